@@ -29,17 +29,17 @@ class Reference(TriangleSampler):
         first, last, kept = _pixel_boxes(corners, size)
         if cull != "none":
             kept &= _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
-        found = []
+        hits = []
         counts = np.where(kept, (last - first + 1).clip(0).prod(axis=1), 0)
         for chunk in _chunks(counts):
             triangle = np.repeat(chunk, counts[chunk])
             within = np.arange(len(triangle)) - np.repeat(np.cumsum(counts[chunk]) - counts[chunk], counts[chunk])
             columns = (last - first + 1)[triangle, 0]
             x, y = first[triangle, 0] + within % columns, first[triangle, 1] + within // columns
-            found.append(_hits(triangle, x, y, corners, depth, size))
-        if not found:
+            hits.append(_hits(triangle, x, y, corners, depth, size))
+        if not hits:
             return _empty(size, layers)
-        triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*found, strict=True))
+        triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*hits, strict=True))
         return _nearest(triangle, pixel, barycentrics, depth, size, layers)
 
 

@@ -107,10 +107,10 @@ class Revolution(BSpline):
     def __init__(self, heights: Any, count: int = 8, ends: str = "clamped", tolerance: float = TOLERANCE):
         if not is_count(count) or count < 4:
             raise InputError(f"count is {quoted(count)}; expected an integer of at least 4")
-        given = shape_of(from_numbers(heights, "heights"))
-        if len(given) != 1 or given[0] < 4:
+        shape = shape_of(from_numbers(heights, "heights"))
+        if len(shape) != 1 or shape[0] < 4:
             raise InputError(f"heights is {quoted(heights)}; expected (n,), at least 4 numbers")
-        heights = np.asarray(check_numbers("heights", heights, given), np.float64)
+        heights = np.asarray(check_numbers("heights", heights, shape), np.float64)
         super().__init__((len(heights), count), (ends, "periodic"), tolerance)
         angle = 2 * np.pi * np.arange(count) / count
         # A closed spline runs inside its control points; a control point's own radius is met at its angle.

@@ -110,11 +110,11 @@ class Mesh(TriangleSurface):
         plain = len(self._tables) == 1 and "normals" not in theta and "uv" not in theta
         if not plain or exemplar(theta["vertices"]) is not None:
             return ()
-        found = []
+        rates = []
         for faces, vertices, nearest in fewer_faces(np.asarray(theta["vertices"]), self.faces):
             change = partial(self._thinned, vertices, nearest)
-            found.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces), change))
-        return found
+            rates.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces), change))
+        return rates
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
         """θ with other vertices, which have the attributes of those that they stand for."""

@@ -53,8 +53,8 @@ def check_rows(who: str, theta: Mapping[str, Tree], name: str, rows: int) -> Non
         return None if fits else f"(rows, {' or '.join(map(str, widths or 'C'))})"
 
     check_entry(who, theta, name, expected)
-    if (given := shape_of(theta[name])[0]) < rows:
+    if (count := shape_of(theta[name])[0]) < rows:
         raise InputError(
-            f"theta[{name!r}] of {who} has {given} rows, but its faces refer to row {rows - 1}; check the indices "
+            f"theta[{name!r}] of {who} has {count} rows, but its faces refer to row {rows - 1}; check the indices "
             f"(they count from 0)"
         )

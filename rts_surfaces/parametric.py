@@ -86,13 +86,13 @@ class Parametric(TriangleSurface):
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Other tolerances."""
-        found = []
+        rates = []
         for tolerance in TOLERANCES:
             if tolerance != self.tolerance:
                 other = copy.copy(self)
                 other.tolerance = tolerance
-                found.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
-        return found
+                rates.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
+        return rates
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
         """Rates of the edges of `whole` and within it, for so many cuts along each side of a patch."""
@@ -118,10 +118,10 @@ class Parametric(TriangleSurface):
         """Triangles that are off the surface by less than `tolerance` pixels near outlines, and coarse elsewhere."""
         points = self.finite(inputs)
         geometry, center = self.geometry(points), self._center(points)
-        found = self.shapes(geometry)
+        tile_shapes = self.shapes(geometry)
         view = view_of(view_key(camera, size, center), center)
-        allowed = allowed_in(view, found, self.tolerance, self.coarse * self.tolerance)
-        return triangles(self.tiles, geometry.points, *by_error(self.tiles, found, allowed))
+        allowed = allowed_in(view, tile_shapes, self.tolerance, self.coarse * self.tolerance)
+        return triangles(self.tiles, geometry.points, *by_error(self.tiles, tile_shapes, allowed))
 
     def shapes(self, geometry: Geometry) -> Shapes:
         """The shapes of the tiles."""
@@ -148,8 +148,8 @@ class Parametric(TriangleSurface):
             tiles, cuts = self.whole, self.uniform(min(int(rate), MOST))
         else:
             check_positive("rate", rate)
-            tiles, found = self.tiles, self.shapes(geometry)
-            cuts = by_error(tiles, found, Allowed.everywhere(len(found.bends), float(rate)))
+            tiles, tile_shapes = self.tiles, self.shapes(geometry)
+            cuts = by_error(tiles, tile_shapes, Allowed.everywhere(len(tile_shapes.bends), float(rate)))
         proxy = triangles(tiles, geometry.points, *cuts)
         a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]

@@ -54,8 +54,8 @@ class Bicubic(Geometry):
         ids, params, row, depth = (np.array(x) for x in (samples.ids, samples.params, samples.row, samples.depth))
         lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
-        given = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
-        parallel(meeting_loops.meet, len(lines[0]), *given, work=200 * len(samples.ids))
+        arguments = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
+        parallel(meeting_loops.meet, len(lines[0]), *arguments, work=200 * len(samples.ids))
         return samples.replace(ids=ids, params=params, row=row, depth=depth)
 
 
@@ -153,9 +153,9 @@ def across(sides: np.ndarray) -> np.ndarray:
     count = np.bincount(flat)[flat[order]]
     first = np.searchsorted(flat[order], flat[order])
     other = order[first + (np.arange(len(flat)) - first + count // 2) % count]
-    found = np.empty(len(flat), np.int32)
-    found[order] = np.where(count > 1, other, -1)
-    return found.reshape(sides.shape)
+    beyond = np.empty(len(flat), np.int32)
+    beyond[order] = np.where(count > 1, other, -1)
+    return beyond.reshape(sides.shape)
 
 
 def _tiles(table: np.ndarray) -> Tiles:

@@ -1,4 +1,4 @@
-"""What is said of files that are damaged, and warnings of a file gathered while it is read."""
+"""Errors for damaged files, and the warnings gathered while a file is read."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def count_of(value: Any) -> int:
 
 
 def _layout(accessor: dict[str, Any], descriptions: list[dict[str, Any]]) -> tuple[int, int, int]:
-    """Where the rows of an accessor begin in its view, from one to the next, and the bytes of one."""
+    """Bytes of an accessor in its view: where its rows begin, from one row to the next, and in one row."""
     row = np.dtype(TYPES[accessor["componentType"]]).itemsize * WIDTHS[accessor["type"]]
     stride = descriptions[accessor["bufferView"]].get("byteStride", row)
     return count_of(accessor.get("byteOffset", 0)), count_of(stride), row

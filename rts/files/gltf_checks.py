@@ -21,7 +21,7 @@ from rts.files.gltf_scenes import check_scenes
 from rts.files.images import is_image
 
 APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
-"""How names of extensions begin that say nothing of shapes."""
+"""Names of extensions that do not concern shapes begin like this."""
 PROPERTIES = {
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse",
     "bufferViews": "buffer byteOffset byteLength byteStride target",
@@ -84,7 +84,7 @@ def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[s
 
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
-    """Refuse what is not sound. A GLB of the same, if there are numbers that trimesh would misread."""
+    """Refuse a damaged file. Return it as a GLB if it holds numbers that trimesh would misread, else None."""
     place = "its tree"
     try:
         tree = json.loads(text, parse_constant=_no_number, object_pairs_hook=_unique)
@@ -193,7 +193,7 @@ def _view(index: int, view: dict[str, Any], buffers: list[bytes], fail: Any) -> 
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[int, str]:
-    """Refuse attributes that do not fit; which accessors trimesh would misread, and as what it would not."""
+    """Refuse attributes that do not fit. Return the accessors that trimesh would misread, with the type to convert to."""
     mode = count_of(primitive.get("mode", 4))
     if mode > 5:
         raise fail(f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)")

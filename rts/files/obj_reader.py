@@ -19,7 +19,7 @@ from rts.files.pieces import Piece
 from rts.files.srgb import decode_srgb
 
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
-"""How many numbers rows may have: a position may have a weight, or a colour, and that an alpha."""
+"""Counts of numbers in a row: a position may have a weight, or a colour, which may have an alpha."""
 FACES = ("f", "fo")
 """Statements of faces; "fo" is what "f" was called once."""
 LEFT_OUT = frozenset(

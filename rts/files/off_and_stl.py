@@ -95,7 +95,7 @@ def _vertices(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray:
 
 
 def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.ndarray, np.ndarray]:
-    """How many corners each face has, and all corners, one face after the other."""
+    """The number of corners of each face, and all corners, face after face."""
     numbers = numbers_of(rows, fail) if rows else []
     if isinstance(numbers, np.ndarray) and (numbers[:, 0] == numbers.shape[1] - 1).all() and numbers.shape[1] > 3:
         faces = numbers[:, 1:]

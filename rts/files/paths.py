@@ -110,7 +110,7 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
 
 
 def cache_folder() -> Path:
-    """Where what is costly to make is kept from one process to the next, such as compiled libraries."""
+    """The folder of files that are costly to make, such as compiled libraries; later processes read them."""
     try:
         if sys.platform == "darwin":
             return Path.home() / "Library" / "Caches" / "rts"

@@ -10,7 +10,7 @@ import numpy as np
 from rts.errors import InputError
 
 WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "colors": (3, 4)}
-"""How many numbers the rows of each table have."""
+"""Numbers in a row of each table."""
 LARGEST = float(np.finfo(np.float32).max)
 SINGULAR = 1e-9
 """The least volume of a parallelepiped for the product of its edges."""

@@ -58,7 +58,7 @@ class Element(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """What a file of polygons holds.
+    """The tables of a file of polygons.
 
     Attributes:
         vertices: columns (V,) by name, "x", "y" and "z" among them.
@@ -210,7 +210,7 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
 
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
-    """What is promised: elements, layout, the name of a texture; and where the data begin."""
+    """The header's elements, layout and name of a texture; and the place where the data begin."""
     # Lines of a Macintosh end in CR alone.
     newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", data) else b"\n"
     end = data.find(newline + b"end_header") + 1
@@ -322,7 +322,7 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> di
 
 
 def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, int]] | None:
-    """Where each property begins and ends in a row of numbers; None where the row is too long or too short."""
+    """First and last place of each property in a row of numbers; None if the row is too long or too short."""
     places, at = [], 0
     for p in properties:
         length = 1

@@ -27,11 +27,11 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 PLANES = (0.01, 1000.0)
 """Near and far planes of cameras whose file tells no bounds."""
 MARGIN = 100.0
-"""How much nearer, and farther, than what a file tells of its scene the planes of its cameras are."""
+"""Factor by which a camera's planes lie nearer, and farther, than the bounds of the scene in its file."""
 SCALE_OF_NEAREST = 0.75
 """In NeRF's frame of LLFF scenes the nearest bound is 1 / 0.75."""
 OFF_CENTRE = 1e-3
-"""How far, in widths of the image, what a file tells of a lens twice may differ."""
+"""Largest difference, in widths of the image, of two statements of a file about one lens."""
 HEADER, ROW = 5, 17
 """Columns of the matrix (3, 5) of an LLFF pose, and numbers in a row of poses_bounds.npy."""
 
@@ -153,7 +153,7 @@ def colour_named(colour: Any) -> np.ndarray:
 
 
 class _Pose(NamedTuple):
-    """What a file says of one picture: how small it is to be made yet, its focal length over its width, its bounds."""
+    """A picture's entry in a file: the reduction still to be made, focal length over width, bounds."""
 
     path: Path
     size: tuple[int, int]
@@ -286,10 +286,10 @@ def _check_lens(place: str, lens: Mapping[str, Any], focal: float, size: tuple[i
     width = lens["w"] if is_real(lens.get("w")) and lens["w"] > 0 else size[1]
     height = width * size[0] / size[1]
     for key, expected in (("fl_x", focal * width), ("fl_y", focal * width), ("cx", width / 2), ("cy", height / 2)):
-        given = lens.get(key, expected)
-        if not is_real(given) or not abs(given - expected) <= OFF_CENTRE * width:
+        value = lens.get(key, expected)
+        if not is_real(value) or not abs(value - expected) <= OFF_CENTRE * width:
             raise InputError(
-                f"{place} has {key} = {quoted(given)}, where camera_angle_x makes it {expected:.6g}; expected a camera "
+                f"{place} has {key} = {quoted(value)}, where camera_angle_x makes it {expected:.6g}; expected a camera "
                 "of square pixels that looks through the middle of its image"
             )
 

@@ -1,4 +1,4 @@
-"""Whether a function depends on the parameters at all, and which directions of them it does not determine."""
+"""Functions that do not depend on their parameters, and directions that they do not determine."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
 
 
 def refuse_independent(residuals: Callable, loss: Callable | None, parameters: Tree, engine: Engine) -> None:
-    """Refuse functions whose results no derivative connects to the parameters; for those whose gradient is zero.
+    """Refuse a function whose results no derivative connects to the parameters. Called where a gradient is zero.
 
     A result is connected where the engine marks it as it marks the parameters: in torch by the graph, in jax by being
     traced. A gradient may be zero though all is connected, such as where nothing is in view.
@@ -122,7 +122,9 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
         terms = []
         for name, shape, first, stop in zip(names, shapes, starts, starts[1:], strict=False):
             terms += _terms(name, shape, column[first:stop])
-        entries.append((int(np.flatnonzero(column)[0]), " with ".join([*terms[:3], *(["others"] if terms[3:] else [])])))
+        entries.append(
+            (int(np.flatnonzero(column)[0]), " with ".join([*terms[:3], *(["others"] if terms[3:] else [])]))
+        )
     return listed([text for _, text in sorted(entries)])
 
 

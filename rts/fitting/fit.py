@@ -203,7 +203,7 @@ def _descend(
 
 
 def _flat(loss: float) -> str:
-    """What to say of a gradient that was zero throughout."""
+    """The reason, in words, of a gradient that was zero throughout."""
     return "the loss is zero" if loss == 0 else NO_GRADIENT
 
 
@@ -211,7 +211,7 @@ def _flat(loss: float) -> str:
 
 
 def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
-    """The residuals as those of their base."""
+    """The residuals as `rts.Residuals`; loss and callback are checked, too."""
     known = _residuals(residuals, "residuals")
     if loss is not None and not callable(loss):
         raise InputError(
@@ -237,7 +237,7 @@ def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
 
 
 class _Function(Residuals):
-    """A function of parameters as residuals, of which nothing else is known."""
+    """Residuals that are a plain function of the parameters."""
 
     def __init__(self, function: Callable[[Tree], Array]):
         self._function = function
@@ -251,18 +251,18 @@ class _Function(Residuals):
 
 
 def _residuals(given: Any, what: str) -> Residuals:
-    """Residuals, of a function if they are one; `what` names them."""
+    """An object as `rts.Residuals`; functions are wrapped. `what` names it in errors."""
     function = callable(given) and not isinstance(given, (Residuals, type))
     residuals = _Function(given) if function else given
     return checked_plugin(residuals, what, Residuals, "a function of the parameters, ")
 
 
-def _taken(stage: Residuals, whole: Residuals, given: Callable | None) -> tuple[Callable[[Array], Array], bool]:
+def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[Callable[[Array], Array], bool]:
     """The loss at a stage of the residuals `whole`, and whether the stage's own sums are for it."""
-    if given is not None and not overrides(stage, "normal_equations", Residuals):
-        return given, False
+    if loss is not None and not overrides(stage, "normal_equations", Residuals):
+        return loss, False
     own = _own_loss(stage)
-    taken = (own or _own_loss(whole) or SQUARE) if given is None else given
+    taken = (own or _own_loss(whole) or SQUARE) if loss is None else loss
     return taken, (own or SQUARE) == taken
 
 

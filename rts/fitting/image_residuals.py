@@ -154,7 +154,7 @@ class ImageResiduals(Residuals):
 
     @property
     def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None, nor set.
-        """What the mean is taken of; that of all stages and views."""
+        """The loss whose mean is minimised, the same for all stages and views."""
         return self._loss
 
     def _take(self, target: Any, weights: Any) -> None:
@@ -165,10 +165,10 @@ class ImageResiduals(Residuals):
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape, whatever the loss."""
         parts, camera = self.scene(parameters)
-        given = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
+        options = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
         if not self._views:
-            return self._difference(render(parts, camera, self.size, **given), parameters)
-        images = render_views(parts, camera, self.size, **given)
+            return self._difference(render(parts, camera, self.size, **options), parameters)
+        images = render_views(parts, camera, self.size, **options)
         return namespace(images).stack(
             [view._difference(images[b, ...], parameters) for b, view in enumerate(self._views)]
         )
@@ -259,7 +259,7 @@ class ImageResiduals(Residuals):
 
     @property
     def _ordinary(self) -> bool:
-        """Whether residuals are those of this class: a subclass may make others of them."""
+        """True unless a subclass computes other residuals."""
         return not overrides(self, "__call__", ImageResiduals)
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
@@ -349,18 +349,18 @@ class ImageResiduals(Residuals):
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
         outside = replace(known, wanted=fine.coarse, border=sampled.apron)
         placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron)
-        sides = (
+        grids = (
             swept(partial(to_splats, sampled), coarse, outside),
             swept(lambda parts, camera, _, own: to_fine_splats(fine, parts, camera, own), finer, placed),
         )
-        if sides[0] is None or sides[1] is None:
+        if grids[0] is None or grids[1] is None:
             return None
         share = finer.target.shape[0] * finer.target.shape[1] / (rows * self.size[1])
-        value, matrix, gradient = (a + share * b for a, b in zip(sides[0], sides[1], strict=True))
+        value, matrix, gradient = (a + share * b for a, b in zip(grids[0], grids[1], strict=True))
         return value, matrix, gradient
 
     def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
-        """A tree in the engine of the parameters and of the target: each may be NumPy's, and the other not."""
+        """A tree in the engine of the parameters and of the target, of which either may be NumPy's."""
         own, like = (self._target, self._weights, self._background), exemplar(parameters)
         return constants(tree, engine_of(tree, parameters, own), exemplar(own) if like is None else like)
 
@@ -382,7 +382,7 @@ class ImageResiduals(Residuals):
 
 
 class _Fields(NamedTuple):
-    """What an image of h × w pixels is compared with: target (h, w, C), weights and background, arrays or None."""
+    """Target (h, w, C), weights and background of an image of h × w pixels; arrays or None."""
 
     target: Array
     weights: Array | None
@@ -390,7 +390,7 @@ class _Fields(NamedTuple):
 
 
 def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
-    """The fields with weights of zero at active pixels, and those for the layout of `fine`, zero at all others."""
+    """Fields for the coarse grid, with zero weights at active pixels, and for the layout of `fine`, zero elsewhere."""
     xp, engine = namespace(pixel), engine_of(pixel)
     height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
 
@@ -437,14 +437,14 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
     return xp.reshape(small, (*size, *kind[2:])), xp.reshape(xp.sqrt(total), (*size, *shape[2:]))
 
 
-def _are_cameras(given: Any) -> TypeGuard[Cameras]:
-    """Whether it is a camera, or a list of some."""
-    listed: list[Any] = list(given) if isinstance(given, (list, tuple)) else [given]
+def _are_cameras(value: Any) -> TypeGuard[Cameras]:
+    """True for a camera or a list of cameras."""
+    listed: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
     return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
 
 
 def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
-    """How many views a target is of; None for one, without an axis of its own. There may be `several` cameras."""
+    """The number of views of a target; None if it is one view without an axis. There may be `several` cameras."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape: Any = shape_of(target)
@@ -455,9 +455,9 @@ def _of_views(weights: Any, count: int) -> Sequence[Any]:
     """The weights of each view."""
     if weights is None:
         return [None] * count
-    given = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
-    if given != count:
-        raise InputError(f"weights are of {given} views; expected {count}, as many as targets")
+    weight_count = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
+    if weight_count != count:
+        raise InputError(f"weights are of {weight_count} views; expected {count}, as many as targets")
     return weights
 
 

@@ -20,11 +20,11 @@ FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12
 TINY = 1e-300
 RESOLVED = 10.0
-"""As many roundings of the loss as a gain must be, at least, to be told from none."""
+"""Least gain that counts as one, in roundings of the loss."""
 
 
 class _Linear(NamedTuple):
-    """What is known of the residuals around a point: their loss, and the normal equations JᵀSJ and JᵀWr over n."""
+    """Residuals linearised at a point: their loss, and the normal equations JᵀSJ and JᵀWr over n."""
 
     value: float
     matrix: np.ndarray
@@ -159,7 +159,7 @@ def levenberg_marquardt(
 
 
 def _loss_rounding(linear: _Linear, count: int) -> float:
-    """How far a mean loss of `count` residuals may be off, whose terms are of the size of one."""
+    """Rounding error of a mean loss of `count` residuals, whose terms are of the size of one."""
     return linear.rounding * (linear.value + 2 * math.sqrt(linear.value / max(count, 1)))
 
 
@@ -237,7 +237,7 @@ def _least_squares(
 
 
 def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
-    """The result of a user's `normal_equations`, refused where its form is another."""
+    """The result of a user's `normal_equations`, refused if its shapes are wrong."""
     expected = (), (count, count), (count,)
     equations: Any = tuple(result) if isinstance(result, (tuple, list)) else (result,)
     if not all(engine.owns(x) for x in equations) or tuple(tuple(x.shape) for x in equations) != expected:
@@ -250,7 +250,7 @@ def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, 
 
 
 def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
-    """All leaves as one vector, and the way back."""
+    """All leaves as one vector, and the function that makes a tree of such a vector again."""
     arrays = list(leaves(parameters))
     xp = namespace(*arrays)
 

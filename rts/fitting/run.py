@@ -28,7 +28,7 @@ class Astray(Exception):
 
 
 class Run:
-    """What a fit keeps as it goes: history, best parameters, and why it stopped.
+    """The record of a running fit: history, best parameters, and why it stopped.
 
     Attributes:
         mattered: of each array of the parameters, whether its gradient was ever other than zero.
@@ -67,7 +67,7 @@ class Run:
 
     @property
     def fresh(self) -> bool:
-        """Whether no loss is known yet, of earlier stages neither: what goes wrong is the caller's to put right."""
+        """True before the first loss of the first stage. An error then is the caller's, since nothing can be saved."""
         return not self.history and not self.before
 
     def note_gradient(self, mattered: Sequence[bool]) -> None:
@@ -86,7 +86,7 @@ class Run:
 
     @property
     def left(self) -> int:
-        """How many more steps there may be."""
+        """Steps that are left."""
         return self.steps - len(self.history)
 
     def stop(self, reason: str) -> bool:
@@ -95,7 +95,7 @@ class Run:
         return False
 
     def stalled(self) -> bool:
-        """Whether the loss has not fallen enough in the last `patience` steps."""
+        """True if the loss has not fallen enough in the last `patience` steps."""
         return len(self.history) - self._last_gain >= self.patience
 
     def attempt(self, engine: Engine, call: Callable, *args: Any) -> Any:
@@ -125,11 +125,11 @@ TRACING = ("JAXTypeError", "JAXIndexError")
 
 
 ENGINE_MARKS = {"torch": ("Tensor", "__dlpack"), "jax": ("ArrayImpl", "Tracer", "jit-wrapped")}
-"""What the frameworks call their arrays when they complain of those of another."""
+"""Names of arrays in errors of the frameworks about arrays of another one."""
 
 
 def untraceable(error: Exception, engine: Engine) -> RtsError | None:
-    """What to say of an error of a framework that could not trace a function, or met arrays of another framework.
+    """A clearer error for a function that a framework could not trace, or that met arrays of another framework.
 
     None for any other error.
     """

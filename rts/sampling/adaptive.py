@@ -1,4 +1,4 @@
-"""Samples where outlines are: which pixels take many, decided by one sample a pixel."""
+"""Adaptive sampling: one sample in most pixels, many in those near outlines, which one sample a pixel shows."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ MOST = 64
 
 @dataclass(frozen=True)
 class Adaptive:
-    """In place of a number of `supersample`: s² samples where outlines are, one in every other pixel.
+    """A value for `supersample`: s² samples in pixels near outlines, one in every other pixel.
 
-    A pixel is active if, of one sample a pixel, its front ends towards a neighbour (nothing is there, or another
-    surface), or a neighbour's towards it. Active pixels are those of `supersample=samples`, the others those of 1.
+    A pixel with s² samples is called active. One sample a pixel decides: a pixel is active if its front ends towards
+    a neighbour, where nothing or another surface is, or a neighbour's front towards it. Active pixels look as with
+    `supersample=samples`, the others as with `supersample=1`.
 
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
@@ -58,25 +59,25 @@ class Adaptive:
         object.__setattr__(self, "samples", int(self.samples))
 
     def dilates(self, parts: Sequence[CheckedPart]) -> bool:
-        """Whether active pixels of a scene are dilated."""
+        """True if the neighbours of a scene's active pixels are active, too."""
         if self.dilated is None:
             return self.contrast is not None or not all(part.uniform for part in parts)
         return self.dilated
 
 
 def as_text(supersample: int | Adaptive) -> str:
-    """What `of_text` reads: "4", "adaptive:4", or with what else is given "adaptive:8:dilated=False:contrast=0.2"."""
+    """The text that `of_text` reads: "4", "adaptive:4", or with options "adaptive:8:dilated=False:contrast=0.2"."""
     if not isinstance(supersample, Adaptive):
         return str(supersample)
-    given = {"dilated": supersample.dilated, "contrast": supersample.contrast}
-    return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
+    options = {"dilated": supersample.dilated, "contrast": supersample.contrast}
+    return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in options.items() if v is not None)])
 
 
 def of_text(text: str) -> int | Adaptive:
-    """The samples a pixel that a text stands for; see `as_text`.
+    """The `supersample` that a text stands for; see `as_text`.
 
     Raises:
-        InputError: it stands for none.
+        InputError: the text stands for none.
     """
     kind, *rest = (word.strip().lower() for word in text.split(":"))
     number, *further = rest if rest and kind == "adaptive" else [kind]
@@ -103,12 +104,12 @@ def _number(text: str) -> float | None:
 
 
 def finest(supersample: Any) -> Any:
-    """Samples along each side of a pixel, where there are most; what is neither is returned as it is."""
+    """The most samples along a side of a pixel: those of an `Adaptive`, else the argument itself."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 
 
 def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:
-    """Cells (H, W) bool whose fronts end towards a neighbour, or a neighbour's towards them, or may by rounding.
+    """Cells (H, W) bool at outlines: the front ends towards a neighbour, or a neighbour's towards it, or may by rounding.
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.
@@ -126,19 +127,19 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
     least, largest = depth.min(initial=0), depth.max(initial=0)
     beyond = 2 * (largest - least) or 1
     marks = np.empty(row.shape[1:], np.uint8)
-    given = (
+    arguments = (
         read_only(row, np.int32),
         read_only(settled, np.int8),
         depth,
         np.cumsum(sizes)[:-1],
         *map(kind, (beyond, TIE * max(largest, -least), CONTINUED)),
     )
-    parallel(adaptive_loops.mark, len(marks), *given, marks, work=4 * row.size)
+    parallel(adaptive_loops.mark, len(marks), *arguments, marks, work=4 * row.size)
     return marks.view(bool)
 
 
 def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
-    """Cells (H, W) bool whose front's colour differs by more than `least` from the mean line of two opposite ones.
+    """Cells (H, W) bool where the front's colour has a second difference above `least` along any of four directions.
 
     Args:
         row: (H, W), the front of each cell.

@@ -1,4 +1,4 @@
-"""`sampler="auto"`: which sampler a part needs, and why."""
+"""`sampler="auto"`: the sampler that suits a part, and the reason."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _log = logging.getLogger("rts")
 
 
 class Choice(NamedTuple):
-    """What is done for a part.
+    """The decision for a part: its sampler, the reason, and the number of samples.
 
     Attributes:
         sampler: the sampler that `sampler="auto"` takes, by name.
@@ -62,7 +62,7 @@ def choose(part: Part, *, static: bool) -> Choice:
 
 
 def is_static(part: Part, camera: Camera) -> bool:
-    """Whether something is differentiated, but not what the surface reads: so calls repeat, and triangles stay."""
+    """True if something is differentiated, but nothing that the surface reads: calls repeat, and triangles stay."""
     constant = is_constant([part.theta[name] for name in part.surface.reads(part.theta)])
     return constant and engine_of(part, camera).differentiates
 

@@ -1,4 +1,4 @@
-"""What samplers build for a surface, kept between calls: structures over triangles, buffers on a device.
+"""A cache of what samplers build for a surface: structures over triangles, buffers on a device.
 
 Optimisers change arrays in place, so identity proves nothing: what is kept goes by a fingerprint of the bytes that the
 proxy was made of.
@@ -76,7 +76,7 @@ class Keeper:
 
 
 def same_faces(a: Proxy, b: Proxy) -> bool:
-    """Whether two proxies differ in the places of their vertices only."""
+    """True if two proxies differ at most in the positions of their vertices."""
     same_count = len(a.vertices) == len(b.vertices)
     return same_count and (a.faces is b.faces or np.array_equal(a.faces, b.faces))
 

@@ -1,4 +1,4 @@
-"""Which cells lie beside outlines, compiled."""
+"""Cells beside outlines, compiled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which side of a surface is seen where hidden layers are: what keeps a front and a back from pairing."""
+"""The side of a surface that each layer shows, by which splatters do not pair a front with a back."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ ALTERNATING = np.array([1, -1, 1, -1])
 def facing(
     fragments: Fragments, kept: np.ndarray, proxy: Proxy, pieces: np.ndarray, camera: Camera, listed: bool
 ) -> np.ndarray:
-    """Which piece is seen, and from which side: (K, H, W) int16, see `rts.contracts.records.Samples`.
+    """The piece that each fragment shows, and its side: (K, H, W) int16, see `rts.contracts.records.Samples`.
 
-    It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere.
-    The last layer of fragments is marked by `MORE_BEHIND`.
+    Splatters compare it in cells that have hidden layers, and beside them; elsewhere it is 0. The last layer of
+    fragments is marked by `MORE_BEHIND`.
 
     Args:
         fragments: what was sampled.
-        kept: (K, H, W) bool, which of them are samples.
+        kept: (K, H, W) bool, the fragments that are samples.
         proxy: the triangles.
         pieces: (T,) int16, the number of each triangle's piece; or (1,), of all.
         camera: host matrices.
-        listed: whether the cells are those of a list, so that what lies side by side in it may not do so in the image.
+        listed: True for the cells of a list: neighbours in the list may not be neighbours in the image.
     """
     return facing_of_views(fragments, kept, proxy, pieces, [camera], kept.shape[1:], listed)
 
@@ -42,7 +42,7 @@ def facing_of_views(
     view: tuple[int, ...],
     listed: bool = False,
 ) -> np.ndarray:
-    """As `facing`, of views (height, width) that lie side by side, line after line; each has a camera."""
+    """`facing` of views (height, width) that lie side by side, line after line; each has a camera."""
     from rts.sampling import facing_loops
 
     behind = np.count_nonzero(kept[1:])

@@ -37,7 +37,7 @@ class Prepared:
     def of(
         cls, parts: Part | Sequence[Part], sampler: Any, camera: Camera | None, size: tuple[int, int] | None
     ) -> Self:
-        """What samplers build of parts; arguments as in `rts.prepare`."""
+        """Prepared parts, with what their samplers build; arguments as in `rts.prepare`."""
         identity = Camera.look_at((0, 0, 1), (0, 0, 0))
         checked, _ = check_scene(parts, identity if camera is None else camera)
         size = None if size is None else check_pixels(size)

@@ -74,8 +74,8 @@ class Covers(NamedTuple):
         self.corners[3 * len(faces) :] = 0
         self.owners[len(faces) :] = 0
         places = len(faces) + np.cumsum(wanted, dtype=np.int64) - wanted
-        given = vertices, faces, sphere, wanted, places
-        parallel(_cover, len(faces), *given, self.corners, self.owners, self.margins, work=100 * len(faces))
+        arguments = vertices, faces, sphere, wanted, places
+        parallel(_cover, len(faces), *arguments, self.corners, self.owners, self.margins, work=100 * len(faces))
 
 
 @compiled(error_model="numpy")

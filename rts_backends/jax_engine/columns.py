@@ -23,8 +23,8 @@ def summed_by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(*arrays: Any) -> Any:
         traced, shapes = jax.make_jaxpr(f, return_shape=True)(*arrays)
-        found = _evaluated(traced.jaxpr, traced.consts, arrays)
-        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+        results = _evaluated(traced.jaxpr, traced.consts, arrays)
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return call
 
@@ -37,19 +37,19 @@ def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], arguments: Sequence[Any]) ->
     while rest:
         count = next((i for i, equation in enumerate(rest) if _is_call(equation) or _is_short(equation)), len(rest))
         run, rest = rest[:count], rest[count:]
-        made = {x for equation in run for x in equation.outvars}
-        needed, given = [x for x in variables(rest, jaxpr.outvars) if x in made], [*known]
-        kept = jaxpr.replace(constvars=[], invars=given, outvars=needed, eqns=run, debug_info=debug)
+        outputs = {x for equation in run for x in equation.outvars}
+        needed, inputs = [x for x in variables(rest, jaxpr.outvars) if x in outputs], [*known]
+        kept = jaxpr.replace(constvars=[], invars=inputs, outvars=needed, eqns=run, debug_info=debug)
         known.update(zip(needed, eval_jaxpr(kept, [], *known.values()), strict=True))
         if rest:
             equation, *rest = rest
             values = [x.val if isinstance(x, Literal) else known[x] for x in equation.invars]
             if _is_call(equation):
                 inner = equation.params["jaxpr"]
-                found = _evaluated(inner.jaxpr, inner.consts, values)
+                results = _evaluated(inner.jaxpr, inner.consts, values)
             else:
-                found = [sum(values[0][..., i] for i in range(values[0].shape[-1]))]
-            known.update(zip(equation.outvars, found, strict=True))
+                results = [sum(values[0][..., i] for i in range(values[0].shape[-1]))]
+            known.update(zip(equation.outvars, results, strict=True))
     return [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
 
 

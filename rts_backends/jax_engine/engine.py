@@ -75,11 +75,11 @@ class JaxEngine(Engine):
 
         def noticed(*host_args: Any) -> Sequence[np.ndarray | np.generic]:
             try:
-                found = fn(*host_args)
+                results = fn(*host_args)
             except RtsError as error:
                 self._error = error
                 raise
-            return [*found, np.int32(max((len(found[i]) for i in packed), default=0))]
+            return [*results, np.int32(max((len(results[i]) for i in packed), default=0))]
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         *results, used = host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
@@ -158,8 +158,8 @@ class JaxEngine(Engine):
             with operations.by_specification():
                 return f(dict(zip(rows, own, strict=True)))
 
-        found = row_blocks.apply(few, used, list(rows.values()))
-        return whole if found is None else found
+        result = row_blocks.apply(few, used, list(rows.values()))
+        return whole if result is None else result
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""
@@ -189,8 +189,8 @@ class JaxEngine(Engine):
         pieces = jnp.pad(rows, ((0, -count % size), *[(0, 0)] * (rows.ndim - 1))).reshape(-1, size, *rows.shape[1:])
         first = f(pieces[0])
         traced = isinstance(first, Tracer)
-        found = jax.lax.map(f, pieces) if traced else jnp.stack([first, *[f(piece) for piece in pieces[1:]]])
-        return found.reshape(-1, *found.shape[2:])[:count]
+        mapped = jax.lax.map(f, pieces) if traced else jnp.stack([first, *[f(piece) for piece in pieces[1:]]])
+        return mapped.reshape(-1, *mapped.shape[2:])[:count]
 
     @staticmethod
     def _looped(body: Callable, going: Callable, state: Tree, most: int) -> Tree:

@@ -122,9 +122,9 @@ class HostPrimitive:
         alike = set(places.values())
         own = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
 
-        def call(*given: jax.Array) -> list[jax.Array]:
-            found = host.filled(filler, own, *given, in_place=places)
-            return [x[None] if i in alike else x for i, x in enumerate(found)]
+        def call(*arrays: jax.Array) -> list[jax.Array]:
+            results = host.filled(filler, own, *arrays, in_place=places)
+            return [x[None] if i in alike else x for i, x in enumerate(results)]
 
         def filler(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
             self._on_host(operands, [x[None] if i in alike else x for i, x in enumerate(results)], params)
@@ -135,12 +135,12 @@ class HostPrimitive:
         device = _cpu_of(operands)
         if device is None:
             return _compiled(self.primitive, tuple(params.items()))(*operands)
-        found = [np.empty(result.shape, result.dtype) for result in self._results(operands, params)]
-        self._on_host([np.asarray(x) for x in operands], found, params)
+        results = [np.empty(result.shape, result.dtype) for result in self._results(operands, params)]
+        self._on_host([np.asarray(x) for x in operands], results, params)
         if any(x.committed for x in operands if isinstance(x, jax.Array)):
-            return jax.device_put(found, device)
+            return jax.device_put(results, device)
         with jax.default_device(device):
-            return jax.device_put(found)
+            return jax.device_put(results)
 
     def _batched(self, operands: Sequence[Any], dims: Sequence, **params: Any) -> tuple[list[jax.Array], list[int]]:
         mapped = [d is not None for d in dims]
@@ -159,8 +159,8 @@ class HostPrimitive:
                 x = jnp.moveaxis(x, 0, at)
                 x = x.reshape(*x.shape[:at], size * x.shape[at + 1], *x.shape[at + 2 :])
             folded.append(x)
-        found, at = self(*folded, **params), int(by_item)
-        return [x.reshape(*x.shape[:at], size, -1, *x.shape[at + 1 :]) for x in found], [at] * len(found)
+        results, at = self(*folded, **params), int(by_item)
+        return [x.reshape(*x.shape[:at], size, -1, *x.shape[at + 1 :]) for x in results], [at] * len(results)
 
     def _over_samples(
         self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
@@ -168,16 +168,16 @@ class HostPrimitive:
         """Compute a batch whose items have samples of their own, item by item."""
         inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
         if not inner:
-            found = self(*operands, **params)
-            return found, [0] * len(found)
+            results = self(*operands, **params)
+            return results, [0] * len(results)
         lead = size, inner[0]
         for i, (x, m, rank) in enumerate(zip(operands, mapped, ranks, strict=True)):
             if m or x.ndim > rank:
                 own = x.shape[x.ndim - rank :]
                 x = x[:, None] if m and x.ndim == rank + 1 else x
                 operands[i] = jnp.broadcast_to(x, (*lead, *own)).reshape(size * inner[0], *own)
-        found = self(*operands, **params)
-        return [x.reshape(*lead, *x.shape[1:]) for x in found], [0] * len(found)
+        results = self(*operands, **params)
+        return [x.reshape(*lead, *x.shape[1:]) for x in results], [0] * len(results)
 
 
 def _only_row(value: Any) -> Any:

@@ -72,8 +72,8 @@ def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any
     known = [*jaxpr.constvars, *(x for equation in before for x in equation.outvars)]
     known = [x for x in known if x in read]
     names = jaxpr.debug_info.with_unknown_names()
-    found = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
-    return jaxpr.replace(constvars=[], invars=[*known, *jaxpr.invars], eqns=rest, debug_info=names), found
+    values = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
+    return jaxpr.replace(constvars=[], invars=[*known, *jaxpr.invars], eqns=rest, debug_info=names), values
 
 
 _SPREADING = {"broadcast_in_dim", "iota"}
@@ -136,13 +136,13 @@ class _Pieces:
 
         def function(*varied: Any) -> jax.Array:
             it = iter(varied)
-            given = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
+            values = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
             own = []
-            for x, whole in zip(given[self.fixed :], self._rows, strict=True):
+            for x, whole in zip(values[self.fixed :], self._rows, strict=True):
                 # What is not in use may hold values at which there are no derivatives.
                 other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
                 own.append(self.among(x, there, other))
-            return eval_jaxpr(self._jaxpr, [], *given[: self.fixed], *own)[0]
+            return eval_jaxpr(self._jaxpr, [], *values[: self.fixed], *own)[0]
 
         return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
 
@@ -178,13 +178,13 @@ def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted:
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
 
-    def step(start: Any, first: Any, found: list[jax.Array]) -> list[jax.Array]:
+    def step(start: Any, first: Any, totals: list[jax.Array]) -> list[jax.Array]:
         function, varied = pieces.varying(start, wanted)
         # The last piece may begin with rows of the one before.
         own = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
         gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(own)
-        sums = [a + b for a, b in zip(found[:same], gradients[:same], strict=True)]
-        for whole, x in zip(found[same:], gradients[same:], strict=True):
+        sums = [a + b for a, b in zip(totals[:same], gradients[:same], strict=True)]
+        for whole, x in zip(totals[same:], gradients[same:], strict=True):
             sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
         return sums
 
@@ -212,8 +212,8 @@ def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
     def batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
         # One loop serves all items, as long as the longest.
         most = operands[0] if dims[0] is None else jnp.max(operands[0])
-        found = jax.vmap(functools.partial(function, most, **params), tuple(dims[1:]))(*operands[1:])
-        return found, [0] * len(found)
+        results = jax.vmap(functools.partial(function, most, **params), tuple(dims[1:]))(*operands[1:])
+        return results, [0] * len(results)
 
     def along(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
         present = _present(tangents)
@@ -251,11 +251,11 @@ _pull = _primitive("pull", _pulled, _like_operands)
 
 
 def _value_jvp(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
-    found, wanted = _value.bind(*primals, **params), _present(tangents[2:])
+    results, wanted = _value.bind(*primals, **params), _present(tangents[2:])
     along = [t for t, there in zip(tangents[2:], wanted, strict=True) if there]
     if not along:
-        return found, [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in found]
-    return found, _push.bind(*primals, *along, wanted=wanted, **params)
+        return results, [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in results]
+    return results, _push.bind(*primals, *along, wanted=wanted, **params)
 
 
 def _push_transpose(gradients: Sequence, *given: Any, wanted: tuple[bool, ...], **params: Any) -> list:

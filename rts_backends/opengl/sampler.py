@@ -277,6 +277,6 @@ def _peel(
             array.render(moderngl.TRIANGLES)
         if query.samples == 0:
             break
-        found = np.frombuffer(framebuffer.read(components=2, dtype="i4"), np.int32)
-        ids[k] = found.reshape(*size, 2)[..., 0]
+        pixels = np.frombuffer(framebuffer.read(components=2, dtype="i4"), np.int32)
+        ids[k] = pixels.reshape(*size, 2)[..., 0]
     return ids

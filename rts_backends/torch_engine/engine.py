@@ -45,12 +45,12 @@ class _HostCall(torch.autograd.Function):
 
     @staticmethod
     def forward(fn, specs, *args):
-        device, given = None, []
+        device, values = None, []
         for a in args:
             tensor = isinstance(a, torch.Tensor)
             device = a.device if tensor and device is None else device
-            given.append(_to_host(a) if tensor else a)
-        return tuple([_tensor(r, device) for r in fn(*given)])
+            values.append(_to_host(a) if tensor else a)
+        return tuple([_tensor(r, device) for r in fn(*values)])
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -23,9 +23,9 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
     if private.transforms_active():
         return function.apply(*args)
     # What torch does with all arguments, in one loop.
-    given = [private.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
+    arguments = [private.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
     # Torch's stubs leave out the class above `Function`.
-    return super(torch.autograd.Function, function).apply(*given)  # pyright: ignore[reportAttributeAccessIssue]
+    return super(torch.autograd.Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def transformed() -> bool:

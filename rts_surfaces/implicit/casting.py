@@ -193,23 +193,23 @@ def _cast_some(
     """Hits of eager arrays: only rays that are not done go on, and roots are sought only where there are any."""
     xp, count = engine_of(enter).namespace, enter.shape[0]
     index = xp.arange(count, dtype=xp.int64, device=enter.device)
-    going, found, t, value = rays, xp.zeros_like(index), xp.zeros_like(enter), free(rays.starts)
+    going, hits, t, value = rays, xp.zeros_like(index), xp.zeros_like(enter), free(rays.starts)
     # The first is of no hit, so that no function is called without points.
     cells, brackets = [index[:1]], [_Bracket(*[t[:1]] * 4)]
     for _ in range(most):
-        on = (t < going.last) & (found < layers)
+        on = (t < going.last) & (hits < layers)
         left = int(xp.sum(xp.astype(on, xp.int64)))
         if not left:
             break
         if left < CROWDED * on.shape[0]:
-            going, index, found, t, value, on = _rows((going, index, found, t, value, on), xp.nonzero(on)[0])
+            going, index, hits, t, value, on = _rows((going, index, hits, t, value, on), xp.nonzero(on)[0])
         further = going.further(t, value)
         after = free(going.at(further))
         crossed = on & _change_sign(value, after)
-        cell, bracket = _rows((found * count + index, _Bracket(t, further, value, after)), xp.nonzero(crossed)[0])
+        cell, bracket = _rows((hits * count + index, _Bracket(t, further, value, after)), xp.nonzero(crossed)[0])
         cells.append(cell)
         brackets.append(bracket)
-        found = found + xp.astype(crossed, xp.int64)
+        hits = hits + xp.astype(crossed, xp.int64)
         t, value = further, after
     cell, bracket = xp.concat(cells), _Bracket(*(xp.concat(x) for x in zip(*brackets, strict=True)))
     met = _rows(rays, cell % count)
@@ -235,23 +235,23 @@ def _cast_all(
     none = xp.stack([zero] * layers)
 
     def on(state: dict[str, Array]) -> Array:
-        return (state["t"] < rays.last) & (state["found"] < layers)
+        return (state["t"] < rays.last) & (state["hits"] < layers)
 
     def body(state: dict[str, Array]) -> dict[str, Array]:
-        going, t, value, found = on(state), state["t"], state["value"], state["found"]
+        going, t, value, hits = on(state), state["t"], state["value"], state["hits"]
         further = xp.where(going, rays.further(t, value), t)
         after = free(rays.at(further))
         crossed = going & _change_sign(value, after)
-        layer = xp.stack([crossed & (found == k) for k in range(layers)])
+        layer = xp.stack([crossed & (hits == k) for k in range(layers)])
         new = _Bracket(t, further, value, after)
         brackets = {n: xp.where(layer, getattr(new, n)[None], state[n]) for n in _Bracket._fields}
-        return {"t": further, "value": after, "found": found + xp.astype(crossed, found.dtype), **brackets}
+        return {"t": further, "value": after, "hits": hits + xp.astype(crossed, hits.dtype), **brackets}
 
-    state = {"t": zero, "value": free(rays.starts), "found": xp.zeros_like(zero, dtype=xp.int32)}
+    state = {"t": zero, "value": free(rays.starts), "hits": xp.zeros_like(zero, dtype=xp.int32)}
     state |= dict.fromkeys(_Bracket._fields, none)
     state = engine.repeat(body, lambda state: xp.any(on(state)), state, most)
 
-    hit = xp.stack([state["found"] > k for k in range(layers)])
+    hit = xp.stack([state["hits"] > k for k in range(layers)])
     flat = [xp.reshape(state[n], (-1,)) for n in _Bracket._fields]
     met = map_leaves(lambda x: xp.concat([x] * layers), rays)
     t = _roots(level, free, met, _Bracket(*flat))

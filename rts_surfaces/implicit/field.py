@@ -192,8 +192,8 @@ class Implicit(Surface):
         # At the origin, where rows that only pad would lie, many a function has no derivative: they do as the first.
         used = xp.any(params != 0, axis=1, keepdims=True)
         params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
-        found, along = params[:, :3], params[:, 3:6]
-        return self.gbuffer(theta, found - level(found)[:, None] * along)
+        points, along = params[:, :3], params[:, 3:6]
+        return self.gbuffer(theta, points - level(points)[:, None] * along)
 
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
         """Normals (N, 3) of unit length, outwards, at positions on the surface; zero where the field has no slope."""

@@ -115,8 +115,8 @@ class FunctionOnLattice(Field):
             points = self.suited(theta, engine.constant(places.astype(np.float32), like))
             return np.asarray(engine.known(engine.stop_gradient(self.level(theta, points))))[:count]
 
-        found = self.band.find(level, self._lattice, closed)
-        return Looked({k: v for k, v in found._asdict().items() if k != "evaluations"}, found.evaluations)
+        band = self.band.find(level, self._lattice, closed)
+        return Looked({k: v for k, v in band._asdict().items() if k != "evaluations"}, band.evaluations)
 
     def _in_planes(self, theta: Mapping[str, Tree], planes: Array) -> Array:
         """The level (P, Y, Z) in planes of the lattice across its first axis, (P,) int32."""

@@ -118,14 +118,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         reads: Sequence[str] | None = None,
         attributes: Mapping[str, Callable[[Any, Array], Array]] | None = None,
     ):
-        for name, given, names in (
+        for name, value, names in (
             ("motion", motion, MOTIONS),
             ("inside", inside, tuple(SIDES)),
             ("at_bounds", at_bounds, ENDS),
             ("near_singular", near_singular, SINGULAR),
         ):
-            if not isinstance(given, str) or given not in names:
-                raise InputError(f"{name} is {quoted(given)}; expected {' or '.join(map(repr, names))}")
+            if not isinstance(value, str) or value not in names:
+                raise InputError(f"{name} is {quoted(value)}; expected {' or '.join(map(repr, names))}")
         self.bounds, self.isovalue, self.motion = check_bounds(bounds), check_isovalue(isovalue), motion
         self.closed, self.near_singular = at_bounds == "capped", near_singular
         self.lipschitz = (
@@ -138,10 +138,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
                 raise InputError("shape is None; expected (X, Y, Z), how finely to look at f")
             field = FunctionOnLattice(f, isovalue, inside, reads, Lattice(self.bounds, shape), table, band)
         else:
-            for name, given, none in (("table", table, False), ("band", band, None), ("reads", reads, None)):
-                if given is not none:
+            for name, value, none in (("table", table, False), ("band", band, None), ("reads", reads, None)):
+                if value is not none:
                     raise InputError(
-                        f"{name} is {quoted(given)} without a function f; expected {none}: θ has the values"
+                        f"{name} is {quoted(value)} without a function f; expected {none}: θ has the values"
                     )
             field = LatticeField(self.bounds, self.isovalue, SIDES[inside], shape)
         super().__init__(field, attributes)
@@ -160,12 +160,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Coarser lattices, and of functions a finer one."""
-        count, found = self.field.lattice(theta).count, []
+        count, rates = self.field.lattice(theta).count, []
         for shape, field, change in self.field.resampled(theta):
             other = copy.copy(self)
             other.field, other._usual = field, {}
-            found.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
-        return found
+            rates.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
+        return rates
 
     # ----------------------------------------------------------------------------------- triangles and samples
 
@@ -185,8 +185,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         theta = map_leaves(lambda x: engine_of(x).stop_gradient(x), from_numbers(theta, "theta"))
         self.check(theta)
         looked = self.field.look(theta, self.closed)
-        found = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
-        return Extracted(found.vertices, found.faces, int(_singular(found).sum()), looked.evaluations)
+        triangles = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
+        return Extracted(triangles.vertices, triangles.faces, int(_singular(triangles).sum()), looked.evaluations)
 
     def _triangles(self, inputs: Mapping[str, np.ndarray]) -> Triangles:
         lattice = self.field.lattice(inputs)
@@ -217,17 +217,17 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         """The triangles of marching cubes, each with the ends of its edges, its cell, and where it is capped."""
         from rts_surfaces.implicit import lattice_samples_loops
 
-        found = self._triangles(inputs)
+        triangles = self._triangles(inputs)
         if len(self._usual) >= KEPT:
             self._usual.clear()
-        self._usual[fingerprint(inputs["values"])] = _usual(found)
-        faces, cells, caps = found.faces, found.cells, found.caps
+        self._usual[fingerprint(inputs["values"])] = _usual(triangles)
+        faces, cells, caps = triangles.faces, triangles.cells, triangles.caps
         if self.near_singular == "drop":
-            kept = ~_singular(found)[faces].any(axis=1)
+            kept = ~_singular(triangles)[faces].any(axis=1)
             faces, cells, caps = faces[kept], cells[kept], caps[kept]
         ids = np.empty((len(faces), 8), np.int32)
-        parallel(lattice_samples_loops.hand_on, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
-        return Proxy(found.vertices, faces, ids)
+        parallel(lattice_samples_loops.hand_on, len(ids), faces, triangles.ends, cells, caps, ids, work=10 * len(ids))
+        return Proxy(triangles.vertices, faces, ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
         """One: marching cubes wind all triangles by which side is inside."""
@@ -246,17 +246,17 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         if self.motion == "edge":
             params[:, 3] = least if self.near_singular == "bound" else 0.0
         isovalue, sign = self.field.level_of_values
-        given = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
+        arguments = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
         # Where no cell is covered there is a row nevertheless, of nothing.
         count = int(samples.row.max()) + 1
         made = points, params, least / lattice.step.max()
-        parallel(lattice_samples_loops.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
+        parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *made, work=300 * count)
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
         """The median, over all edges that are crossed, of the difference of their ends; kept since the triangles."""
-        found = self._usual.get(fingerprint(inputs["values"]))
-        return _usual(self._triangles(inputs)) if found is None else found
+        difference = self._usual.get(fingerprint(inputs["values"]))
+        return _usual(self._triangles(inputs)) if difference is None else difference
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
         """The lattice points that samples share."""
@@ -320,9 +320,9 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         """See `rts.Surface`: with near-singular edges as they are."""
         if self.near_singular != "bound":
             return None
-        found = copy.copy(self)
-        found.near_singular = "keep"
-        return found
+        surface = copy.copy(self)
+        surface.near_singular = "keep"
+        return surface
 
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
         """The field's, and in caps that of the bounds' side."""
@@ -345,12 +345,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.gbuffer(theta, position)
 
 
-def _singular(found: Triangles) -> np.ndarray:
+def _singular(triangles: Triangles) -> np.ndarray:
     """Which vertices lie on near-singular edges (V,) bool."""
-    return (found.differences > 0) & (found.differences < NEAR_SINGULAR * _usual(found))
+    return (triangles.differences > 0) & (triangles.differences < NEAR_SINGULAR * _usual(triangles))
 
 
-def _usual(found: Triangles) -> float:
+def _usual(triangles: Triangles) -> float:
     """The median difference of the ends of edges that are crossed."""
-    crossed = found.differences[found.differences > 0]
+    crossed = triangles.differences[triangles.differences > 0]
     return float(np.median(crossed)) if len(crossed) else 0.0

@@ -95,8 +95,8 @@ class LatticeField(ScalarField):
 
         Differentiable in the values and in the points.
         """
-        found = interpolated(theta["values"], points, self.lattice(theta))
-        return self.sign * (found - self.isovalue)
+        value = interpolated(theta["values"], points, self.lattice(theta))
+        return self.sign * (value - self.isovalue)
 
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The gradient (M, 3) of the level: central differences at lattice points, interpolated as the values are."""

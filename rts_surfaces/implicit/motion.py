@@ -62,8 +62,8 @@ def _push(
     from rts_surfaces.implicit import motion_loops
 
     values, params, rows = _checked(operands, 16)
-    given = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
-    parallel(motion_loops.push, len(rows), *given, work=30 * len(rows))
+    arguments = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
+    parallel(motion_loops.push, len(rows), *arguments, work=30 * len(rows))
 
 
 def _pull(
@@ -127,8 +127,8 @@ def _forward_edges(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue:
     from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
-    given = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_loops.cross, len(rows), *given, work=60 * len(rows))
+    arguments = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
+    parallel(motion_loops.cross, len(rows), *arguments, work=60 * len(rows))
 
 
 def _push_edges(
@@ -137,8 +137,8 @@ def _push_edges(
     from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
-    given = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_loops.push_crossings, len(rows), *given, work=60 * len(rows))
+    arguments = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
+    parallel(motion_loops.push_crossings, len(rows), *arguments, work=60 * len(rows))
 
 
 def _pull_edges(
@@ -153,8 +153,8 @@ def _pull_edges(
 
     values, params, rows, numbers = _checked(operands, 4)
     if results[0] is not None:
-        given = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
-        motion_loops.pull_crossings(*given)
+        arguments = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
+        motion_loops.pull_crossings(*arguments)
 
 
 ALONG_EDGES = Operation(

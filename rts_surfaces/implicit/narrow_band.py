@@ -155,7 +155,7 @@ class _Evaluate:
         return ROUNDING * float(np.finfo(values.dtype).eps) * lipschitz * far
 
     def _levels(self, loop: Callable, numbers: np.ndarray, items: np.ndarray, *args: Any) -> np.ndarray:
-        found = np.empty(0, self.dtype)
+        all_levels = np.empty(0, self.dtype)
         for first in range(0, len(items), self.chunk):
             some = items[first : first + self.chunk]
             places = np.empty((len(some), 3))
@@ -163,12 +163,12 @@ class _Evaluate:
             levels = np.asarray(self.level(places))
             self.count += len(some)
             if first == 0:
-                found, self.dtype = np.empty(len(items), levels.dtype), levels.dtype
-            found[first : first + len(some)] = levels
+                all_levels, self.dtype = np.empty(len(items), levels.dtype), levels.dtype
+            all_levels[first : first + len(some)] = levels
             wrong = np.isnan(levels) & (numbers[first : first + len(some)] >= 0)
             if self.refuses and wrong.any():
                 raise _Unknown(int(numbers[first + wrong.argmax()]))
-        return found
+        return all_levels
 
 
 class _Grid:
@@ -276,9 +276,9 @@ def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray
     directory, bricks = _bricks(grid.counts, np.uint8)
     bricks, used = loops.marked(blocks, grid.counts, directory, bricks, 0)
     rows = grid.corners(blocks)
-    found = [loops.crossed(blocks, rows, grid.values, grid.counts, closed)]
-    while len(found[-1][0]):
-        blocks, bricks, used = loops.beyond(*found[-1], grid.values, grid.counts, closed, directory, bricks, used)
+    fronts = [loops.crossed(blocks, rows, grid.values, grid.counts, closed)]
+    while len(fronts[-1][0]):
+        blocks, bricks, used = loops.beyond(*fronts[-1], grid.values, grid.counts, closed, directory, bricks, used)
         rows = grid.corners(blocks)
-        found.append((blocks, rows))
-    return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+        fronts.append((blocks, rows))
+    return np.concatenate([f[0] for f in fronts]), np.concatenate([f[1] for f in fronts])

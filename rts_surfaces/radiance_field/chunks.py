@@ -27,11 +27,11 @@ def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
     count = arrays[0].shape[0]
     if count <= rows:
         return f(*arrays)
-    engine, found = engine_of(arrays), []
+    engine, results = engine_of(arrays), []
     for start in range(0, count, rows):
         some = [x[start : start + rows, ...] for x in arrays]
-        found.append(engine.checkpoint(lambda: None, lambda _, some=some: f(*some)))
-    return engine.namespace.concat(found)
+        results.append(engine.checkpoint(lambda: None, lambda _, some=some: f(*some)))
+    return engine.namespace.concat(results)
 
 
 def fast_engine() -> Engine:

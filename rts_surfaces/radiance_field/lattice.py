@@ -72,18 +72,18 @@ def _computed(weights: Any, points: Lattice, progress: bool | None) -> np.ndarra
     with progress_bar(progress, "density", len(values)) as advance:
         for start in range(0, len(values), CHUNK):
             numbers = np.arange(start, min(start + CHUNK, len(values)))
-            found = density(weights, engine.constant(points.points(numbers).astype(np.float32)))
-            values[numbers] = engine.to_numpy(found)
+            densities = density(weights, engine.constant(points.points(numbers).astype(np.float32)))
+            values[numbers] = engine.to_numpy(densities)
             advance(len(numbers))
     return values.reshape(points.shape)
 
 
 def _key(weights: Any, points: Lattice) -> str:
     """A name that changes with weights and points."""
-    found = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
+    digest = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
     for place, array in placed(weights):
-        found.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()[:32]
+        digest.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
 
 
 def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:

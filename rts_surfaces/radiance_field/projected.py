@@ -81,15 +81,15 @@ class Projected(TriangleSurface):
 
     def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
         """The surface's triangles, seen from the world; they carry the depths of their corners, as bits of floats."""
-        found = self.surface.proxy(inputs, camera, size)
-        vertices = np.asarray(found.vertices, np.float64)
+        inner = self.surface.proxy(inputs, camera, size)
+        vertices = np.asarray(inner.vertices, np.float64)
         world = self.ndc.to_world(vertices)
         # NDC are a mirror image of the world: z grows with depth.
-        faces = np.ascontiguousarray(found.faces[:, ::-1])
-        depths = (-world[:, 2]).astype(np.float32)[found.faces]
-        assert found.ids is not None, "surfaces that refine samples say what these carry"
+        faces = np.ascontiguousarray(inner.faces[:, ::-1])
+        depths = (-world[:, 2]).astype(np.float32)[inner.faces]
+        assert inner.ids is not None, "surfaces that refine samples say what these carry"
         kept = (depths < DEEPEST * self.ndc.near).all(axis=1)
-        ids = np.concatenate([found.ids, depths.view(np.int32)], axis=1)
+        ids = np.concatenate([inner.ids, depths.view(np.int32)], axis=1)
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
 
     def pieces(self, proxy: Proxy) -> np.ndarray:

@@ -51,8 +51,8 @@ class RadianceShader(Shader):
         weights = theta["weights"]
         check_network(weights, "theta['weights']")
         position = gbuffer["position"]
-        given = weights, position, -unit(camera.toward(position))
-        weights, position, direction = constants(given, engine_of(given), exemplar(given))
+        trees = weights, position, -unit(camera.toward(position))
+        weights, position, direction = constants(trees, engine_of(trees), exemplar(trees))
         points = position if self.ndc is None else self.ndc.from_world(position)
         color = in_chunks(lambda p, d: radiance(weights, p, d), self.chunk, points, direction)
         xp = namespace(color)

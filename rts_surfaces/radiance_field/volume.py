@@ -110,20 +110,20 @@ def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
     def call(o: np.ndarray, d: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.ndarray:
         points = (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)
         directions = np.repeat(v, t.shape[1], axis=0)
-        found = in_chunks(rows, CHUNK, engine.constant(points), engine.constant(directions))
-        return engine.to_numpy(found).reshape(*t.shape, 4)
+        radiance = in_chunks(rows, CHUNK, engine.constant(points), engine.constant(directions))
+        return engine.to_numpy(radiance).reshape(*t.shape, 4)
 
     return call
 
 
-def _composited(found: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Premultiplied RGBA (R, 4), and the weight of each sample (R, S)."""
     lengths = np.concatenate([np.diff(t, axis=1), np.full_like(t[:, :1], LAST)], axis=1)
     lengths = lengths * np.linalg.norm(directions, axis=1, keepdims=True)
-    passed = np.exp(-found[..., 3] * lengths)
+    passed = np.exp(-radiance[..., 3] * lengths)
     before = np.cumprod(np.concatenate([np.ones_like(t[:, :1]), passed[:, :-1] + np.float32(1e-10)], axis=1), axis=1)
     weights = (1 - passed) * before
-    rgb = np.sum(weights[..., None] * found[..., :3], axis=1)
+    rgb = np.sum(weights[..., None] * radiance[..., :3], axis=1)
     return np.concatenate([rgb, np.sum(weights, axis=1, keepdims=True)], axis=1), weights
 
 

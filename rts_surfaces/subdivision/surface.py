@@ -104,9 +104,9 @@ class Subdivision(Parametric):
         uv_rule: str = "corners_plus1",
         tolerance: float = TOLERANCE,
     ):
-        for name, given, known in (("boundary", boundary, BOUNDARIES), ("uv_rule", uv_rule, UV_RULES)):
-            if not isinstance(given, str) or given not in known:
-                raise InputError(f"{name} is {quoted(given)}; expected one of {', '.join(map(repr, known))}")
+        for name, value, known in (("boundary", boundary, BOUNDARIES), ("uv_rule", uv_rule, UV_RULES)):
+            if not isinstance(value, str) or value not in known:
+                raise InputError(f"{name} is {quoted(value)}; expected one of {', '.join(map(repr, known))}")
         if not isinstance(chaikin, (bool, np.bool_)):
             raise InputError(f"chaikin is {quoted(chaikin)}; expected True or False")
         self._rules = Rules(boundary, bool(chaikin), uv_rule)
@@ -176,12 +176,12 @@ class Subdivision(Parametric):
         """
         from rts_surfaces.subdivision.obj_cages import read_cage
 
-        found = read_cage(path)
+        cage = read_cage(path)
         try:
-            surface = cls(found.faces, **found.options)
+            surface = cls(cage.faces, **cage.options)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-        return [Part(surface, found.theta, found.shader)]
+        return [Part(surface, cage.theta, cage.shader)]
 
     # ---------------------------------------------------------------------------------------------- checks
 
