@@ -60,7 +60,7 @@ def places(vertices, faces):
 
 @compiled
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
-    """Whether a triangle covers a pixel exactly, its least barycentric there, its depth, two barycentrics."""
+    """True if a triangle covers a pixel exactly; its least barycentric there, its depth, two barycentrics."""
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
     to_corner(matrix, vertices, ib, corners, 1)

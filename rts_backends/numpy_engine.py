@@ -26,7 +26,7 @@ class NumpyEngine(Engine):
     differentiates = False
 
     def owns(self, x: Any) -> bool:
-        """Whether `x` is a NumPy array."""
+        """True for a NumPy array."""
         return isinstance(x, np.ndarray)
 
     def constant(self, value: Any, like: Array | None = None) -> np.ndarray:

@@ -46,7 +46,7 @@ MANY = 1 << 16
 """Triangles from which on they are put in clusters; fewer gain nothing."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
-"""What stands for an order of triangles that is that of their indices."""
+"""Stands for the order of triangles by index."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -109,7 +109,7 @@ class Raster(TriangleSampler):
 
     @property
     def _draws(self) -> bool:
-        """Whether it draws itself, not a subclass, which may look at what was prepared."""
+        """True unless a subclass draws, which may look at what was prepared."""
         kind = type(self)
         return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
 

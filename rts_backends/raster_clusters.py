@@ -23,10 +23,10 @@ FRONTS, BACKS = 1, 2
 """Bits that say whether a cluster may hold triangles that face as asked for, and others."""
 
 AROUND = 1e-9
-"""What counts as nothing beside the terms of a sum, in float64: a cluster so near to the border of the view is kept."""
+"""Rounding of a sum in float64, as a share of its terms: a cluster so near to the border of the view is kept."""
 
 NOISE = 1e-13
-"""How far off the determinant of three corners may be, of the product of the largest numbers in it."""
+"""Rounding error of the determinant of three corners, as a share of the product of the largest numbers in it."""
 
 STEPS = np.float64(2**10 - 1)
 """The largest place on an axis."""
@@ -79,7 +79,7 @@ class Clusters(NamedTuple):
     def seen(
         self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool, asked: Blocks = EVERYTHING
     ) -> tuple[np.ndarray, ...]:
-        """What may be in view.
+        """Clusters and blocks of vertices that may be in view.
 
         Args:
             matrix: (4, 4) to homogeneous pixels.
@@ -89,8 +89,8 @@ class Clusters(NamedTuple):
             asked: the blocks of cells that are asked for.
 
         Returns:
-            Numbers of clusters (N,) int32, which triangles these may hold (N,) uint8 as bits, and numbers of blocks of
-            vertices, int32.
+            Numbers of clusters (N,) int32, the triangles that these may hold (N,) uint8 as bits `FRONTS` and `BACKS`,
+            and numbers of blocks of vertices, int32.
         """
         height, width = size
         # Positions a pixel outside of the image are not rounded into it.

@@ -72,7 +72,7 @@ class Rays(Sampler):
 
 
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
-    """What `intersect` of a surface gave, which must have the right shapes."""
+    """The result of a surface's `intersect`, refused if its shapes are wrong."""
     if not isinstance(hits, RayHits):
         raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected RayHits")
     grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths

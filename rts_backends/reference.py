@@ -69,7 +69,7 @@ def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray
 
 
 def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """Whether each triangle's outward normal points to the viewer's side; corners in homogeneous camera space."""
+    """Marks of triangles whose outward normal points to the viewer's side; corners in homogeneous camera space."""
     a, b, c = corners[:, 0, :3], corners[:, 1, :3], corners[:, 2, :3]
     toward = a * camera.projection[3, 2] + [0, 0, camera.projection[3, 3]]
     outward = np.cross(b - a, c - a) * np.sign(np.linalg.det(camera.view[:3, :3]))

@@ -64,7 +64,7 @@ class BSpline(Patches):
         )
 
     def bezier_rows(self, values: Array) -> Array:
-        """Those of all patches, by knot insertion: sums of control points with weights of at least zero."""
+        """Bézier control points of all patches, by knot insertion: sums of control points, weights at least zero."""
         xp, engine = namespace(values), engine_of(values)
         a, b = (engine.constant(m, values) for m in self._along)
         (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)

@@ -1,4 +1,4 @@
-"""Where rays meet bicubic patches, on the host, compiled: Newton's method, across the edges of patches.
+"""Hits of rays with bicubic patches, compiled: Newton's method, which may cross the edges of patches.
 
 Patches are in the form of powers, see `rts_surfaces.bicubic_loops`. It imports numba.
 """

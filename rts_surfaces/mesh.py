@@ -131,7 +131,7 @@ class Mesh(TriangleSurface):
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """Those of its faces, found once."""
+        """The pieces of the mesh's faces, computed once."""
         if self._pieces is None:
             self._pieces = pieces(self.faces)
         return self._pieces

@@ -8,9 +8,9 @@ from rts import InputError, namespace
 from rts.plugin_api.arrays import Tree, shape_of
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
-"""What the G-buffer calls an entry, if not by its own name."""
+"""Names in the G-buffer of entries of θ that have another name there."""
 WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
-"""How many numbers there are for each vertex or control point."""
+"""Numbers for each vertex or control point."""
 
 RESERVED = ("vertices", "points", "position", "normal")
 """Names that no further attribute may have."""

@@ -23,7 +23,7 @@ TOLERANCE = 0.1
 """Pixels that a triangle may be off the surface where there may be an outline."""
 
 TOLERANCES = (0.8, 0.3, 0.1, 0.05)
-"""Those of `rates`."""
+"""Tolerances that `rates` offers."""
 
 RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS = 1e-4, 6, 0.25, 0.02, 8
 """Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, how far a sample may lie

@@ -88,14 +88,14 @@ class Patches(Parametric):
 
     @abc.abstractmethod
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """What is wrong with the shape of an entry of θ but for its last axis, in words; None for nothing."""
+        """The shape expected of an entry of θ without its last axis, in words; None if it is right."""
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
         """The control points, as `bezier_rows` takes them."""
         return theta["points"]
 
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
-        """What shape an entry of θ is to have, in words; None if it has it."""
+        """The shape expected of an entry of θ, in words; None if it is right."""
         wrong = self.control_shape(shape[:-1]) if shape else "an array"
         if wrong is None and shape[-1] not in WIDTHS[name]:
             return f"a last axis of {' or '.join(map(str, WIDTHS[name]))}"
@@ -142,8 +142,8 @@ class Patches(Parametric):
 def across(sides: np.ndarray) -> np.ndarray:
     """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
 
-    Where more than two patches share an edge it is the one half way round. So a side that is a single point leads to
-    the patch on the other side of the point.
+    Where more than two patches share an edge, the one half way round follows. So a side that is a single point leads
+    to the patch on the other side of the point.
 
     Args:
         sides: (n, 4), the edges of `Tiles`.

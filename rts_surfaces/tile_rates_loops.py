@@ -1,4 +1,4 @@
-"""How finely tiles are to be cut: their shapes, where outlines may be, and rates. Compiled.
+"""Rates at which tiles are cut, from their shapes and from where outlines may be. Compiled.
 
 Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
 """
@@ -25,7 +25,7 @@ def _dot(a, b):
 
 @compiled
 def _slopes(found, frame, slopes):
-    """Derivatives along s and t (2, 3), of those in parameters of the patch."""
+    """Derivatives along s and t (2, 3), from derivatives in parameters of the patch."""
     for k in range(2):
         for c in range(3):
             slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]

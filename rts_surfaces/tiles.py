@@ -22,14 +22,14 @@ MOST = 256
 MOST_TRIANGLES = 2**27
 """The largest number of triangles: 8 GiB."""
 LEAST = {4: 2, 3: 3}
-"""How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
+"""Least number of cuts of a tile of so many sides, if it is cut at all, so that points lie within it."""
 AT_ONCE = 2048
-"""Tiles whose shapes are looked at together."""
+"""Tiles whose shapes are computed together."""
 GRID = {4: 3, 3: 5}
-"""Points along each side of a tile of so many sides at which its shape is looked at."""
+"""Points along each side of a tile of so many sides at which its shape is measured."""
 ENOUGH, FINEST = 500, 4
-"""Where patches are fewer than this, they are looked at in smaller tiles, at most so many along a side: so that they
-need not be as fine all over as they are at outlines."""
+"""Patches that are fewer than this are split into smaller tiles, at most so many along a side. So only tiles at
+outlines need to be fine."""
 
 Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 """(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), these and
@@ -76,7 +76,7 @@ class Tiles(NamedTuple):
 
 
 class Shapes(NamedTuple):
-    """What triangles by error need to know of tiles, float64.
+    """Shapes of tiles, float64, from which their errors as triangles follow.
 
     Attributes:
         normals: (n, G, G, 3) of unit length, or zero, at a grid of points.
@@ -189,11 +189,11 @@ def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray)
 
 
 class Allowed(NamedTuple):
-    """How far triangles may be off the surface, in units of space; infinity where out of view.
+    """Allowed distance of triangles from the surface, in units of space; infinity out of view.
 
     Attributes:
         chord: (n,), of each tile.
-        edge: (n,), those at its edges, should they be outlines.
+        edge: (n,), at the edges of each tile, should these be outlines.
         facing: (n,) int8: 1 where all of a tile faces the viewer, −1 where none does, else 0.
     """
 
@@ -208,10 +208,10 @@ class Allowed(NamedTuple):
 
 
 def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> Allowed:
-    """How far triangles may be off in a view.
+    """The allowed distances of triangles from the surface in a view.
 
     Args:
-        view: what the camera sees.
+        view: the camera's view.
         tile_shapes: the shapes of the tiles.
         fine: pixels, where a tile or an edge may have an outline.
         coarse: pixels elsewhere.

@@ -74,21 +74,21 @@ def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
 
 def _matrix(name: str, node: dict[str, Any], fail: Any) -> np.ndarray:
     """The transform (4, 4) of a node, but for its rotation, which changes no volume. Its numbers are checked."""
-    properties = {key: node[key] for key in _WIDTHS if key in node}
-    for key, values in properties.items():
+    entries = {key: node[key] for key in _WIDTHS if key in node}
+    for key, values in entries.items():
         numbers = isinstance(values, list) and all(isinstance(x, (int, float)) and x is not True for x in values)
         if not numbers or len(values) != _WIDTHS[key]:
             raise fail(f"{key} of {name} is {str(values)[:80]}; expected {_WIDTHS[key]} numbers")
-    if "matrix" in properties and len(properties) > 1:
+    if "matrix" in entries and len(entries) > 1:
         raise fail(
-            f"{name} has both matrix and {', '.join(key for key in properties if key != 'matrix')}; expected one of them"
+            f"{name} has both matrix and {', '.join(key for key in entries if key != 'matrix')}; expected one of them"
         )
     matrix = np.eye(4)
-    if "matrix" in properties:
-        matrix = np.array(properties["matrix"], np.float64).reshape(4, 4).T
-    matrix[:3, 3] += properties.get("translation", 0)
-    matrix[:3, :3] *= properties.get("scale", 1)
-    length = np.linalg.norm(np.array(properties.get("rotation", [0, 0, 0, 1]), np.float64))
+    if "matrix" in entries:
+        matrix = np.array(entries["matrix"], np.float64).reshape(4, 4).T
+    matrix[:3, 3] += entries.get("translation", 0)
+    matrix[:3, :3] *= entries.get("scale", 1)
+    length = np.linalg.norm(np.array(entries.get("rotation", [0, 0, 0, 1]), np.float64))
     if not abs(length - 1) <= 0.01:
-        raise fail(f"rotation of {name} is {properties['rotation']}; expected a quaternion of length 1")
+        raise fail(f"rotation of {name} is {entries['rotation']}; expected a quaternion of length 1")
     return matrix

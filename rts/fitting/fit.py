@@ -250,10 +250,10 @@ class _Function(Residuals):
         return quoted(self._function)
 
 
-def _residuals(given: Any, what: str) -> Residuals:
+def _residuals(value: Any, what: str) -> Residuals:
     """An object as `rts.Residuals`; functions are wrapped. `what` names it in errors."""
-    function = callable(given) and not isinstance(given, (Residuals, type))
-    residuals = _Function(given) if function else given
+    function = callable(value) and not isinstance(value, (Residuals, type))
+    residuals = _Function(value) if function else value
     return checked_plugin(residuals, what, Residuals, "a function of the parameters, ")
 
 

@@ -109,7 +109,7 @@ def finest(supersample: Any) -> Any:
 
 
 def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:
-    """Cells (H, W) bool at outlines: the front ends towards a neighbour, or a neighbour's towards it, or may by rounding.
+    """Cells (H, W) bool at outlines: a front ends, or may by rounding, towards a neighbour, or the reverse.
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.

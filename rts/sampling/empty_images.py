@@ -45,7 +45,7 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
 
 
 def out_of_view(part: CheckedPart, camera: Camera) -> str | None:
-    """The place of a part outside of the view, such as "lies behind …"; None if some of it may be seen, or if traced."""
+    """The place of a part outside of the view, such as "lies behind …"; None if it may be seen, or is traced."""
     if not isinstance(part.surface, TriangleSurface):
         return None
     known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))

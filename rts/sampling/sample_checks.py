@@ -47,11 +47,11 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
         )
     width = 2 if corners is None else corners.shape[2]
     if not surface.refines and width != surface.sample_widths[1]:
-        description = (
+        corner_text = (
             "no corner_params, and so 2 barycentrics" if corners is None else f"corner_params of {width} numbers"
         )
         raise InputError(
-            f"the proxy of {surface!r} has {description} a corner, but sample_widths says {surface.sample_widths[1]}; make "
+            f"the proxy of {surface!r} has {corner_text} a corner, but sample_widths says {surface.sample_widths[1]}; make "
             f"them agree"
         )
     for name, array in (("ids", ids), ("corner_params", corners)):

@@ -70,7 +70,7 @@ def split(runs, gap, lines, across):
 
 @loop
 def number(active, pieces, high, pitch, across, pixel):
-    """Fill in the places of active pixels in the layout, in pixels: `across` in a line, lines of pieces `pitch` apart."""
+    """Fill in the places of active pixels in the layout, in pixels: `across` a line, lines of pieces `pitch` apart."""
     height, _ = active.shape
     for strip, first, columns, line, at in pieces:
         for y in range(strip * high, min(height, (strip + 1) * high)):

@@ -20,7 +20,7 @@ from rts_backends.exact_hits import corner_lists, look, places
 from rts_backends.triangles import facing, pixel_matrix
 
 STEP = 1e-6
-"""How far beyond a hit the next ray starts, as a share of the object's size; float32 resolves about a tenth of it."""
+"""Distance from a hit to the next ray's start, a share of the object's size; float32 resolves a tenth of it."""
 REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 

@@ -72,7 +72,7 @@ def _pointer(typing_context, address):
 
 @compiled(error_model="numpy")
 def _decide(t, state, work, vertices, faces):
-    """Whether a triangle is hit, and at which depth; see `cast` for `work`."""
+    """True if a triangle is hit, and the depth of the hit; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)

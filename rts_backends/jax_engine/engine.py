@@ -48,7 +48,7 @@ class JaxEngine(Engine):
         self._used = UsedRows()
 
     def owns(self, x: Any) -> bool:
-        """Whether `x` is a jax array or a tracer."""
+        """True for a jax array or a tracer."""
         return isinstance(x, jax.Array)
 
     def constant(self, value: Any, like: jax.Array | None = None) -> jax.Array:
@@ -88,11 +88,11 @@ class JaxEngine(Engine):
         return tuple(results)
 
     def traced(self, x: jax.Array) -> bool:
-        """Whether `x` is a tracer."""
+        """True for a tracer."""
         return isinstance(x, Tracer)
 
     def plain(self, x: jax.Array) -> bool:
-        """Whether it is of real numbers."""
+        """True for an array of real numbers."""
         return getattr(x.dtype, "kind", None) in _REAL_KINDS
 
     def admitted(self, x: jax.Array, name: str) -> jax.Array:
@@ -107,7 +107,7 @@ class JaxEngine(Engine):
         return None if isinstance(x, Tracer) else np.asarray(x)
 
     def on_host(self, *arrays: jax.Array) -> bool:
-        """Whether all are on CPUs; of a tracer that is not known yet, and taken to be so."""
+        """True if all arrays are on CPUs. The device of a tracer is not known yet, and taken to be one."""
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
@@ -117,7 +117,7 @@ class JaxEngine(Engine):
         return super().by_host(f, otherwise, *arrays)
 
     def take_error(self) -> RtsError | None:
-        """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""
+        """The error of the latest host call under a trace, once; jax replaces it by an error of its own."""
         error, self._error = self._error, None
         return error
 

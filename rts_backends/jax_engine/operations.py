@@ -33,7 +33,7 @@ from rts_backends.jax_engine.host import clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
-"""Which of the differentiable operands have a tangent or want a gradient."""
+"""Marks of the differentiable operands that have a tangent or want a gradient."""
 
 MOST_KEPT = 1 << 24
 """The most bytes that are kept of what values leave to derivatives."""
@@ -55,7 +55,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
 
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
-    """Whether loops may compute it: dtypes are theirs; on what device arrays are, a traced function cannot know."""
+    """True if loops may compute the operation, by its dtypes; a traced function cannot know the device of arrays."""
     return not _specifying.get() and operation.fits([x.dtype for x in operands])
 
 
@@ -151,7 +151,7 @@ class _Differentiable:
 
     @staticmethod
     def told(operation: Operation) -> bool:
-        """Whether its functions are told how many rows are in use."""
+        """True if the operation's functions take the number of rows in use."""
         return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:

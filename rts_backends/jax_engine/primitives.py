@@ -83,7 +83,7 @@ class HostPrimitive:
         return [*samples, *rest]
 
     def _by_item(self, operands: Sequence[Any], params: dict) -> list[bool]:
-        """Which operands have the axis B."""
+        """Marks of the operands that have the axis B."""
         return [x.ndim > rank for x, rank in zip(operands, self._own_ranks(params), strict=True)]
 
     def _results(self, operands: Sequence[Any], params: dict) -> list[jax.ShapeDtypeStruct]:
@@ -199,7 +199,7 @@ def _only_row(value: Any) -> Any:
 
 
 def _read_once(value: Any) -> bool:
-    """Whether an array in a program that is about to be compiled is made there, and one operation reads it so far."""
+    """True for an array that a program about to be compiled makes, and only one operation reads so far."""
     name = getattr(value.owner, "name", "stablehlo.constant")  # An argument's owner has no name.
     return name != "stablehlo.constant" and sum(1 for _ in value.uses) == 1
 

@@ -23,14 +23,14 @@ from jax.interpreters import ad, batching, mlir
 from rts_backends.jax_engine.columns import summed_by_columns, variables
 
 PIECE = 1 << 11
-"""Rows that are taken at a time: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in
-caches, and that XLA does not wake its other threads for each."""
+"""Rows of a piece: enough to be worth XLA's calls, and few enough that intermediate arrays stay in caches, and that XLA
+does not wake its other threads for each."""
 
 LEAST = 1 << 15
-"""Rows, below which all are computed: a loop would take as long as it saves."""
+"""Below this number of rows all are computed: a loop would cost as much as it saves."""
 
 CLOSED = 1 << 16
-"""The most numbers that a function may close over: their gradients are as large as they are, for each piece."""
+"""The most numbers that a function may close over: each piece has a gradient of their size."""
 
 
 def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array]) -> jax.Array | None:
@@ -38,12 +38,12 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 
     Args:
         f: arrays (n, ·) → (n, ·), for any n.
-        used: how many rows are in use, () int32.
+        used: the number of rows in use, () int32.
         rows: arrays (N, ·).
 
     Returns:
-        The value, or None where the whole of it may as well be computed: of few rows; of a function that closes over
-        much, that does not read rows, or that has effects, which must happen once.
+        The value, or None where all rows may as well be computed: they are few, or the function closes over much, does
+        not read rows, or has effects, which must happen once.
     """
     if rows[0].shape[0] < max(LEAST, PIECE):
         return None
@@ -59,7 +59,7 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
-    """A function without what does not depend on its arguments, and the results of that, which it takes before them."""
+    """A function without the equations that its arguments do not enter; it takes their results, returned, first."""
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
         # Numbers spread over the rows of a piece are no less to keep than to make.
@@ -82,14 +82,14 @@ _SPREADING = {"broadcast_in_dim", "iota"}
 
 
 class _Pieces:
-    """How a function of rows is computed.
+    """A function of rows, computed piece by piece.
 
     Args:
         jaxpr: the function of a piece: arrays that are the same for all pieces, and arrays (n, ·) → (n, ·).
         operands: its operands, the latter (N, ·).
-        fixed: how many are the same for all pieces.
-        most: how many rows are in use, at most; None to go through all.
-        used: how many rows are in use.
+        fixed: the number of operands that are the same for all pieces.
+        most: the largest number of rows in use; None to go through all.
+        used: the number of rows in use.
     """
 
     def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], fixed: int, most: Any, used: Any):
@@ -232,7 +232,7 @@ def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
 
 
 def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
-    """Which tangents there are; integers have none."""
+    """Marks of the tangents that are not zero; integers have none."""
     return tuple(type(t) is not ad.Zero and t.dtype != jax.dtypes.float0 for t in tangents)
 
 

@@ -152,7 +152,7 @@ def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
 
 
 def _ratio(camera: Camera, near: float, far: float) -> float:
-    """How many times as wide a pixel is at one depth as at another; infinity where it is a point there."""
+    """The width of a pixel at depth `far` over that at `near`; infinity where the pixel is a point at `near`."""
     first, last = (camera.projection[3, 3] - camera.projection[3, 2] * z for z in (near, far))
     return float(last / first) if first > 0 else np.inf
 

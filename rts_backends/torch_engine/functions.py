@@ -29,7 +29,7 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
 
 
 def transformed() -> bool:
-    """Whether a transform of torch, forward mode or a compilation looks at what is computed now."""
+    """True while a transform of torch, forward mode or a compilation traces the computation."""
     if torch.compiler.is_compiling() or private.forward_level() >= 0:
         return True
     return private.maybe_current_level() is not None
@@ -48,7 +48,7 @@ def quiet_forward_mode() -> None:
 
 
 def foreign(*tensors: Tensor | None) -> bool:
-    """Whether any is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
+    """True if a tensor is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which hides its values."""
     for t in tensors:
         if t is not None and private.is_legacy_batchedtensor(t):
             return True

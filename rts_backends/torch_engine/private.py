@@ -43,7 +43,7 @@ except ImportError:
 
 
 is_zero = getattr(Tensor, "_is_zerotensor", lambda x: False)
-"""Whether a tensor stands for zeros, without memory."""
+"""True for a tensor that stands for zeros, without memory."""
 
 
 def forward_level() -> int:

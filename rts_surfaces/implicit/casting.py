@@ -1,4 +1,4 @@
-"""Where rays meet a field's surface: steps that bracket changes of sign, then roots in the brackets."""
+"""Ray casting of a field's surface: steps that bracket changes of sign, then roots in the brackets."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import RayHits
 
 STEPS, WITH_BOUND = 256, 512
-"""How many of the shortest steps there are across the region, without and with a Lipschitz constant."""
+"""The number of shortest steps across the region, without and with a Lipschitz constant."""
 
 SECANT, NEWTON = 5, 2
-"""How often the methods of Illinois and of Newton are applied in a bracket."""
+"""Steps of the methods of Illinois and of Newton in a bracket."""
 
 CROWDED = 0.75
-"""The share of rays that still go on at which the others are taken out."""
+"""Finished rays are removed when less than this share of the rays goes on."""
 
 FLATTEST = 1e-6
-"""The least square of a slope that points are moved by, as a share of the usual one; flatter places move less."""
+"""Least squared slope by which points are moved, as a share of the usual one; flatter places move less."""
 
 
 class Region(NamedTuple):
-    """Where surfaces are looked for: a `ball` or a `box`.
+    """The region in which rays are followed: a `ball` or a `box`.
 
     Attributes:
-        span: origins and directions (R, 3) → (R,) where rays enter, or 0 where they begin within, and (R,) where they
-            leave, in units of their directions; both are 0 for rays that miss it.
-        across: the length of the longest ray within it.
+        span: origins and directions (R, 3) → distances (R,) at which rays enter, 0 if they begin within, and (R,) at
+            which they leave, in units of their directions; both are 0 for rays that miss the region.
+        across: the length of the longest ray within the region.
     """
 
     span: Callable[[Array, Array], tuple[Array, Array]]
@@ -262,7 +262,7 @@ def _cast_all(
 
 
 def _roots(level: Callable, free: Callable, rays: _Rays, bracket: _Bracket) -> Array:
-    """Where a function has its zero along rays (M,), each within its own bracket, which it never leaves."""
+    """Zeros (M,) of a function along rays, each within its own bracket, which no step leaves."""
     engine = engine_of(bracket.low)
     xp, (low, high, below, above) = engine.namespace, bracket
     t = low
@@ -290,7 +290,7 @@ def _rows(tree: Any, index: Array) -> Any:
 
 
 def _change_sign(before: Array, after: Array) -> Array:
-    """Whether one is inside and the other outside; what is not a number is neither."""
+    """True where one value is inside and the other outside; NaN is neither."""
     return ((before < 0) & (after >= 0)) | ((before >= 0) & (after < 0))
 
 

@@ -18,20 +18,20 @@ from rts.plugin_api.records import Samples
 from rts_surfaces.parameter_checks import RESERVED
 
 LARGEST = 1e38
-"""What is larger is no number of single precision."""
+"""Larger values count as no number of single precision."""
 
 Function = Callable[[Mapping[str, Tree], Array], Array]
 """A function of θ and points (M, 3)."""
 
 SIDES = {"below": 1.0, "above": -1.0}
-"""Which values are inside, and what turns these negative."""
+"""The sides of the isovalue that may be the inside, and the sign that makes the values there negative."""
 
 
 class ScalarField(abc.ABC):
-    """A number at every point of space, as surfaces use it: negative inside.
+    """A scalar field as surfaces use it: a number at every point of space, negative inside.
 
     Attributes:
-        name: what errors call it.
+        name: its name in errors.
     """
 
     name: str
@@ -42,11 +42,11 @@ class ScalarField(abc.ABC):
 
     @abc.abstractmethod
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ without them."""
+        """Refuse θ that lacks such an entry."""
 
     @abc.abstractmethod
     def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """How far the field is from the isovalue, negative inside; what has the isovalue itself counts as outside.
+        """The field minus the isovalue, with the sign that makes it negative inside; zero counts as outside.
 
         Args:
             theta: θ.
@@ -151,7 +151,7 @@ class Field(ScalarField):
 
 
 class Implicit(Surface):
-    """What surfaces of a field share: which entries of θ they read, and their G-buffer.
+    """Base class of surfaces of a field: the entries of θ that they read, and their G-buffer.
 
     Args:
         field: the field.
@@ -172,11 +172,11 @@ class Implicit(Surface):
         self.field, self.attributes = field, dict(attributes or {})
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """What the field reads; all entries where there are attributes."""
+        """The entries that the field reads; all entries if there are attributes."""
         return tuple(theta) if self.attributes else self.field.names(theta)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ without what the field reads."""
+        """Refuse θ that lacks an entry which the field reads."""
         self.field.check(theta)
 
     def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:

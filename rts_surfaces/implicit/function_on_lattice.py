@@ -22,12 +22,12 @@ CHUNK = 2**15
 
 
 class Looked(NamedTuple):
-    """What is known of a field at lattice points.
+    """Values of a field at lattice points.
 
     Attributes:
-        inputs: what `TriangleSurface.proxy_inputs` gives: "values" (X, Y, Z); or "values" (M,), "numbers" (M,),
+        inputs: the result of `TriangleSurface.proxy_inputs`: "values" (X, Y, Z); or "values" (M,), "numbers" (M,),
             "corners" (C, 8) and "cells" (C, 3) of a `Band`.
-        evaluations: how many points a function was evaluated at.
+        evaluations: the number of points at which a function was evaluated.
     """
 
     inputs: dict[str, Array]
@@ -49,10 +49,10 @@ class Resampled(NamedTuple):
 
 
 class FunctionOnLattice(Field):
-    """A field that is looked at on a lattice; see `Field`, and `Isosurface` for the arguments.
+    """A field that is evaluated at the points of a lattice; see `Field`, and `Isosurface` for the arguments.
 
     Attributes:
-        level_of_values: isovalue and sign of what `look` gives: the level itself.
+        level_of_values: isovalue and sign of the values that `look` gives, which are levels already.
     """
 
     level_of_values = (0.0, 1.0)

@@ -34,13 +34,13 @@ NEAR_SINGULAR = 1e-3
 """An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
 
 BESIDE = 1e-3
-"""How far before the bounds rays begin where the surface is capped, as a share of the bounds: they meet the caps."""
+"""Distance before the bounds at which rays begin if the surface is capped, so that they meet the caps; a share."""
 
 STEPS_PER_CELL = 2
 """Steps of rays across the narrowest side of a cell, where there is no Lipschitz bound."""
 
 ON_SIDE = 1e-6
-"""How near to the bounds' side points of a cap are, as a share of the bounds."""
+"""Largest distance of a cap's points from the bounds' side, as a share of the bounds."""
 
 KEPT = 4
 """Fields whose usual differences are remembered."""
@@ -49,13 +49,13 @@ MOTIONS, ENDS, SINGULAR = ("normal", "edge"), ("capped", "open"), ("bound", "dro
 
 
 class Extracted(NamedTuple):
-    """An isosurface as triangles, and what it took to find them.
+    """An isosurface as triangles, and the cost of their extraction.
 
     Attributes:
         vertices: (V, 3) float32, on edges of the lattice.
         faces: (T, 3) int32, counter-clockwise seen from outside.
-        near_singular: how many of the edges that are crossed are near-singular.
-        evaluations: at how many points the function was evaluated; 0 where values are given.
+        near_singular: the number of crossed edges that are near-singular.
+        evaluations: the number of points at which the function was evaluated; 0 where values are given.
     """
 
     vertices: np.ndarray
@@ -65,7 +65,7 @@ class Extracted(NamedTuple):
 
 
 class Isosurface(Implicit, TriangleSurface, RaySurface):
-    """Where a field has one value: θ["values"] (X, Y, Z) at the points of a lattice, or a function of θ and points.
+    """The isosurface of a field: θ["values"] (X, Y, Z) at the points of a lattice, or a function of θ and points.
 
     A sample's ids are the numbers of six lattice points, the ends of three edges; point (x, y, z) has the number
     (x Y + y) Z + z. The first three of its parameters are the barycentrics in the triangle between these edges.
@@ -174,7 +174,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.look(theta, self.closed).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
-        """The triangles of marching cubes, dropped ones included, and what they cost.
+        """The triangles of marching cubes, dropped ones included, and their cost.
 
         Args:
             theta: θ, with values that are known.
@@ -206,7 +206,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         raise InputError(f"{self.field.name} is {value} at lattice point [{at}]; expected finite numbers")
 
     def why_no_triangles(self, inputs: Mapping[str, np.ndarray]) -> str:
-        """Where the field lies beside the isovalue; one text for all values, so that a loop warns once."""
+        """The side of the isovalue on which the whole field lies; one text for all values: a loop warns only once."""
         values, (isovalue, sign) = inputs["values"], self.field.level_of_values
         if "corners" in inputs:
             return f"has no surface: its band found no place where the field crosses the isovalue {self.isovalue:g}"
@@ -230,11 +230,11 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return Proxy(triangles.vertices, faces, ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """One: marching cubes wind all triangles by which side is inside."""
+        """One piece: marching cubes wind all triangles by which side is inside."""
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
-        """What samples carry: weights of the six values, their place, and how they move; and lattice points merged."""
+        """Samples with their parameters: weights of the six values, place and motion; and merged lattice points."""
         from rts_surfaces.implicit import lattice_samples_loops
 
         lattice = self.field.lattice(inputs)
@@ -254,7 +254,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
-        """The median, over all edges that are crossed, of the difference of their ends; kept since the triangles."""
+        """The median difference of the ends of crossed edges, kept from when the triangles were made."""
         difference = self._usual.get(fingerprint(inputs["values"]))
         return _usual(self._triangles(inputs)) if difference is None else difference
 
@@ -265,7 +265,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ------------------------------------------------------------------------------------ evaluation and rays
 
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
-        """Where rays meet the field itself within the bounds, and the caps; see `rts.RaySurface`."""
+        """Hits of rays with the field itself within the bounds, and with the caps; see `rts.RaySurface`."""
         lattice, (low, high) = self.field.lattice(theta), self.bounds
         values, margin = theta.get("values"), BESIDE * (high - low) if self.closed else 0.0
         known = engine_of(values).known(values) if isinstance(self.field, LatticeField) else None
@@ -325,7 +325,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return surface
 
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
-        """The field's, and in caps that of the bounds' side."""
+        """The normal of the field; in caps that of the bounds' side."""
         xp, caps = namespace(position), self._caps(engine_of(position).stop_gradient(position))
         capped = xp.max(xp.abs(caps), axis=-1, keepdims=True) > 0
         return xp.where(capped, unit(caps), super().normal(theta, position))
@@ -346,7 +346,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
 
 def _singular(triangles: Triangles) -> np.ndarray:
-    """Which vertices lie on near-singular edges (V,) bool."""
+    """Marks (V,) bool of vertices on near-singular edges."""
     return (triangles.differences > 0) & (triangles.differences < NEAR_SINGULAR * _usual(triangles))
 
 

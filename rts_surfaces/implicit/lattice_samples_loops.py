@@ -1,4 +1,4 @@
-"""What samples of an isosurface carry, compiled."""
+"""Parameters of an isosurface's samples, compiled."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 
 LARGEST = 1e38
-"""What is larger is no number of single precision: fields that are flat to the last digit move nothing."""
+"""Larger values count as no number of single precision: fields that are flat to the last digit move nothing."""
 
 
 @compiled(inline="always")

@@ -1,6 +1,6 @@
-"""Marching cubes: which edges of a cell each of its triangles has its corners on, by the signs at the cell's corners.
+"""Marching cubes: the edges of a cell on which its triangles' corners lie, by the signs at the cell's corners.
 
-The table of the 256 cases is that of PyMCubes, asked once, by 256 single cells. Values at lattice points only say where
+The table of the 256 cases is read off PyMCubes once, from 256 single cells. Values at lattice points only decide where
 on an edge a corner lies.
 """
 
@@ -46,7 +46,7 @@ class Triangles(NamedTuple):
 
 @functools.cache
 def cases() -> tuple[np.ndarray, np.ndarray]:
-    """How many triangles (256,) uint8 cells have, and the edges (256, 5, 3) int8 that their corners lie on.
+    """The number of triangles (256,) uint8 of a cell, and the edges (256, 5, 3) int8 that their corners lie on.
 
     Bit i of the number of a case says whether corner i is inside.
 

@@ -1,4 +1,4 @@
-"""How samples of an isosurface move with the field: along its gradient, or along the edges of the lattice; operations.
+"""Operations that move an isosurface's samples with the field: along its gradient, or along the lattice's edges.
 
 Both take values (M,), params (N, P) in their dtype, and rows (N, 6) int32: the six values of each sample.
 """
@@ -19,7 +19,7 @@ Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
 """Shape, first point and step of a lattice."""
 
 _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
-"""Which parameters of a sample are the weights of the six values, its place, and by how much it moves for a unit."""
+"""Parameters of a sample: the weights of the six values, its place, and its motion for a unit of level."""
 
 
 def _by_level(values: Array, params: Array, rows: Array, *, isovalue: float, sign: float) -> Array:
@@ -108,7 +108,7 @@ def _by_crossings(
 
 
 def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """How far along an edge the level is zero (N,); its derivative as if the ends differed by `least` or more."""
+    """The place (N,) along an edge where the level is zero; its derivative as if the ends differed by `least`."""
     engine = engine_of(f_a)
     xp, apart = engine.namespace, f_b - f_a
     same = apart == 0

@@ -21,7 +21,7 @@ Level = Callable[[np.ndarray], np.ndarray]
 WORK = 5
 """Nanoseconds that a place takes."""
 ROUNDING = 4
-"""How many times the last digit of its scale, Lipschitz bound times coordinates, a level may be off."""
+"""Rounding error of a level, in last digits of its scale: the Lipschitz bound times coordinates."""
 
 
 class Band(NamedTuple):
@@ -33,7 +33,7 @@ class Band(NamedTuple):
         corners: (C, 8) int32, the rows of `numbers` of the corners of each cell. Corner i has the offsets (i & 1,
             i >> 1 & 1, i >> 2 & 1) along x, y and z.
         cells: (C, 3) int32, the coordinates of the lowest corner of each cell; each cell once, in no special order.
-        evaluations: how many points the level was evaluated at.
+        evaluations: the number of points at which the level was evaluated.
     """
 
     numbers: np.ndarray
@@ -53,9 +53,9 @@ class NarrowBand:
     Without one, coarse cells whose corners differ in sign are halved, with those around them; after that, only those
     of the halves whose corners differ in sign. At every fineness the surface is then followed across the sides of cells
     that it crosses. So each coarse cell whose corners differ in sign has cells in the band, and none of them ends in a
-    hole: the neighbour is in the band, too, wherever four corners that both have differ in sign. What lies between
-    coarse corners of one sign, and does not hang together with what they see, is found only where it shows at the
-    corners of half as coarse cells, within the margin.
+    hole: the neighbour is in the band, too, wherever four corners that both have differ in sign. A part of the
+    surface between coarse corners of one sign, apart from the rest, is found only where it shows at the corners of half
+    as coarse cells, within the margin.
 
     Args:
         lipschitz: how fast the level changes at most, per unit of length; None where this is not known.
@@ -124,7 +124,7 @@ class _Unknown(Exception):
 
 
 class _Evaluate:
-    """The level at points of a lattice, in chunks, counted; while it `refuses` NaN, `_Unknown` where there is one."""
+    """The level at points of a lattice, in chunks, counted. While it `refuses` NaN, a NaN raises `_Unknown`."""
 
     def __init__(self, level: Level, lattice: Lattice, chunk: int):
         self.level, self.chunk, self.count, self.refuses = level, chunk, 0, True
@@ -133,7 +133,7 @@ class _Evaluate:
         self.low, self.step = tuple(lattice.low.tolist()), tuple(lattice.step.tolist())
 
     def counts(self, side: int) -> tuple[int, ...]:
-        """How many blocks of such a side there are along each axis."""
+        """The number of blocks of such a side along each axis."""
         return tuple(-(-(n - 1) // side) for n in self.shape)
 
     def all_blocks(self, side: int) -> np.ndarray:
@@ -150,7 +150,7 @@ class _Evaluate:
         return numbers, self._levels(loops.centres, numbers, blocks, side, self.shape, self.low, self.step)
 
     def slack(self, values: np.ndarray, lipschitz: float) -> float:
-        """How far levels may be off by rounding."""
+        """The largest rounding error of levels."""
         far = max(max(abs(x), abs(x + s * (n - 1))) for x, s, n in zip(self.low, self.step, self.shape, strict=True))
         return ROUNDING * float(np.finfo(values.dtype).eps) * lipschitz * far
 

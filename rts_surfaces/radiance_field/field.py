@@ -43,7 +43,7 @@ class RadianceField:
         return f"RadianceField({', '.join(f'{name}: {self.architecture(name)}' for name in NETWORKS)})"
 
     def architecture(self, network: str = "fine") -> Architecture:
-        """What the network "coarse" or "fine" is like."""
+        """The architecture of the network "coarse" or "fine"."""
         return check_network(self.weights[network])
 
     def save(self, path: Any) -> None:

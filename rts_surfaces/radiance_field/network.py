@@ -27,14 +27,14 @@ REPEATED = ("layers_xyz", "layers_dir")
 
 
 class Architecture(NamedTuple):
-    """What the shapes of weights tell of a network.
+    """The architecture of a network, from the shapes of its weights.
 
     Attributes:
         position_levels: frequencies that encode positions: 2⁰ to 2^(levels − 1).
         direction_levels: frequencies that encode directions.
         width: units of the layers that density is computed from.
-        layers: how many these are, the first included.
-        parameters: how many numbers the weights are.
+        layers: the number of these layers, the first included.
+        parameters: the number of weights.
     """
 
     position_levels: int
@@ -45,12 +45,12 @@ class Architecture(NamedTuple):
 
 
 def check_network(weights: Any, name: str = "the network") -> Architecture:
-    """What a network is like; refused where layers are missing, or their shapes do not fit together.
+    """The architecture of a network, refused where layers are missing, or their shapes do not fit together.
 
     Args:
         weights: {"layer1": layer, "layers_xyz": [layer, …], "fc_alpha", "fc_feat", "layers_dir": [layer, …],
             "fc_rgb"}, each layer a dict of "weight" and "bias".
-        name: what an error calls the network.
+        name: the network's name in errors.
 
     Raises:
         InputError: it is none; the message names the layer.
@@ -65,11 +65,11 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
             raise InputError(f"{name} has no list of layers {n!r}; expected at least one layer")
     count = 0
 
-    def layer(place: str, weight_pair: Any, outputs: int | None, inputs: int | None) -> tuple[int, int]:
+    def layer(place: str, arrays: Any, outputs: int | None, inputs: int | None) -> tuple[int, int]:
         nonlocal count
-        if not isinstance(weight_pair, Mapping) or not {"weight", "bias"} <= set(weight_pair):
+        if not isinstance(arrays, Mapping) or not {"weight", "bias"} <= set(arrays):
             raise InputError(f"{name} has no 'weight' and 'bias' of the layer {place!r}; expected both")
-        shape, bias = shape_of(weight_pair["weight"]), shape_of(weight_pair["bias"])
+        shape, bias = shape_of(arrays["weight"]), shape_of(arrays["bias"])
         fits = len(shape) == 2 and 0 not in shape and bias == shape[:1]
         if not fits or (outputs or shape[0], inputs or shape[1]) != shape:
             expected = f"({outputs or 'n'}, {inputs or 'm'}) and ({outputs or 'n'},)"
@@ -90,14 +90,14 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
 
     width, encoded = layer("layer1", weights["layer1"], None, None)
     position_levels = levels("layer1", encoded)
-    for i, weight_pair in enumerate(weights["layers_xyz"]):
-        layer(f"layers_xyz.{i}", weight_pair, width, width)
+    for i, arrays in enumerate(weights["layers_xyz"]):
+        layer(f"layers_xyz.{i}", arrays, width, width)
     layer("fc_alpha", weights["fc_alpha"], 1, width)
     features, _ = layer("fc_feat", weights["fc_feat"], None, width)
     narrow, joined = layer("layers_dir.0", weights["layers_dir"][0], None, None)
     direction_levels = levels("layers_dir.0", joined - features)
-    for i, weight_pair in enumerate(weights["layers_dir"][1:], 1):
-        layer(f"layers_dir.{i}", weight_pair, narrow, narrow)
+    for i, arrays in enumerate(weights["layers_dir"][1:], 1):
+        layer(f"layers_dir.{i}", arrays, narrow, narrow)
     layer("fc_rgb", weights["fc_rgb"], 3, narrow)
     return Architecture(position_levels, direction_levels, width, 1 + len(weights["layers_xyz"]), count)
 

@@ -18,7 +18,7 @@ from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
 
 @dataclass(frozen=True)
 class RadianceShader(Shader):
-    """What a network θ["weights"] sees at a sample along the ray that meets it (Miller et al. 1998, NeRF's colours).
+    """The colour that a network θ["weights"] gives a sample, seen along its ray (Miller et al. 1998, NeRF).
 
     Colours are as the network gives them, in the encoding of the images that it was trained on: sRGB, as a rule. For
     linear ones, decode the image.

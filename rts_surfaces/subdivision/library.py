@@ -54,12 +54,12 @@ _first_use = threading.Lock()
 
 
 class Tools(NamedTuple):
-    """What the library is made with.
+    """The tools that build the library.
 
     Attributes:
         compiler: the command, perhaps with options.
         prefix: the folder that holds OpenSubdiv's include and lib.
-        version: the text of the header that tells OpenSubdiv's version.
+        version: the text of the header with OpenSubdiv's version.
     """
 
     compiler: tuple[str, ...]

@@ -17,17 +17,17 @@ from rts.plugin_api.files import read_polygons
 from rts_surfaces.subdivision.binding import UV_RULES
 
 _BOUNDARIES = ("none", "edge_and_corner", "edge_only")
-"""What interpolateboundary 0, 1 and 2 stand for."""
+"""Boundary rules of interpolateboundary 0, 1 and 2."""
 _TAGS = ("crease", "corner", "hole", "interpolateboundary", "facevaryinginterpolateboundary", "creasemethod")
 
 
 class CageFile(NamedTuple):
-    """What a file holds.
+    """A cage as its file has it.
 
     Attributes:
         faces: lists of vertices.
         options: keywords of `Subdivision`.
-        theta: "vertices" (V, 3) and what the file has of "uv", "colors", "texture" and "color", float32, linear.
+        theta: "vertices" (V, 3) and, if the file has them, "uv", "colors", "texture" and "color", float32, linear.
         shader: a shader for it.
     """
 

@@ -29,8 +29,8 @@ from rts_surfaces.subdivision.face_tiles import tiles_of
 library.find()  # Without OpenSubdiv there is no such plugin.
 
 BESIDE = 1 / 16
-"""How far from the border of a tile it is looked at how it bends. At extraordinary vertices second derivatives have no
-bound, and at creases they are large, but both on so little of a tile that triangles are off by less than that."""
+"""Distance from the border of a tile from which on its bend is measured. At extraordinary vertices second derivatives
+have no bound, and at creases they are large. Both cover so little of a tile that triangles stay near the surface."""
 LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
 VERTEX_ATTRIBUTES = ("colors", "uv")
@@ -145,7 +145,7 @@ class Subdivision(Parametric):
         self._points: tuple[tuple, Points] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy is made of: the library's objects stay in this process."""
+        """The state of a copy: the library's objects stay in this process."""
         return {name: value for name, value in vars(self).items() if name not in ("limit", "_points")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
