@@ -103,7 +103,7 @@ def _following(cells, first):
 
 @compiled
 def touching(places, box, begin, end, bits):
-    """Put those places first whose boxes hold cells that are asked for in some lines; how many there are.
+    """Put places first whose boxes hold cells that are asked for in some lines. Returns their number.
 
     `box` has the first and last column, and the first and last row, of each box (4, ·). All is in one loop, since
     compiled code counts references to arrays that it hands on.

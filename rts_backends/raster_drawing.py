@@ -133,7 +133,7 @@ def _draw(items, given, top, end, width, asked, layered):
 
 @compiled
 def _asked(hits, found, top, asked, cells):
-    """Leave out hits (n, 2) in cells that are not asked for, and number the others if some are; how many are left."""
+    """Drop hits (n, 2) in cells that are not asked for, and number the rest if only some are. Returns their number."""
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
     if len(bits) == 0:
@@ -236,7 +236,7 @@ def _insert(hits, met, drawn, layered):
 
 @compiled(error_model="numpy")
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and whether it is surely one."""
+    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and True for hits that are certain."""
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
@@ -266,7 +266,7 @@ def _covers(b, x, y, numbers, clips):
 
 @compiled(inline="always")
 def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers of a cell, at its place of `nearest` and of the rest: behind what is as near."""
+    """Put a hit into the layers of a cell, at its place of `nearest` and of the rest: behind hits that are as near."""
     moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, place], triangle_ids[k, cell]

@@ -53,7 +53,7 @@ def _chunks(counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First and last pixel (x, y) that each triangle may cover, and whether it may cover any."""
+    """First and last pixel (x, y) that each triangle may cover, and marks of triangles that may cover any."""
     height, width = size
     w = corners[..., 3]
     whole = np.all(w > 0, axis=1)

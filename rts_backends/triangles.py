@@ -89,7 +89,7 @@ def owns(x, y):
 
 @compiled
 def edge_values(corners, ia, ib, ic, x, y):
-    """Edge functions at a pixel position, positive inside, and whether the position belongs to the triangle."""
+    """Edge functions at a pixel position, positive inside, and True if the position belongs to the triangle."""
     xa, ya, wa = edge(corners, ib, ic)
     xb, yb, wb = edge(corners, ic, ia)
     xc, yc, wc = edge(corners, ia, ib)

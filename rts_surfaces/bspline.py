@@ -94,7 +94,7 @@ class Revolution(BSpline):
 
     Args:
         heights: (n,) numbers, the y of the profile's control points, at least 4.
-        count: how many control points there are around the axis, at least 4.
+        count: the number of control points around the axis, at least 4.
         ends: "clamped" or "open", of the profile.
         tolerance: pixels that triangles may be off the surface near outlines.
 

@@ -117,7 +117,7 @@ class Mesh(TriangleSurface):
         return rates
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-        """θ with other vertices, which have the attributes of those that they stand for."""
+        """θ with other vertices, which have the attributes of the vertices that they stand for."""
         kept = {name: theta[name] for name in self._attributes(theta)}
         attributes = {name: take(x, engine_of(x).constant(nearest, x)) for name, x in kept.items()}
         return {**theta, **attributes, "vertices": vertices}
@@ -150,7 +150,7 @@ class Mesh(TriangleSurface):
         return interpolate(rows, samples.ids, column, samples.params)
 
     def vertex_normals(self, vertices: Array) -> Array:
-        """(V, 3) unit normals, the area-weighted mean of the faces around each vertex; zero where there is none."""
+        """Unit normals (V, 3), the area-weighted mean of the faces around each vertex; zero without faces."""
         if exemplar(vertices) is not None:
             return self._vertex_normals(vertices)
         key, kept = fingerprint(vertices), self._normals

@@ -1,4 +1,4 @@
-"""Entries of θ as surfaces know them: names, widths, and what is refused."""
+"""Names, widths and checks of entries of θ."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RESERVED = ("vertices", "points", "position", "normal")
 
 
 def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
-    """Refuse names of attributes that mean something else, or are among those that are taken."""
+    """Refuse names of attributes that mean something else, or are taken."""
     for name in names:
         if name in RESERVED or name in taken:
             raise InputError(f"indices declares {name!r}, which is no further attribute; expected another name")

@@ -111,7 +111,7 @@ class Parametric(TriangleSurface):
         return self.control_points(theta)
 
     def proxy_key(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """The cell of views: so images do not depend on what was rendered before."""
+        """The cell of views, so that images do not depend on earlier renders."""
         return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
@@ -155,7 +155,7 @@ class Parametric(TriangleSurface):
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
-        """(u, v) and depth where rays meet the patches, by Newton's method; what does not meet is dropped."""
+        """Samples where rays meet the patches, by Newton's method; samples whose rays miss are dropped."""
         return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def _second(found, a, b, c):
 
 @compiled
 def _normal(slopes, out):
-    """Fill the unit normal, and return whether there is one; else it is zero."""
+    """Fill the unit normal and return True; fill zeros and return False if there is none."""
     for c in range(3):
         x, y = (c + 1) % 3, (c + 2) % 3
         out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
@@ -52,7 +52,7 @@ def _normal(slopes, out):
 
 @loop
 def shapes(start, stop, found, frames, normals, places, bends):
-    """Fill what is asked of the shape of tiles.
+    """Fill normals, places and bends of tiles.
 
     Args:
         start: first tile.
@@ -127,7 +127,7 @@ def outlines(
         bends: (n, 3), the largest second derivatives along the normal.
         eye: (3,), or the direction towards the viewer if `parallel`.
         toward: (3,) unit, from the middle of the surface to the eye.
-        parallel: whether rays are.
+        parallel: True if rays are parallel.
         aside: how far the eye may be off sideways; where parallel, how far the direction.
         depth: how far it may be off along `toward`.
         spread: (2,), width of a pixel at depth z.
@@ -171,7 +171,7 @@ def outlines(
                 if not parallel:
                     far = math.sqrt(_dot(view, view))
                     nearest = min(nearest, far - move)
-                    # What moves along the line of sight does not turn it.
+                    # Movement along the line of sight does not turn it.
                     ahead = _dot(view, toward)
                     slack += depth * math.sqrt(max(far * far - ahead * ahead, 0.0)) / far if far > 0 else depth
                 faces[i, j] = _dot(normals[t, i, j], view) / far if far > 0 else 0.0

@@ -203,7 +203,7 @@ def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
 
 @loop
 def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
-    """Fill the triangles of triangular tiles; the arguments are as those of `quadrilaterals`, of three sides."""
+    """Fill the triangles of triangular tiles; arguments as for `quadrilaterals`, with three sides."""
     faces, ids, params = out
     for n in range(start, stop):
         r, t, base, frame = inner[n, 0], first[n], inner_first[n], frames[n]

@@ -21,7 +21,7 @@ _ONE_AT_A_TIME = threading.RLock()  # Filters of warnings belong to the whole pr
 
 
 def unreadable(path: Path, kind: str, what: str) -> InputError:
-    """The error of a file that is not what its name says, or is damaged."""
+    """The error of a file that is damaged, or of another format than its name says."""
     return InputError(
         f"{path} cannot be read as {kind} ({what}); the file may be cut short or of another format: export it again"
     )
@@ -87,7 +87,7 @@ def gathered(path: Path) -> Iterator[list[str]]:
 
 
 class _Lines(logging.Handler):
-    """Notes what is logged as a warning, or worse, with the error that led to it."""
+    """Notes records logged as warnings or worse, with the errors that led to them."""
 
     def __init__(self, path: Path, lines: list[str]):
         super().__init__(logging.WARNING)

@@ -1,4 +1,4 @@
-"""Accessors of GLB and glTF files: what they promise is there, in a layout and of types that the format allows."""
+"""Checks of accessors of GLB and glTF files: their data are present, in layouts and types that the format allows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMPONENTS = {
     "COLOR_0": ("f4", "u1", "u2", "u1 fraction", "u2 fraction"),
     "indices": ("u1", "u2", "u4"),
 }
-"""Types of components; those of integers that stand for fractions of their largest are `normalized`."""
+"""Types of components; integers that stand for fractions of their largest value are `normalized`."""
 _INTEGERS = tuple(kind + more for kind in ("i1", "u1", "i2", "u2") for more in ("", " fraction"))
 QUANTIZED = COMPONENTS | {
     "POSITION": ("f4", *_INTEGERS),
@@ -35,11 +35,11 @@ QUANTIZED = COMPONENTS | {
 MOST = 2**24
 """Rows of an accessor without data, all zero, which a damaged file could otherwise have any number of."""
 BOUNDS_TOLERANCE = 1e-3
-"""By how much `min` and `max` may be off, of the size of what they bound; some writers round them."""
+"""Tolerance of `min` and `max`, as a share of the range that they bound; some writers round them."""
 
 
 def count_of(value: Any) -> int:
-    """A whole number that is not negative; a ValueError where it is none."""
+    """A whole number of at least zero; a ValueError for anything else."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{value!r} is no count")
     return value
@@ -89,7 +89,7 @@ def rows_of(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views:
 def check_attributes(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[str, int]:
-    """Refuse attributes and indices that do not fit. Returns the accessors by what they are for, if they have data."""
+    """Refuse attributes and indices that do not fit. Returns the accessors that have data, by attribute."""
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
     accessors = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}

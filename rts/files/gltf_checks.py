@@ -1,4 +1,4 @@
-"""GLB and glTF files checked before trimesh reads them: that what they promise is there, and colours are colours."""
+"""Checks of GLB and glTF files before trimesh reads them: promised data are present, and colours are colours."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
-    """The GLB, without what may follow its end; or one of the same, with numbers that trimesh reads rightly.
+    """The GLB, without bytes after its end; or an equal one with numbers that trimesh reads rightly.
 
     Args:
         path: its path.
@@ -74,7 +74,7 @@ def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
 
 
 def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[str, bytes]:
-    """The glTF itself, or a GLB of the same; arguments and errors are those of `sound_glb`."""
+    """The glTF itself, or an equal GLB; arguments and errors as for `sound_glb`."""
 
     def fail(what: str) -> InputError:
         return unreadable(path, "GLTF", what)
@@ -251,7 +251,7 @@ def _check_material(
     file: Callable[[str], bytes],
     fail: Any,
 ) -> None:
-    """Refuse a colour or a texture that is none; trimesh leaves out what it cannot read."""
+    """Refuse an invalid colour or texture, which trimesh would leave out."""
     look = material.get("pbrMetallicRoughness", {})
     factor = np.array(look.get("baseColorFactor", [1.0] * 4), np.float64)
     if factor.shape != (4,):
@@ -275,7 +275,7 @@ def _check_material(
 
 
 def _check_colors(path: Path, name: str, colors: np.ndarray, fail: Any) -> None:
-    """Refuse colours (N, C) that are none; warn of those that trimesh brings into range."""
+    """Refuse invalid colours (N, C); warn of colours that trimesh brings into range."""
     wrong = ~(np.abs(colors) <= 255).all(axis=1)
     if wrong.any():
         at = int(np.argmax(wrong))

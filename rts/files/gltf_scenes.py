@@ -52,7 +52,7 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
 
 
 def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
-    """The parents of nodes. Whoever walked among nodes that are no forest would never end."""
+    """The parents of nodes, refused if nodes form no forest: a walk among these would never end."""
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for child in map(count_of, node.get("children", [])):

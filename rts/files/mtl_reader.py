@@ -16,7 +16,7 @@ from rts.files.paths import inside
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
 _MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
 _MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
-"""A comment by which MeshLab signs; its Tr is 1 for what is opaque."""
+"""A comment by which MeshLab signs; its Tr is 1 for opaque materials."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
 
 

@@ -21,7 +21,7 @@ from rts.files.srgb import decode_srgb
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
 """Counts of numbers in a row: a position may have a weight, or a colour, which may have an alpha."""
 FACES = ("f", "fo")
-"""Statements of faces; "fo" is what "f" was called once."""
+"""Statements of faces; "fo" is the older name of "f"."""
 LEFT_OUT = frozenset(
     "vp deg bmat step cstype p l curv curv2 surf parm trim hole scrv sp end con g s mg o bevel c_interp d_interp lod "
     "shadow_obj trace_obj ctech stech call csh maplib usemap bzp bsp cdc cdp res".split()
@@ -142,7 +142,7 @@ class _Lines:
             raise
 
     def polygons(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Zero-based indices of position, uv and normal (H, 3) of all corners, and how many each face has (F,).
+        """Zero-based indices of position, uv and normal (H, 3) of all corners, and the corner count of each face (F,).
 
         An index that is not given is −1.
         """
@@ -189,7 +189,7 @@ class _Lines:
 
 
 class Polygons(NamedTuple):
-    """The faces of an OBJ file as they are, all materials in one.
+    """The faces of an OBJ file as polygons, all materials in one.
 
     Attributes:
         vertices: (V, 3) float64.
@@ -198,7 +198,7 @@ class Polygons(NamedTuple):
         sizes: (F,) int64, how many corners each face has.
         corners: (H, 3) int64, position, uv and normal of the corners of all faces; −1 where one is not given.
         tags: the statements "t", as OpenSubdiv's files have them, each with the number of its line.
-        materials: how many materials faces have.
+        materials: the number of materials of faces.
         color: (3,) or (4,) in [0, 1], linear, of the only material; None of none, or of several.
         texture: (h, w, 3 or 4) float32 in [0, 1], linear, of that material; or None.
     """
@@ -301,7 +301,7 @@ def _materials(lines: _Lines) -> dict[str | None, Material]:
 
 
 def _statements(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, those that end in a backslash joined with the next.
+    """Lines with their numbers; a line that ends in a backslash is joined with the next.
 
     A comment ends with its line: a backslash there is the end of a folder's name.
     """

@@ -1,4 +1,4 @@
-"""OFF and STL files checked before trimesh reads them, which takes what is there for what is promised."""
+"""Checks of OFF and STL files before trimesh reads them, which does not compare data with the header."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def text_of(path: Path, kind: str, data: bytes) -> str:
 
 
 def plain_off(path: Path, data: bytes) -> bytes:
-    """A binary PLY of triangles with what an OFF holds: vertices, their colours, and polygons.
+    """A binary PLY of triangles with the content of an OFF: vertices, their colours, and polygons.
 
     Raises:
         InputError: rows are not as many as promised, or not as long; something is no number; a face has less than 3

@@ -75,7 +75,7 @@ def output_folder(path: Any) -> Path:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turns what goes wrong while a file is written, or the folders above it, into an InputError of one line."""
+    """Turns errors while a file, or the folders above it, are written into an InputError of one line."""
     try:
         yield
     except (OSError, MemoryError, struct.error, OverflowError) as error:

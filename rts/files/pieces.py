@@ -26,7 +26,7 @@ class Piece(NamedTuple):
             it. Colours are in [0, 1], as encoded in the file.
         texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, alpha straight; or None.
         color: (3,) or (4,) factor of the material, as encoded in the file; or None.
-        linear: whether `color` and the attribute "colors" are linear rather than sRGB.
+        linear: True if `color` and the attribute "colors" are linear rather than sRGB.
         transform: (4, 4) scene-from-local, or None.
     """
 

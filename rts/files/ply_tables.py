@@ -50,7 +50,7 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
-    """A table that the header promises: its name, how many rows, and its columns."""
+    """A table that the header promises: its name, number of rows, and columns."""
 
     name: str
     rows: int

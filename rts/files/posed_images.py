@@ -43,7 +43,7 @@ class View:
         camera: the camera, float64 NumPy.
         size: (height, width).
         image: (H, W, 3 or 4) float32, or a function that gives it whenever it is asked for.
-        name: what the picture is called in its file.
+        name: the picture's name in its file.
         near: the depth at which the scene begins, in the units of the camera; None where that is not known.
         far: the depth at which it ends, or None.
     """
@@ -96,9 +96,9 @@ def load_views(
     Args:
         path: one of these files, or its folder.
         split: which transforms_….json of a folder: "train", "val" or "test".
-        downscale: n, to give images of 1/n of the size: means of n × n pixels of what `linear` says, premultiplied. In
-            LLFF the folder `images_n` is used instead, where there is one.
-        linear: whether images are to be linear, as `rts.load_image` gives them; False for the numbers of the file, sRGB
+        downscale: n, for images of 1/n of the size: means of n × n premultiplied pixels, encoded as `linear` says. In
+            LLFF the folder `images_n` is used instead, if it exists.
+        linear: True if images are to be linear, as `rts.load_image` gives them; False for the numbers of the file, sRGB
             as a rule. NeRF is trained on these, composited and averaged as they are.
         background: "white", "black" or a colour (3,), encoded like the images, to put them on: (H, W, 3); None for
             (H, W, 4) premultiplied.
@@ -110,7 +110,7 @@ def load_views(
             same in both.
         near: near plane of the cameras; default 0.01, or a hundredth of the nearest bound.
         far: far plane; default 1000, or a hundred times the farthest bound.
-        cache: whether to keep each image once it is read.
+        cache: True to keep each image once it is read.
 
     Returns:
         A list of views: `camera` (float64 NumPy), `size`, `image` (float32), `name`, and `near` and `far` of the scene
@@ -279,7 +279,7 @@ def _blender(path: Path, downscale: int) -> list[_Pose]:
 
 
 def _check_lens(place: str, lens: Mapping[str, Any], focal: float, size: tuple[int, int]) -> None:
-    """Refuse what other tools write into such files that is not followed: distortion, and axes off the centre."""
+    """Refuse lenses that other tools write and that are not supported: distortion, and axes off the centre."""
     bent = [k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if lens.get(k)]
     if bent:
         raise InputError(f"{place} has a lens that distorts ({', '.join(bent)}), which is not followed; undistort it")

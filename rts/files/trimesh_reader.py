@@ -23,7 +23,7 @@ LINEAR_COLORS = {"glb", "gltf"}
 
 
 class _Folder:
-    """Resolves names for trimesh in the model's folder; keeps what went wrong, which trimesh only logs."""
+    """Resolves names for trimesh in the model's folder; keeps the errors, which trimesh only logs."""
 
     def __init__(self, path: Path):
         self.path, self.problem = path, None
@@ -82,7 +82,7 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
 
 
 def _checked(path: Path, extension: str, data: bytes, folder: _Folder) -> tuple[str, bytes]:
-    """The format and the bytes that trimesh is to read, once what the file promises has been found to be there."""
+    """The format and the bytes for trimesh to read, after the checks of the file."""
     match extension:
         case "ply":
             return "ply", plain_ply(path, data, folder.get)

@@ -14,9 +14,9 @@ from rts.errors import EngineError, InputError
 from rts.fitting.parameter_names import listed
 
 UNSEEN = 0.02
-"""Numbers below this share of a direction's largest are left out where it is told."""
+"""Numbers below this share of a direction's largest are left out of its description."""
 SHORT = 4
-"""Arrays of at most so many numbers are told as a vector."""
+"""Arrays of at most so many numbers are described as a vector."""
 
 NO_WAY = "no derivative leads from the one to the other"
 
@@ -25,8 +25,8 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
     """The engine of parameters that have derivatives.
 
     Args:
-        parameters: what a user gave.
-        purpose: what an error adds to what it expects.
+        parameters: a user's parameters.
+        purpose: text for the end of an error.
 
     Raises:
         InputError: no arrays that have derivatives.
@@ -87,7 +87,7 @@ def _marked(x: Array, engine: Engine) -> bool:
 
 
 def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[str], shapes: Sequence[tuple]) -> str:
-    """Directions of the parameters, told by names and numbers.
+    """Directions of the parameters, described by names and numbers.
 
     Args:
         basis: (U, k), linearly independent columns that span the directions, in numbers of the parameters.

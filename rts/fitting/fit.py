@@ -39,11 +39,11 @@ class Fit(NamedTuple):
         history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
             With a schedule those of all stages, one after the other.
         steps: number of losses computed, the one at the start included.
-        reason: why it stopped, in one line; and what the residuals leave open: arrays whose gradient was zero
-            throughout and, for Levenberg–Marquardt, combinations of parameters that change nothing, such as
-            "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
+        reason: why it stopped, in one line; and the parameters that the residuals do not determine: arrays whose
+            gradient was zero throughout and, for Levenberg–Marquardt, combinations of parameters that change nothing,
+            such as "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
         seconds: wall time, compilation included.
-        stages: how many of the steps were made at each stage of the schedule; one number without a schedule.
+        stages: the number of steps at each stage of the schedule; one number without a schedule.
 
     With a schedule, parameters, loss and reason are those of the last stage.
 
@@ -258,7 +258,7 @@ def _residuals(value: Any, what: str) -> Residuals:
 
 
 def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[Callable[[Array], Array], bool]:
-    """The loss at a stage of the residuals `whole`, and whether the stage's own sums are for it."""
+    """The loss at a stage of the residuals `whole`, and True if the stage's own sums are for this loss."""
     if loss is not None and not overrides(stage, "normal_equations", Residuals):
         return loss, False
     own = _own_loss(stage)

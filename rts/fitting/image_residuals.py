@@ -59,18 +59,18 @@ class ImageResiduals(Residuals):
     Usable wherever a function of parameters is, such as with `rts.fit`. Levenberg–Marquardt takes less time and memory
     for it than for a function: derivatives along all unknowns are multiplied together as the image is swept.
 
-    With a target of B views it is that of all of them, as `rts.render_views` renders them.
+    A target of B views is compared with B renders, as `rts.render_views` makes them.
 
     Args:
-        scene: parameters → part or parts, or what `prepare` made of them; or a tuple of these and a camera, or cameras.
-        camera: the camera, where `scene` gives none; of several views a list, or what `Camera.stack` made of it.
+        scene: parameters → part, parts or the result of `prepare`; or a tuple of these and a camera, or cameras.
+        camera: the camera, if `scene` gives none; of several views a list, or the result of `Camera.stack`.
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
             or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
             Of several views (B, H, W, ·), or a list.
         weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
             bool; constants. Of several views (B, H, W, ·), or a list.
-        background: as in `render`; a constant. It is that of every view.
+        background: as in `render`; a constant, the same for every view.
         sampler: as in `render`.
         splatter: as in `render`.
         layers: as in `render`.
@@ -78,7 +78,7 @@ class ImageResiduals(Residuals):
         capacity: as in `render`.
         channels: C of the image, as the scene's shaders say it. Where it is not 3, Levenberg–Marquardt takes the
             Jacobian.
-        loss: what becomes of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
+        loss: the function of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
             "soft_l1", "huber" or "cauchy", to which large residuals count less: where part of the target is wrong, such
             as a mask with something in front. Or an `rts.Loss`, which has its own `f_scale`.
         f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1,
@@ -206,18 +206,18 @@ class ImageResiduals(Residuals):
         Args:
             stage: the resolution.
         """
-        made = copy(self)
-        made._views = [view.at_stage(stage) for view in self._views]
-        made._sigma = float(stage.sigma)
+        other = copy(self)
+        other._views = [view.at_stage(stage) for view in self._views]
+        other._sigma = float(stage.sigma)
         if stage.supersample is not None:
-            made._settings = replace(self._settings, supersample=stage.supersample)
-        made.size = stage.size(self.size)
-        if made.size != self.size:
+            other._settings = replace(self._settings, supersample=stage.supersample)
+        other.size = stage.size(self.size)
+        if other.size != self.size:
             if not self._views:
-                made._target, made._weights = _shrunk(self._target, self._weights, made.size)
+                other._target, other._weights = _shrunk(self._target, self._weights, other.size)
             if self._background is not None and len(self._background.shape) == 3:
-                made._background = box_filtered(self._background, made.size)
-        return made
+                other._background = box_filtered(self._background, other.size)
+        return other
 
     def scene(self, parameters: Tree) -> tuple[Any, Any]:
         """Parts and camera for these parameters; of several views a list of cameras."""
@@ -288,7 +288,7 @@ class ImageResiduals(Residuals):
         return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 
     def _swept(self, splatter: SummingSplatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
+        """`normal_equations` by the splatter's sums, in the bands of `render`; None where the splatter has no sums."""
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
             equations = self._swept_band(splatter, parameters, engine, top, rows)
@@ -321,14 +321,14 @@ class ImageResiduals(Residuals):
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
         def swept(shown: Callable[..., Splats], fields: _Fields, known: Splats) -> tuple[Array, Array, Array] | None:
-            """The normal equations of what `shown` makes of parts, cameras and a context; of it `known` is constant."""
+            """Normal equations of the splats that `shown` makes of parts, cameras and a context; `known` is constant."""
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))
                 seen = camera.for_size(self.size), window(camera)
                 moved = shown(parts, *seen, context_of(parts, camera, sampled, v))
                 positions, rgba = constants((moved.positions, moved.rgba), engine, v)
-                # What is opaque has an alpha of one, whatever its colours.
+                # Opaque samples have an alpha of one, whatever their colours.
                 return positions, rgba if colored else engine.stop_gradient(rgba)
 
             (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)

@@ -50,7 +50,7 @@ class _Model:
 
     Args:
         linear: the normal equations.
-        sizes: how many numbers each array of the parameters has.
+        sizes: the number of entries of each array of the parameters.
     """
 
     def __init__(self, linear: _Linear, sizes: Sequence[int]):
@@ -69,7 +69,7 @@ class _Model:
         self._open = np.linalg.qr(self.open * self.units[:, None])[0] if self.open.shape[1] else None
 
     def step(self, damping: float) -> tuple[np.ndarray, float]:
-        """The step, and the gain that the model predicts of it."""
+        """The step, and the gain that the model predicts for it."""
         along = self._downhill / (self._values + damping)
         step = self._directions @ along
         if self._open is not None:
@@ -106,10 +106,10 @@ def levenberg_marquardt(
         parameters: where to start; a private copy.
         engine: the engine of the parameters.
         run: takes note of each step, and says when to stop.
-        jit: whether to compile.
+        jit: True to compile.
         loss: of the residuals.
         own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
-        supersample: of residuals that are of an image, how many samples a pixel has along each axis.
+        supersample: samples a pixel along each axis, for residuals of an image.
     """
     vector, unflatten = flatten(parameters)
     sizes = [math.prod(x.shape) for x in leaves(parameters)]

@@ -89,7 +89,7 @@ SCALES = 1e-10, 1e10
 
 @dataclass(frozen=True)
 class Loss:
-    """The mean of s² ρ((r / s)²) over residuals r, with s for `f_scale`: what a fit makes small.
+    """A loss for fits: the mean of s² ρ((r / s)²) over residuals r, with s for `f_scale`.
 
     The losses are those of `scipy.optimize.least_squares`, whose cost is half the sum where this is the mean:
 

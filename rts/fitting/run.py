@@ -1,4 +1,4 @@
-"""One run of a fit: what it keeps, when it stops, and its progress bar."""
+"""One run of a fit: its record, the rule by which it stops, and its progress bar."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Run:
     """The record of a running fit: history, best parameters, and why it stopped.
 
     Attributes:
-        mattered: of each array of the parameters, whether its gradient was ever other than zero.
-        remarks: what else is to be told of the outcome, beside why it stopped.
-        residuals: how many numbers the residuals are, once that is known.
-        asked: whether the callback has asked to stop.
+        mattered: for each array of the parameters, True once its gradient was other than zero.
+        remarks: further remarks on the outcome, beside the reason.
+        residuals: the number of residuals, once it is known.
+        asked: True if the callback has asked to stop.
     """
 
     def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int, before: int = 0):
@@ -75,7 +75,7 @@ class Run:
         self.mattered = [a or b for a, b in zip(mattered, self.mattered or [False] * len(mattered), strict=True)]
 
     def told(self, names: Sequence[str]) -> str:
-        """Why the fit stopped, and what is to be told beside, in one line; with the names of the arrays."""
+        """The reason why the fit stopped, and further remarks, in one line; arrays go by their names."""
         lost = [name for name, mattered in zip(names, self.mattered, strict=False) if not mattered]
         remarks = self.remarks
         if lost and len(lost) < len(names):
@@ -156,7 +156,7 @@ def untraceable(error: Exception, engine: Engine) -> RtsError | None:
 
 
 def require(finite: bool, what: str, start: bool) -> None:
-    """Refuse what is not finite: at the start that is an error of the caller."""
+    """Refuse numbers that are not finite: at the start these are an error of the caller."""
     if not finite and start:
         raise InputError(f"{what} at the start; check the parameters and the target for NaN")
     if not finite:

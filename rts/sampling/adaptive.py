@@ -28,7 +28,7 @@ class Adaptive:
 
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
-        dilated: whether the eight neighbours of active pixels are active too. Colours that change near outlines need
+        dilated: True if the eight neighbours of active pixels are active too. Colours that change near outlines need
             that; None for where some part's shader is not `uniform`.
         contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
             four directions: edges of colour on surfaces. Needs colours, which `rts.sample` does not have, nor do

@@ -27,10 +27,10 @@ class Choice(NamedTuple):
     Attributes:
         sampler: the sampler that `sampler="auto"` takes, by name.
         reason: why.
-        samples: how many samples are taken, at a size that is given; None where that is not known.
-        fine: how many of them are fine ones, of `rts.Adaptive`; None without.
-        active: how many pixels of the image take fine samples, for all parts together; None without.
-        remarks: what looks like a mistake, a line each: entries of θ that nobody reads, a mesh wound inside out.
+        samples: the number of samples, for a given size; None where it is not known.
+        fine: the number of fine samples among them, of `rts.Adaptive`; None without.
+        active: the number of pixels of the image with fine samples, for all parts together; None without.
+        remarks: likely mistakes, a line each: entries of θ that nothing reads, a mesh wound inside out.
     """
 
     sampler: str

@@ -23,7 +23,7 @@ def facing(
     fragments is marked by `MORE_BEHIND`.
 
     Args:
-        fragments: what was sampled.
+        fragments: the fragments of all layers.
         kept: (K, H, W) bool, the fragments that are samples.
         proxy: the triangles.
         pieces: (T,) int16, the number of each triangle's piece; or (1,), of all.

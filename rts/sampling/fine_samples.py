@@ -66,7 +66,7 @@ def fine_samples(
         grid: the sizes.
         where: the rule by which pixels are active.
         take: samples the fine grid: a number of layers, a rule for hidden samples, cells and capacity → `Sampled`.
-        hidden: the rule for those of an image; None to keep all.
+        hidden: the rule for hidden samples of an image; None to keep all.
         layers: K, or "auto".
         capacity: rows to allot, or None for as many as there are, or could be.
         flat: True if pixels that are not active show fronts of one colour alone, where any cell is `settled`.

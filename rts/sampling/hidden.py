@@ -91,7 +91,7 @@ class HiddenBySplatter:
     settles: bool
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
-        """The samples that can reach the image, or those of its cells (H, W) that are `wanted`."""
+        """The samples that can reach the image, or its cells (H, W) that are `wanted`."""
         covered, depth, size = question
         too_rough = (self.settles or len(covered) > 1) and too_far(max(size, self.size), depth)
         needed = covered if too_rough or len(covered) == 1 else self._needed(covered, depth)

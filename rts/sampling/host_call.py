@@ -74,7 +74,7 @@ class HostCall:
         part: the part.
         surface: its surface.
         cameras: through which it is seen, in its local space, without derivatives.
-        shape: how many samples there may be.
+        shape: bounds on the number of samples.
         entry: the part's prepared entry, if known; the inputs of its proxy are then not read.
     """
 
@@ -91,7 +91,7 @@ class HostCall:
         self._engine, like = context_of(part.theta, cameras)
         self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
         reads = {name: part.theta[name] for name in surface.reads(part.theta)}
-        # What has no derivative is evaluated where it is sampled.
+        # A surface without derivatives is evaluated where it is sampled, on the host.
         self._theta = reads if self._engine.differentiates and is_constant(reads) else None
         self._asked = part.reads if isinstance(part, CheckedPart) else None
         self._attributes = _attribute_specs(surface, self._asked, self._theta, shape, like)

@@ -42,7 +42,7 @@ def _nothing_told(row: Array) -> Array:
 
 
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
-    """Part, row within it, depth and what faces the viewer, (K, H, W) each, from those three of each part.
+    """Part, row within the part, depth and facing (K, H, W), merged from row, depth and facing of each part.
 
     The last are missing where they are not given.
     """
@@ -54,10 +54,10 @@ def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Arr
     part, row, depth = (xp.take_along_axis(x, order, axis=0) for x in (part, row, depth))
     if not facing:
         return part, row, depth
-    told = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
-    last, bit = told[-1:, ...], Cells.MORE_BEHIND
+    merged_facing = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
+    last, bit = merged_facing[-1:, ...], Cells.MORE_BEHIND
     marked = xp.where((last != 0) & (xp.abs(last) < bit), last + xp.where(last > 0, bit, -bit), last)
-    return part, row, depth, xp.concat([told[:-1, ...], xp.astype(marked, told.dtype)])
+    return part, row, depth, xp.concat([merged_facing[:-1, ...], xp.astype(marked, merged_facing.dtype)])
 
 
 def _of_part(facing: Array, part: int, count: int) -> Array:
@@ -71,10 +71,10 @@ def _of_part(facing: Array, part: int, count: int) -> Array:
     return xp.astype(xp.where(facing > 0, number, -number), facing.dtype)
 
 
-def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Array, ...]:
+def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
     """`_interleaved`, compiled: sorting many short columns takes array code far longer."""
     count = len(sizes)
-    rows, depths = given[:count], given[count : 2 * count]
+    rows, depths = tables[:count], tables[count : 2 * count]
     shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
     dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
 
@@ -88,5 +88,5 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -
         return merging_loops.interleave(*arguments, layers, Cells.MORE_BEHIND)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
-    specs = specs if len(given) == 2 * count else (*specs, ArraySpec(shape, np.int16))
-    return engine_of(given).call_host(host, specs, *given)
+    specs = specs if len(tables) == 2 * count else (*specs, ArraySpec(shape, np.int16))
+    return engine_of(tables).call_host(host, specs, *tables)

@@ -23,14 +23,14 @@ def pack(
     """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of samples.
 
     Args:
-        fragments: what was sampled.
+        fragments: the fragments of all layers.
         kept: (K, H, W) bool, which of them to take; covered ones.
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
         capacity: rows to allot, or 0 for as many as are covered, at least one.
         *more: further fragments, and which of them to take, for rows behind all others, at most K · H · W in all. Their
             row is returned last; they do not count in how many there are.
-        views: how many views the grid is of, down and across; each is packed by itself, one after the other.
+        views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
     grids = [_Lines.of(fragments, kept, views), *(_Lines.of(*given) for given in more)]
     total, room = int(grids[0].counts.sum()), capacity or max(1, grids[0].kept.size)

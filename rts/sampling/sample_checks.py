@@ -51,8 +51,8 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
             "no corner_params, and so 2 barycentrics" if corners is None else f"corner_params of {width} numbers"
         )
         raise InputError(
-            f"the proxy of {surface!r} has {corner_text} a corner, but sample_widths says {surface.sample_widths[1]}; make "
-            f"them agree"
+            f"the proxy of {surface!r} has {corner_text} a corner, but sample_widths says "
+            f"{surface.sample_widths[1]}; make them agree"
         )
     for name, array in (("ids", ids), ("corner_params", corners)):
         if array is not None and len(array) < len(faces):
@@ -108,7 +108,7 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
     """A sampler's samples of a part, refused where they do not fit its cells, or one another.
 
     Args:
-        samples: the samples; values that are traced are not looked at.
+        samples: the samples; traced values are not checked.
         grid: (H, W) of the cells.
         sampler: the sampler.
     """
@@ -162,7 +162,7 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
 
     Args:
         camera: float64; its view is that of the camera times the part's transform.
-        transform: that transform, where there is one, to know what to blame.
+        transform: the part's transform, if it has one, which an error may blame.
 
     Returns:
         The camera, the last row of its view without rounding.

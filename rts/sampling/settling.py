@@ -47,7 +47,7 @@ def on_surface(
         layers: K.
         tables: what the surface's `table_specs` allots.
         size: (height, width) of the grid of cells.
-        cells: (L, C), the cells that the samples are of, as flat indices in the grid; None for all.
+        cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
     """
     first = Fragments(*(x[:layers] for x in fragments))
     moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables, size, cells)
@@ -90,7 +90,7 @@ def refined(
         camera: host matrices.
         tables: what the surface's `table_specs` allots.
         size: (height, width) of the grid of cells; None for that of the samples.
-        cells: (L, C), the cells that the samples are of, as flat indices in the grid; None for all.
+        cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
     """
     by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
     allotted = {

@@ -84,7 +84,7 @@ class Room(NamedTuple):
     """The room of a layout.
 
     Attributes:
-        columns: columns of strips, a pixel wide, those that aprons take included.
+        columns: columns of strips, a pixel wide, those of aprons included.
         cells: fine cells to sample.
     """
 
@@ -93,7 +93,7 @@ class Room(NamedTuple):
 
 
 def rounded(count: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few, so that what is compiled for a shape serves again."""
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few shapes, so that compiled programs serve again."""
     size = 16
     while size < count:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
@@ -279,23 +279,25 @@ def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
         ArraySpec(laid, np.int32),
         ArraySpec(laid, np.int32),
     ]
-    told = [] if sampled.facing is None else [sampled.facing]
-    specs += [ArraySpec(laid, np.int16) for _ in told]
+    facing = [] if sampled.facing is None else [sampled.facing]
+    specs += [ArraySpec(laid, np.int16) for _ in facing]
     amid = [] if sampled.settled is None else [sampled.settled]
     specs += [ArraySpec(laid[1:], np.int8) for _ in amid]
 
-    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *known: np.ndarray) -> tuple[np.ndarray, ...]:
-        sides = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in known[: len(told)]]
-        *placed, settled = _arranged(row, place, cells, sizes, grid.fine[1], *known[len(told) :])
+    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *optional: np.ndarray) -> tuple[np.ndarray, ...]:
+        sides = [
+            np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in optional[: len(facing)]
+        ]
+        *placed, settled = _arranged(row, place, cells, sizes, grid.fine[1], *optional[len(facing) :])
         return *placed, *sides, *([settled] if amid else [])
 
-    arguments = sampled.row, layout.place, layout.cells, *told, *amid
-    index, shift, row, part, *known = engine.call_host(host, tuple(specs), *arguments)
+    arguments = sampled.row, layout.place, layout.cells, *facing, *amid
+    index, shift, row, part, *optional = engine.call_host(host, tuple(specs), *arguments)
     return Fine(
         sampled.samples,
         index,
         shift,
-        Cells(row, facing=known[0] if told else None, settled=known[-1] if amid else None),
+        Cells(row, facing=optional[0] if facing else None, settled=optional[-1] if amid else None),
         part,
         layout.wanted,
         layout.pixel,

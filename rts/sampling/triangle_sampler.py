@@ -51,7 +51,7 @@ class TriangleSampler(Sampler):
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Give every instance a keeper, whatever `__init__` a subclass has; refuse what would never be called."""
+        """Give every instance a keeper, whatever `__init__` a subclass has; refuse an `update` that is never called."""
         if overrides(cls, "update", TriangleSampler) and not overrides(cls, "prepare", TriangleSampler):
             raise PluginError(
                 f"{cls.__qualname__} has an update, which adapts what prepare built, and no prepare; write prepare, or "
@@ -62,11 +62,11 @@ class TriangleSampler(Sampler):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """The sampler's own settings: copies, and those in other processes, build anew."""
+        """The sampler's own settings: a copy, such as in another process, prepares anew."""
         return {name: value for name, value in self.__dict__.items() if name != "_keeper"}
 
     def prepare(self, proxy: Proxy) -> Any:
-        """Build what `rasterize` needs: an acceleration structure, device buffers. The default is the proxy itself."""
+        """Build the input of `rasterize`: an acceleration structure, device buffers. The default gives the proxy."""
         check_faces(proxy)
         return proxy
 
@@ -280,7 +280,7 @@ class _Search:
         cull: the part's.
         inputs: of the surface's proxy.
         camera: host matrices.
-        shape: how many samples there may be.
+        shape: bounds on the number of samples.
         tables: what the surface's `table_specs` allots.
         hidden: the rule for hidden samples; None to keep all.
         entry: the surface's prepared entry, if known.
@@ -302,7 +302,7 @@ class _Search:
         """The samples where the triangles are, or where a surface that moves none refines them."""
         known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
-        # What is refined is not settled.
+        # Refined samples all stay, none is left out amid one colour.
         kept, facing = decision.needed if self.surface.refines else decision.kept, None
         if sides:
             # Nobody looks at them where no sample is hidden, and to find them takes long.
@@ -383,7 +383,7 @@ class _Search:
         """The size of the largest coordinate of the triangles; 0 where the rule knows it already."""
         if known.size is not None or self.hidden is None:
             return known.size or 0.0
-        # Vertices that were looked at as a part of θ need not be looked at again.
+        # The rule has the size of vertices that are themselves a part of θ.
         read = self.hidden.size > 0 and any(np.may_share_memory(x, known.proxy.vertices) for x in leaves(self.inputs))
         return 0.0 if read else largest(known.proxy.vertices)
 

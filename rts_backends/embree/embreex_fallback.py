@@ -112,7 +112,7 @@ class Scene:
 def _take(
     first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, nearest
 ):  # fmt: skip
-    """Put the hit of each pixel, and those of all triangles around its corners, among the pixel's nearest."""
+    """Put the hit of each pixel, and hits of all triangles around its corners, among the pixel's nearest."""
     layers = ids.shape[1]
     corners = np.empty((3, 4))
     for n in range(first, last):

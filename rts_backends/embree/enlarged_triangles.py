@@ -29,7 +29,7 @@ NEVER = 255
 
 
 class Covers(NamedTuple):
-    """Triangles that cover those of a proxy: first one for each, then further ones of the thin and the small.
+    """Triangles that cover a proxy's: first one for each, then further ones for thin and small triangles.
 
     Attributes:
         corners: (3 M + 1, 3) float32, three for each cover; the last row is padding, since Embree reads 16 bytes each.

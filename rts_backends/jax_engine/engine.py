@@ -102,7 +102,7 @@ class JaxEngine(Engine):
         return x
 
     def known(self, x: jax.Array) -> np.ndarray | None:
-        """The value; under `grad` and `jvp` of what is eager, too."""
+        """The value, also under an eager `grad` or `jvp`."""
         x = jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
         return None if isinstance(x, Tracer) else np.asarray(x)
 
@@ -216,8 +216,8 @@ class JaxEngine(Engine):
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
         """By `jax.checkpoint` of `f`. What `make` gave is kept: to trace `make` would fix the shapes of its arrays."""
-        made = make()
-        return jax.checkpoint(lambda: f(made))()
+        operand = make()
+        return jax.checkpoint(lambda: f(operand))()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""

@@ -89,7 +89,7 @@ def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, l
 
 
 def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], Any]:
-    """The call with those of its results that are wanted."""
+    """The call with only the wanted results."""
     if not any(wanted):
         return [False] * len(equation.invars), None
     used = tuple(i for i, wish in zip(equation.params["used"], wanted, strict=True) if wish)

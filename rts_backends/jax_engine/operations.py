@@ -1,4 +1,4 @@
-"""Operations as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and what is made of them.
+"""Operations as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and their combinations.
 
 Three primitives an operation: its value, its pushforward and its pullback. Each of the last two is linear in the
 tangents or the gradients, and the transpose of the other; their derivatives by the operands, which are second
@@ -36,7 +36,7 @@ Wanted = tuple[bool, ...]
 """Marks of the differentiable operands that have a tangent or want a gradient."""
 
 MOST_KEPT = 1 << 24
-"""The most bytes that are kept of what values leave to derivatives."""
+"""The most bytes that values keep for derivatives."""
 
 
 def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any], used: Any) -> jax.Array:
@@ -46,7 +46,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
         operation: the operation.
         operands: its operands.
         params: its parameters.
-        used: how many rows of packed operands are in use, () int32.
+        used: the number of rows of packed operands in use, () int32.
     """
     if operation not in _bound:
         _bound[operation] = _Differentiable(operation, _name(operation), params)
@@ -161,7 +161,7 @@ class _Differentiable:
     # ------------------------------------------------------------------------------------------ by compiled loops
 
     def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
-        """The operands, of packed ones the rows in use; their number; and what the value has kept."""
+        """The operands, packed ones without unused rows; the number of rows; and the arrays that the value has kept."""
         operands = [read_only(x) for x in given[: self._inputs]]
         operation, used = self.operation, 0
         if operation.packed:

@@ -32,8 +32,8 @@ class HostPrimitive:
         host: fills the results for one item.
         specified: computes the results by specification.
         even: see `Operation`.
-        noted: whether the last result is a note.
-        some: whether of the operands after the samples there are only those that a parameter `wanted` says.
+        noted: True if the last result is a note.
+        some: True if the operands after the samples are only those that a parameter `wanted` marks.
         in_place: indices of operands whose gradients may take their places; the results are gradients of those of the
             first operands that the parameter `wanted` says, with an axis before. `host` finds then that they share
             memory.
@@ -76,7 +76,7 @@ class HostPrimitive:
         return (function if not any(a == 0 for a in axes) else jax.vmap(function, axes))(*operands)
 
     def _own_ranks(self, params: dict) -> list[int]:
-        """Ranks of those operands that there are: tangents may be of one alone."""
+        """Ranks of the operands that are present: tangents may be of one alone."""
         samples, rest = self.ranks[: self.samples], self.ranks[self.samples :]
         if self._some:
             rest = (r for r, wish in zip(rest, params["wanted"], strict=True) if wish)

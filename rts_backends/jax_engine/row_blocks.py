@@ -130,7 +130,7 @@ class _Pieces:
         return start + jnp.arange(self._size)
 
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
-        """The value of a piece as a function of those operands that are wanted, closed ones and pieces, and these."""
+        """The value of a piece as a function of the wanted operands, closed ones and pieces; and these operands."""
         operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
         there = self.index(start) < self._used
 
@@ -139,7 +139,7 @@ class _Pieces:
             values = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
             own = []
             for x, whole in zip(values[self.fixed :], self._rows, strict=True):
-                # What is not in use may hold values at which there are no derivatives.
+                # Unused rows may hold values at which there are no derivatives.
                 other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
                 own.append(self.among(x, there, other))
             return eval_jaxpr(self._jaxpr, [], *values[: self.fixed], *own)[0]
@@ -157,9 +157,9 @@ def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr, fixed: int) ->
     return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The derivative along tangents of those operands that are wanted, which follow the operands."""
-    operands, tangents = given[: len(wanted)], given[len(wanted) :]
+def _pushed(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
+    """The derivative along tangents of the wanted operands; tangents follow the operands."""
+    operands, tangents = arrays[: len(wanted)], arrays[len(wanted) :]
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
 
@@ -172,9 +172,9 @@ def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted:
     return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The gradients of those operands that are wanted; that of the value follows the operands."""
-    *operands, g = given
+def _pulled(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
+    """The gradients of the wanted operands; the gradient of the value follows the operands."""
+    *operands, g = arrays
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
 
@@ -196,18 +196,18 @@ def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted:
 
 
 def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
-    """A primitive of one of the functions, whose first operands say how many rows are in use: at most, and each item.
+    """A primitive of one of the functions; its first operands are the numbers of rows in use: at most, and of the item.
 
     Args:
         name: its name.
         function: computes it.
         results: shapes and dtypes of the operands after these, and parameters → those of the results.
     """
-    made = Primitive(f"rts_rows_in_use_{name}")
-    made.multiple_results = True
-    made.def_impl(function)
-    made.def_abstract_eval(lambda most, used, *avals, **params: results(*avals, **params))
-    mlir.register_lowering(made, mlir.lower_fun(function, multiple_results=True))
+    primitive = Primitive(f"rts_rows_in_use_{name}")
+    primitive.multiple_results = True
+    primitive.def_impl(function)
+    primitive.def_abstract_eval(lambda most, used, *avals, **params: results(*avals, **params))
+    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=True))
 
     def batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
         # One loop serves all items, as long as the longest.
@@ -224,11 +224,11 @@ def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
             _, *given = (next(it) if t else x for x, t in zip(primals, present, strict=True))
             return function(None, *given, **params)
 
-        return made.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
+        return primitive.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
 
-    batching.primitive_batchers[made] = batched
-    ad.primitive_jvps[made] = along
-    return made
+    batching.primitive_batchers[primitive] = batched
+    ad.primitive_jvps[primitive] = along
+    return primitive
 
 
 def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:

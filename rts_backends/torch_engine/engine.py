@@ -96,7 +96,7 @@ class TorchEngine(Engine):
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
         if array.dtype != dtype and array.dtype.kind == "f":
-            # What is too large becomes infinite. torch takes longer for a matrix.
+            # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
                 array = array.astype(dtype)
         return _tensor(array, None if like is None else like.device)

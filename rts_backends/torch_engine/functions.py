@@ -39,7 +39,7 @@ _loaded: list[bool] = []
 
 
 def quiet_forward_mode() -> None:
-    """Have torch load what its forward mode needs, which makes it warn of its own `torch.jit.script`; once."""
+    """Have torch load the modules of its forward mode once; the loading warns of torch's own `torch.jit.script`."""
     if not _loaded:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)

@@ -100,7 +100,7 @@ class _Call:
         return pull
 
     def pushed(self, present: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., Tensor]:
-        """The specification's pushforward as a function of the differentiable operands and those tangents (T, ·)."""
+        """The specification's pushforward as a function of the differentiable operands and their tangents (T, ·)."""
 
         def push(*given: Tensor) -> Tensor:
             varied, tangents = self.split(given)
@@ -223,7 +223,7 @@ class _Pull(torch.autograd.Function):
 
 
 class _Push(torch.autograd.Function):
-    """Tangents (T, ·) of the result along those of the differentiable operands that are present."""
+    """Tangents (T, ·) of the result along the present tangents of the differentiable operands."""
 
     @staticmethod
     def forward(call, present, *given):

@@ -299,7 +299,7 @@ def _without_derivative(level: Callable[[Array], Array], points: Array) -> Array
 
 
 def _ahead(enter: Array, leave: Array) -> tuple[Array, Array]:
-    """The part of a span that is not behind the origin of a ray; 0 and 0 where there is none."""
+    """The part of a span ahead of the origin of a ray; 0 and 0 if it is empty."""
     xp = engine_of(enter).namespace
     enter = xp.clip(enter, 0, None)
     met = leave > enter

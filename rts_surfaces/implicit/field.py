@@ -1,4 +1,4 @@
-"""Functions of space, as surfaces use them: those that are negative inside, and what surfaces of fields share."""
+"""Scalar fields of space, negative inside, and the base class of surfaces of fields."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Field(ScalarField):
         return tuple(theta) if self._reads is None else self._reads
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ that lacks an entry which `f` reads. What `f` makes of it is checked when it is called."""
+        """Refuse θ that lacks an entry which `f` reads. The result of `f` is checked when it is called."""
         for name in self.names(theta):
             if name not in theta:
                 raise InputError(f"theta has no {name!r}, which {self.name} reads; it has {sorted(theta)}")
@@ -124,14 +124,14 @@ class Field(ScalarField):
 
     def _why(self, error: Exception, engine: Engine) -> str:
         """The message for an error of `f`."""
-        told = " ".join(str(error).split())[:120] or type(error).__name__
+        message = " ".join(str(error).split())[:120] or type(error).__name__
         if isinstance(error, (AttributeError, TypeError)) and not engine.differentiates:
             return (
-                f"{self.name} cannot work with arrays of NumPy ({told}); it gets these where theta has no others: put "
+                f"{self.name} cannot work with arrays of NumPy ({message}); it gets these where theta has no others: put "
                 f"the weights that it reads into theta"
             )
         return (
-            f"{self.name} fails on points (M, 3) of {engine.name} ({told}); write it in array code, with the functions "
+            f"{self.name} fails on points (M, 3) of {engine.name} ({message}); write it in array code, with the functions "
             f"of rts.namespace(points) alone"
         )
 
@@ -140,7 +140,7 @@ class Field(ScalarField):
         return gradient(partial(self.level, theta), points)
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The points in the widest floating dtype of what `f` reads, float32 at least."""
+        """The points in the widest floating dtype among the entries that `f` reads, float32 at least."""
         xp, bits = namespace(points), 0
         for x in leaves({name: theta[name] for name in self.names(theta)}):
             if hasattr(x, "dtype") and namespace(x).isdtype(x.dtype, "real floating"):
@@ -184,7 +184,7 @@ class Implicit(Surface):
 
         Args:
             theta: θ.
-            samples: those of `rts_surfaces.implicit.casting.moving`.
+            samples: samples with the parameters of `rts_surfaces.implicit.casting.moving`.
             level: f, points (M, 3) → (M,), differentiable in θ.
         """
         params = self.field.suited(theta, samples.params)
@@ -232,7 +232,7 @@ def known_number(name: str, value: np.ndarray | None) -> float:
 
 
 def check_function(name: str, f: Any) -> None:
-    """Refuse what is no function of θ and points; a class is none, its objects may be."""
+    """Refuse anything but a function of θ and points; a class is none, its objects may be."""
     if not callable(f) or isinstance(f, type):
         raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
     try:
@@ -249,7 +249,7 @@ def check_function(name: str, f: Any) -> None:
 
 
 def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:
-    """Refuse what a function gave for points (M, 3), if it is not (M,), or (M, C), in their engine and dtype."""
+    """Refuse a function's result for points (M, 3) that is not (M,), or (M, C), in their engine and dtype."""
     engine, count = engine_of(points), points.shape[0]
     expected = f"({count}, C)" if columns else f"({count},)"
     try:

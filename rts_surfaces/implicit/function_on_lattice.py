@@ -1,4 +1,4 @@
-"""Functions of space, looked at on a lattice: everywhere, or in a narrow band."""
+"""Functions of space evaluated on a lattice: everywhere, or in a narrow band."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class FunctionOnLattice(Field):
         return self.level(theta, self.suited(theta, places))
 
     def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """The level at all lattice points, or at those of the band; without derivative."""
+        """The level at all lattice points, or at the band's; without derivative."""
         read = {name: theta[name] for name in self.names(theta)}
         engine, like, count = engine_of(read), exemplar(read), self._lattice.count
         if self.band is None:

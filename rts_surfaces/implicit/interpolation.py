@@ -47,7 +47,7 @@ def _cells(
 
 
 def _corners(shape: Sequence[int], lowest: Sequence[Array], shares: Sequence[Array]) -> tuple[Array, Array]:
-    """Numbers and weights (M, 8) of the corners of cells, for what is interpolated linearly along each axis."""
+    """Numbers and weights (M, 8) of the corners of cells, for interpolation that is linear along each axis."""
     xp = namespace(lowest[0])
     first = (lowest[0] * shape[1] + lowest[1]) * shape[2] + lowest[2]
     ids, weights = [], []
@@ -135,4 +135,4 @@ DIFFERENCES = Operation(
     differentiable=2,
     **_PACKED,
 )
-"""The operation of `differences`, on values and points; low and step are those of the lattice."""
+"""The operation of `differences`, on values and points; low and step are the lattice's."""

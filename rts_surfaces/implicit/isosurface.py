@@ -83,7 +83,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             triangle's corners slide along the edges of the lattice, as in the paper.
         inside: "below" or "above" the isovalue.
         at_bounds: "capped": where the inside reaches the bounds, it is closed there; or "open".
-        near_singular: what is done where an edge's ends are so much alike that its corner would move without bound.
+        near_singular: the rule where an edge's ends are so much alike that its corner would move without bound.
             "bound": derivatives are bounded. "drop": there is no surface, as in the paper. "keep": nothing.
         table: for a costly `f`. It is called once for each lattice point, not once for each sample that has it. A
             number says for how many to allot room where shapes must be known, as in `jax.jit`; else there is room for
@@ -170,7 +170,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ----------------------------------------------------------------------------------- triangles and samples
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """Values at lattice points: those of θ, or levels of the function, everywhere or in its band."""
+        """Values at lattice points: θ's, or levels of the function, everywhere or in its band."""
         return self.field.look(theta, self.closed).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
@@ -249,8 +249,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         arguments = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
         # Where no cell is covered there is a row nevertheless, of nothing.
         count = int(samples.row.max()) + 1
-        made = points, params, least / lattice.step.max()
-        parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *made, work=300 * count)
+        results = points, params, least / lattice.step.max()
+        parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *results, work=300 * count)
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:

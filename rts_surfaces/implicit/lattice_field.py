@@ -22,11 +22,11 @@ class LatticeField(ScalarField):
     Args:
         bounds: the corners of the lattice.
         isovalue: where the level is zero.
-        sign: 1 where values below the isovalue are inside, −1 where those above it are.
+        sign: 1 if values below the isovalue are inside, −1 if values above it are.
         shape: (X, Y, Z) that the values must have, or None for any.
 
     Attributes:
-        level_of_values: isovalue and sign of what `look` gives.
+        level_of_values: isovalue and sign of the values that `look` gives.
     """
 
     name = "theta['values']"

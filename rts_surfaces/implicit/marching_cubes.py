@@ -80,7 +80,7 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
         lattice: the lattice.
         isovalue: points are inside where `sign * (value - isovalue)` is below zero.
         sign: 1 or −1.
-        closed: whether to cap what is inside at the bounds.
+        closed: True to cap the inside at the bounds.
     """
     from rts_surfaces.implicit import marching_cubes_loops as loops
 
@@ -147,7 +147,7 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
 
 
 def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray, ...]:
-    """The band's cells, and where the surface is closed those around the lattice, whose outer corners are outside.
+    """The band's cells, and for a closed surface the cells around the lattice, whose outer corners are outside.
 
     Returns:
         For each cell its row of the band (C,) int32; the rows of its corners (C, 8) int32, in place of outer ones those

@@ -61,9 +61,9 @@ class NarrowBand:
         lipschitz: how fast the level changes at most, per unit of length; None where this is not known.
         coarse: cells along each side of the blocks to begin with, a power of two; None for 16 with a Lipschitz bound
             and 8 without one.
-        margin: how many coarse cells around those whose corners differ in sign are halved with them. With a Lipschitz
+        margin: coarse cells halved around each one whose corners differ in sign, in cells. With a Lipschitz
             bound it does not count.
-        chunk: how many points the level is evaluated at together, at most.
+        chunk: the largest number of points at which the level is evaluated together.
 
     Raises:
         InputError: an argument is of the wrong kind.
@@ -93,7 +93,7 @@ class NarrowBand:
         Args:
             level: see `Level`; called for at most `chunk` places at a time.
             lattice: the lattice.
-            closed: whether the surface is capped at the lattice's boundary. Cells are in the band, too, if one of their
+            closed: True if the surface is capped at the lattice's boundary. Cells are in the band, too, if one of their
                 corners is inside and on the boundary.
 
         Returns:
@@ -172,7 +172,7 @@ class _Evaluate:
 
 
 class _Grid:
-    """Corners of blocks of one side, and the levels at those that are known.
+    """Corners of blocks of one side, and the levels at corners where they are known.
 
     Attributes:
         numbers: (M,) int64, their numbers in the lattice.
@@ -253,7 +253,7 @@ def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> 
 
 
 def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tuple[_Grid, np.ndarray, np.ndarray]:
-    """Find cells whose corners differ in sign, and follow the surface from them; returns what `_bounded` does."""
+    """Find cells whose corners differ in sign, and follow the surface from them; results as of `_bounded`."""
     grid = _Grid(evaluate, side)
     blocks = evaluate.all_blocks(side)
     rows = grid.corners(blocks)
@@ -272,7 +272,7 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
 
 
 def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the blocks whose corners differ in sign, and add those that the surface goes on in."""
+    """Choose the blocks whose corners differ in sign, and add blocks into which the surface goes on."""
     directory, bricks = _bricks(grid.counts, np.uint8)
     bricks, used = loops.marked(blocks, grid.counts, directory, bricks, 0)
     rows = grid.corners(blocks)

@@ -48,8 +48,8 @@ def progress_bar(wanted: bool | None, what: str, total: int) -> Iterator[Callabl
     """A progress bar on standard error, and the function that moves it on by a number.
 
     Args:
-        wanted: whether to show it; None to do so in a terminal.
-        what: what is being done.
+        wanted: True to show it; None to do so in a terminal.
+        what: the work's name, for the bar.
         total: the number that makes it full.
     """
     if wanted is False or (wanted is None and not sys.stderr.isatty()):

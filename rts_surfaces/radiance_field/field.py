@@ -16,7 +16,7 @@ from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_ne
 
 NETWORKS = ("coarse", "fine")
 LARGEST = 2**30
-"""Bytes of weights; what claims to be more is no network of this kind."""
+"""The most bytes of weights; a larger file holds no network of this kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class RadianceField:
             shape: (X, Y, Z), at least 2 each.
             network: "fine" or "coarse".
             keep: True to keep them in the user's cache and to find them there; a folder for that; False for neither.
-            progress: whether to show a progress bar; None to do so in a terminal.
+            progress: True to show a progress bar; None to do so in a terminal.
 
         Raises:
             InputError: there is no such lattice or network.

@@ -42,7 +42,7 @@ def lattice(
         network: "fine" or "coarse".
         keep: where to keep the lattice, and to look for it: True for the user's cache, a folder, or False for nowhere.
             It goes by weights, bounds and shape. What is damaged there is computed anew.
-        progress: whether to show a progress bar; None to do so in a terminal.
+        progress: True to show a progress bar; None to do so in a terminal.
 
     Returns:
         (X, Y, Z) float32, per unit of length in the field's space; [i, j, k] is at step i of x, j of y, k of z.
@@ -87,7 +87,7 @@ def _key(weights: Any, points: Lattice) -> str:
 
 
 def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
-    """The lattice in a file; None where there is none, or it is damaged (zip files hold checksums)."""
+    """The lattice in a file; None if the file is missing or damaged (zip files hold checksums)."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             values = file["density"]

@@ -122,7 +122,7 @@ def encoding(vectors: Array, levels: int) -> Array:
 
 
 def density(weights: Mapping[str, Tree], points: Array) -> Array:
-    """Volume density σ at points: what a ray loses of its light, per unit of length in the field's space.
+    """Volume density σ at points: the share of its light that a ray loses per unit of length in the field's space.
 
     Args:
         weights: a network, see `check_network`.

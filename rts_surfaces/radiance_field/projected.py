@@ -131,7 +131,7 @@ class Projected(TriangleSurface):
         return gbuffer
 
     def _normals(self, position: Array, normals: Array) -> Array:
-        """Unit normals (N, 3) in the world, of those in NDC: times the transposed Jacobian of world to NDC."""
+        """Unit normals (N, 3) in the world: normals in NDC times the transposed Jacobian of world to NDC."""
         xp, (x_scale, y_scale) = namespace(position), self.ndc.scale
         x, y, depth = position[:, 0], position[:, 1], -position[:, 2]
         a, b = x_scale * normals[:, 0], y_scale * normals[:, 1]

@@ -1,4 +1,4 @@
-"""Radiance fields drawn by volume rendering: what surface light fields are compared with."""
+"""Volume rendering of radiance fields, with which surface light fields are compared."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LAST = 1e10
 
 
 class VolumeImage(NamedTuple):
-    """A picture of a volume, and what it took.
+    """A picture of a volume, and its cost.
 
     Attributes:
         image: (H, W, 3) RGB on the background, or (H, W, 4) premultiplied RGBA, in the encoding of the network.
@@ -55,7 +55,7 @@ def volume_render(
         samples: of the coarse and the fine network, along each ray.
         background: a colour (3,), or None for transparency.
         ndc: the map to the field's space, or None.
-        progress: whether to show a progress bar.
+        progress: True to show a progress bar.
     """
     if not isinstance(field, RadianceField):
         raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")

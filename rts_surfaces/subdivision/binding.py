@@ -127,7 +127,7 @@ class Limit:
         handle, widths = ctypes.c_void_p(), (ctypes.c_int * 2)()
         self._call("rts_cage", ctypes.byref(description), ctypes.byref(handle), widths)
         self.handle = handle.value or 0
-        # What a `Points` leaves behind: the next one's memory need not be asked of the system, page by page.
+        # Memory that one `Points` leaves to the next, so that the system need not clear it page by page.
         self._left: list[int] = []
         weakref.finalize(self, _free, self._library, self.handle, self._left)
         self.used = read_only(used.astype(np.int32))

@@ -1,4 +1,4 @@
-"""Cages from OBJ files: polygons, uv, and the statements "t" by which OpenSubdiv's files tag what these are made of.
+"""Cages from OBJ files: polygons, uv, and the tags of OpenSubdiv's files, which are statements "t".
 
 `t name i/f/s …` has so many integers, floats and words. Vertices and faces in them count from 0, those of "f" from 1.
 """

@@ -74,9 +74,9 @@ class Subdivision(Parametric):
             for ever.
         corners: rows (vertex, sharpness).
         holes: numbers of faces that shape the surface, and are no part of it.
-        boundary: what becomes of edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
+        boundary: the rule for edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
             face are corners), "edge_only" (no corners), "none" (faces at the boundary have no surface).
-        chaikin: whether the sharpness of creases is smoothed along them.
+        chaikin: True if the sharpness of creases is smoothed along them.
         indices: attribute name → None for one row a vertex, which is how others than the known ones are declared; and
             for "uv" lists of integers into θ["uv"], as `faces` are: a face-varying map with seams.
         uv_rule: where a face-varying uv is linear rather than smooth: "none", "corners_only", "corners_plus1",
@@ -135,7 +135,7 @@ class Subdivision(Parametric):
         return tuple(dict.fromkeys((*VERTEX_ATTRIBUTES, *(indices or {})))), uv
 
     def _prepare(self) -> None:
-        """Make what is not kept in a copy."""
+        """Make the objects that copies do not keep."""
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
             raise InputError(
@@ -246,7 +246,7 @@ class Subdivision(Parametric):
         return gbuffer
 
     def _weights(self, like: Array, faces: Array, params: Array, channel: int, derivatives: bool) -> tuple[Array, ...]:
-        """Weights (N, W) of control points; for derivatives those along u, and those along v."""
+        """Weights (N, W) of control points; for derivatives also weights along u and along v."""
         engine = engine_of(like, params)
         dtype = np.float64 if engine.namespace.finfo(like.dtype).bits == 64 else np.float32
         table = self.limit.table if channel == VERTEX else self.limit.uv_table
