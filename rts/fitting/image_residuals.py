@@ -321,7 +321,7 @@ class ImageResiduals(Residuals):
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
         def swept(shown: Callable[..., Splats], fields: _Fields, known: Splats) -> tuple[Array, Array, Array] | None:
-            """Normal equations of the splats that `shown` makes of parts, cameras and a context; `known` is constant."""
+            """Normal equations of the splats that `shown` makes of parts, camera and context; `known` is constant."""
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))

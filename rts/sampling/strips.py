@@ -345,9 +345,11 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     layers, count = whole.row.shape[0], whole.ids.shape[0]
     rows = count if capacity is None else capacity
     grid = layers, *cells.shape
-    told = [] if whole.facing is None else [whole.facing]
+    whole_facing = [] if whole.facing is None else [whole.facing]
 
-    def host(row: np.ndarray, depth: np.ndarray, cells: np.ndarray, *told: np.ndarray) -> tuple[np.ndarray, ...]:
+    def host(
+        row: np.ndarray, depth: np.ndarray, cells: np.ndarray, *whole_facing: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         there = cells >= 0
         at = np.where(there, cells, 0)
         row, depth = (x.reshape(layers, -1)[:, at] for x in (row, depth))
@@ -357,7 +359,7 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         number[covered] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
         kept = np.zeros(max(1, len(index)) if capacity is None else rows, np.int32)
         kept[: len(index)] = index[: len(kept)]
-        sides = (np.where(number >= 0, x.reshape(layers, -1)[:, at], 0).astype(np.int16) for x in told)
+        sides = (np.where(number >= 0, x.reshape(layers, -1)[:, at], 0).astype(np.int16) for x in whole_facing)
         dropped = np.asarray(max(0, len(index) - rows), np.int32)
         return kept, number, np.where(number >= 0, depth, 0), dropped, *sides
 
@@ -367,9 +369,9 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         ArraySpec(grid, np.int32),
         ArraySpec(grid, kind),
         ArraySpec((), np.int32),
-        *(ArraySpec(grid, np.int16) for _ in told),
+        *(ArraySpec(grid, np.int16) for _ in whole_facing),
     )
-    arguments = whole.row, whole.depth, cells, *told
+    arguments = whole.row, whole.depth, cells, *whole_facing
     index, row, depth, overflow, *facing = engine_of(whole).call_host(host, specs, *arguments)
     xp, gbuffer = namespace(index), whole.gbuffer
     tables = whole.tables.items()

@@ -124,14 +124,14 @@ class Field(ScalarField):
 
     def _why(self, error: Exception, engine: Engine) -> str:
         """The message for an error of `f`."""
-        message = " ".join(str(error).split())[:120] or type(error).__name__
+        text = " ".join(str(error).split())[:120] or type(error).__name__
         if isinstance(error, (AttributeError, TypeError)) and not engine.differentiates:
             return (
-                f"{self.name} cannot work with arrays of NumPy ({message}); it gets these where theta has no others: put "
+                f"{self.name} cannot work with arrays of NumPy ({text}); it gets these where theta has no others: put "
                 f"the weights that it reads into theta"
             )
         return (
-            f"{self.name} fails on points (M, 3) of {engine.name} ({message}); write it in array code, with the functions "
+            f"{self.name} fails on points (M, 3) of {engine.name} ({text}); write it in array code, with the functions "
             f"of rts.namespace(points) alone"
         )
 
