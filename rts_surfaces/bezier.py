@@ -81,7 +81,7 @@ class Bezier(Patches):
         return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
 
     def bezier_rows(self, values: Array) -> Array:
-        """The control points themselves."""
+        """The control points, which are Bézier's already."""
         return values
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:

@@ -85,7 +85,7 @@ class Parametric(TriangleSurface):
                     array.flags.writeable = False
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Other tolerances."""
+        """The surface at other tolerances."""
         rates = []
         for tolerance in TOLERANCES:
             if tolerance != self.tolerance:

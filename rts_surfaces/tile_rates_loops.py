@@ -117,7 +117,7 @@ def curves(start, stop, found, frames, along, out):
 def outlines(
     start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
 ):
-    """Fill how far triangles of tiles may be off the surface, in units of space; infinity where out of view.
+    """Fill the allowed distances of tiles' triangles from the surface, in units of space; infinity out of view.
 
     Args:
         start: first tile.
@@ -189,7 +189,7 @@ def outlines(
 
 @loop
 def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
-    """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
+    """Fill the numbers of cuts of tiles and their sides: inner (n, 2) along s and t, edges (E,).
 
     Args:
         bends: (n, 3).

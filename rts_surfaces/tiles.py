@@ -1,4 +1,4 @@
-"""Patches in tiles, and triangles of these that meet without cracks whatever the rates at which tiles are cut.
+"""Tiles of patches, and their triangles, which meet without cracks at any rates of cutting.
 
 A tile is a quadrilateral or a triangle, with local coordinates (s, t): the unit square, or the triangle (0, 0), (1, 0),
 (0, 1). Tiles that share an edge share its points.
@@ -203,7 +203,7 @@ class Allowed(NamedTuple):
 
     @classmethod
     def everywhere(cls, count: int, chord: float) -> Allowed:
-        """So many tiles alike."""
+        """The same distance for `count` tiles."""
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 

@@ -54,7 +54,7 @@ def is_plain(text: str) -> bool:
 
 @contextlib.contextmanager
 def gathered(path: Path) -> Iterator[list[str]]:
-    """A list that has, once the block is left, one line for each thing that was warned of in it.
+    """A list that holds one line for each warning of a file in the block, once it is left.
 
     Other libraries warn in their own ways, and some only log: what they say is caught, and led back to the file.
     Threads take turns.
@@ -102,5 +102,5 @@ class _Lines(logging.Handler):
 
 
 def warn(text: str) -> None:
-    """Warn of a file; inside `gathered`, from which the warning comes to the user."""
+    """Warn of a file; call it inside `gathered`, which passes the warning on to the user."""
     errors.warn(text, FileWarning)

@@ -73,7 +73,7 @@ def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
 
 
 def _matrix(name: str, node: dict[str, Any], fail: Any) -> np.ndarray:
-    """The transform (4, 4) of a node, but for its rotation, which changes no volume. Its numbers are checked."""
+    """The transform (4, 4) of a node without its rotation, which changes no volume. Its numbers are checked."""
     entries = {key: node[key] for key in _WIDTHS if key in node}
     for key, values in entries.items():
         numbers = isinstance(values, list) and all(isinstance(x, (int, float)) and x is not True for x in values)

@@ -124,7 +124,7 @@ def _duration(kind: str, fps: float) -> int:
 
 
 def _each(frames: Any) -> Iterable[Any]:
-    """The frames; refused where they are none, or one image."""
+    """The frames of an animation, refused if there are none, or only one image."""
     shape = tuple(getattr(frames, "shape", ()))
     one = len(shape) in (1, 2) or (len(shape) == 3 and shape[2] in (1, 3, 4))
     if one or isinstance(frames, (str, bytes, dict)) or not isinstance(frames, Iterable):

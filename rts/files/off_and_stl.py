@@ -26,7 +26,7 @@ TRIANGLE = _RECORD.itemsize
 
 
 def text_of(path: Path, kind: str, data: bytes) -> str:
-    """A file's text; an InputError where the bytes are none."""
+    """A file's text; an InputError if the bytes are no text."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -122,7 +122,7 @@ def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.n
 
 
 def sound_stl(path: Path, data: bytes) -> bytes:
-    """The STL itself where it is binary and as long as it promises; one in text as nothing but solids and vertices.
+    """A binary STL as it is, if its length is right; an STL in text rewritten as solids and vertices only.
 
     Raises:
         InputError: it is longer or shorter, or the text departs from the format.
@@ -152,13 +152,13 @@ def sound_stl(path: Path, data: bytes) -> bytes:
         at = end.end()
     if at < len(text.rstrip()) or not text.strip():
         line = text.count("\n", 0, at) + 1
-        there = " ".join(text[at : at + 200].split())[:40]
-        raise unreadable(path, "STL", f"line {line}, {there!r}, is no solid, facet of three vertices, or endsolid")
+        excerpt = " ".join(text[at : at + 200].split())[:40]
+        raise unreadable(path, "STL", f"line {line}, {excerpt!r}, is no solid, facet of three vertices, or endsolid")
     return "".join(solids).encode()
 
 
 def _check_records(path: Path, records: np.ndarray) -> None:
-    """Refuse triangles whose bytes are not where they ought to be.
+    """Refuse triangles whose bytes are misplaced.
 
     Their numbers are of any size, then: coordinates are too small or too large to be any, and normals have no length
     of 1, nor of 0.

@@ -35,11 +35,11 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
     turned = _turned(points, corners[triangles], owner, sizes)
     # A quad has only one other diagonal; there may be many of them.
     quads = turned[sizes[turned] == 4]
-    others = (ends - 4)[quads, None, None] + np.array([[1, 2, 3], [1, 3, 0]])
+    other_fans = (ends - 4)[quads, None, None] + np.array([[1, 2, 3], [1, 3, 0]])
     places = np.repeat(np.arange(len(quads)), 2)
-    worse = _turned(points, corners[others.reshape(-1, 3)], places, sizes[quads])
+    worse = _turned(points, corners[other_fans.reshape(-1, 3)], places, sizes[quads])
     right = np.setdiff1d(np.arange(len(quads)), worse)
-    triangles[first[quads[right]][:, None] + np.arange(2)] = others[right]
+    triangles[first[quads[right]][:, None] + np.arange(2)] = other_fans[right]
     for polygon in np.setdiff1d(turned, quads[right]):
         begin, count = ends[polygon] - sizes[polygon], sizes[polygon]
         ears = _ears(points[corners[begin : begin + count]])
@@ -66,7 +66,7 @@ def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes:
 
 
 def _ears(ring: np.ndarray) -> np.ndarray | None:
-    """(n − 2, 3) int triangles of one polygon of corners (n, 3), or None where there are none that fit."""
+    """Triangles (n − 2, 3) int of one polygon of corners (n, 3), or None if no triangles fit."""
     import mapbox_earcut
 
     size = np.abs(ring).max()

@@ -50,10 +50,10 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     from trimesh.exchange.load import mesh_formats
 
     if extension not in mesh_formats():
-        others = ", ".join(sorted(mesh_formats() - {"obj", "ply", "stl", "glb", "gltf", "off"}))
+        formats = ", ".join(sorted(mesh_formats() - {"obj", "ply", "stl", "glb", "gltf", "off"}))
         raise InputError(
             f"{path} has the extension {path.suffix!r}, which is not known; expected obj, ply, stl, glb, "
-            f"gltf, off or another of trimesh's: {others}"
+            f"gltf, off or another of trimesh's: {formats}"
         )
     folder: Any = _Folder(path)
     kind = extension.upper()

@@ -267,7 +267,7 @@ def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[C
 
 
 def _own_loss(residuals: Residuals) -> Loss | None:
-    """The loss that residuals say they are for."""
+    """The loss that residuals declare as theirs."""
     loss = residuals.loss
     if loss is None or isinstance(loss, Loss):
         return loss

@@ -120,41 +120,45 @@ def levenberg_marquardt(
         run.note_gradient([bool(d.any()) for d in _split(np.diag(linear.matrix), sizes)])
         return linear, _Model(linear, sizes)
 
-    here, model = taken(linearize(vector), start=run.fresh)
-    going = run.record(unflatten(vector), here.value)
+    current, model = taken(linearize(vector), start=run.fresh)
+    going = run.record(unflatten(vector), current.value)
     damping, growth = FIRST_DAMPING, 2.0
     promising, jumps = True, False
     while going:
-        if not here.matrix.any() and len(run.history) == 1:
+        if not current.matrix.any() and len(run.history) == 1:
             refuse_independent(residuals, None, parameters, engine)
-        if not here.value or not here.gradient.any():
+        if not current.value or not current.gradient.any():
             run.stop(
-                "the loss is zero" if not here.value else "the gradient is zero" if here.matrix.any() else NO_GRADIENT
+                "the loss is zero"
+                if not current.value
+                else "the gradient is zero"
+                if current.matrix.any()
+                else NO_GRADIENT
             )
             break
         damping = max(damping, model.least)
         delta, predicted = model.step(damping)
         trial = vector + engine.constant(delta, vector)
         # A trial after one that was accepted probably is, too: its normal equations come with its loss.
-        there = linearize(trial) if promising and run.left > 1 else None
-        trial_value = loss_at(trial) if there is None else there.value
+        at_trial = linearize(trial) if promising and run.left > 1 else None
+        trial_value = loss_at(trial) if at_trial is None else at_trial.value
         going = run.record(unflatten(trial), trial_value)
         if not going:
             break
-        gain = here.value - trial_value
+        gain = current.value - trial_value
         promising = gain > 0  # False for a trial that is not finite, too.
         if not promising:
-            if damping >= 1 and predicted > RESOLVED * _loss_rounding(here, run.residuals):
+            if damping >= 1 and predicted > RESOLVED * _loss_rounding(current, run.residuals):
                 jumps = math.isfinite(trial_value)
             damping, growth = damping * growth, growth * 2
             going = damping <= LARGEST_DAMPING or run.stop(_no_step(jumps, supersample))
-        elif gain <= run.tolerance * here.value:
+        elif gain <= run.tolerance * current.value:
             going = run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
         else:
             ratio = gain / max(predicted, gain)
             damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
             vector, jumps = trial, False
-            here, model = taken(there or linearize(vector), start=False)
+            current, model = taken(at_trial or linearize(vector), start=False)
     _note_open(model, parameters, sizes, run)
 
 

@@ -136,8 +136,8 @@ def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidde
         row = value_of(sampled.row)
         if row is None:
             raise InputError('layers is "auto", but the values that decide are traced; give a number of layers')
-        others = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
-        counts = (row[..., 1:, :, :] >= 0).sum(axis=others)
+        other_axes = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
+        counts = (row[..., 1:, :, :] >= 0).sum(axis=other_axes)
         most = 1 + int(np.flatnonzero(np.append(1, counts)).max())
         if (most < count and not _ran_out(sampled)) or count > LAYER_LIMIT:
             break

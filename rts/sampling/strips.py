@@ -350,10 +350,10 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     def host(
         row: np.ndarray, depth: np.ndarray, cells: np.ndarray, *whole_facing: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        there = cells >= 0
-        at = np.where(there, cells, 0)
+        listed = cells >= 0
+        at = np.where(listed, cells, 0)
         row, depth = (x.reshape(layers, -1)[:, at] for x in (row, depth))
-        covered = (row >= 0) & there
+        covered = (row >= 0) & listed
         index = row[covered]
         number = np.full(grid, -1, np.int32)
         number[covered] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)

@@ -116,10 +116,10 @@ class TriangleSampler(Sampler):
         Returns:
             Fragments, (K, L, C).
         """
-        whole, there = self.rasterize(prepared, camera, size, layers, cull), cells >= 0
+        whole, listed = self.rasterize(prepared, camera, size, layers, cull), cells >= 0
         check_fragments(whole, (layers, *size), np.iinfo(np.int32).max, self)
-        at = np.where(there, cells, 0)
-        ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
+        at = np.where(listed, cells, 0)
+        ids = np.where(listed, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
 
     def rasterize_exits(

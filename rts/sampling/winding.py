@@ -89,5 +89,5 @@ def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool
     places, at = np.unique(vertices, axis=0, return_inverse=True)
     start = at.reshape(-1)[faces].astype(np.int64)
     end = np.roll(start, -1, axis=1)
-    there, back = start * len(places) + end, end * len(places) + start
-    return np.array_equal(np.sort(there, axis=None), np.sort(back, axis=None))
+    forward, backward = start * len(places) + end, end * len(places) + start
+    return np.array_equal(np.sort(forward, axis=None), np.sort(backward, axis=None))

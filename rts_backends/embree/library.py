@@ -65,7 +65,7 @@ def find() -> str | None:
 
 
 def load() -> ctypes.CDLL | None:
-    """The library with its signatures, or None where it cannot be found."""
+    """The library with its signatures, or None if it is missing."""
     global _library, _device
     with _first_use:
         if _library is None:

@@ -140,7 +140,7 @@ class JaxEngine(Engine):
         return True
 
     def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
-        """By selection, which XLA can fuse with what reads it; ones where no cell refers to any row."""
+        """Rows filled by selection, which XLA can fuse with later code; ones where no cell refers to any row."""
         used = jnp.max(row) + 1
         index = jnp.arange(x.shape[0]).reshape(-1, *[1] * (x.ndim - 1))
         return jnp.where(index < used, x, jnp.where(used > 0, x[:1], 1))
@@ -170,7 +170,7 @@ class JaxEngine(Engine):
         return np.asarray(x)
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int) -> Tree:
-        """A loop of Python's as long as values are known, which compiles nothing; else `jax.lax.while_loop`."""
+        """A Python loop while values are known, which compiles nothing; else `jax.lax.while_loop`."""
         state = jax.lax.stop_gradient(state)
         for count in range(most):
             on = going(state)
@@ -215,7 +215,7 @@ class JaxEngine(Engine):
         return jax.value_and_grad(f)
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
-        """By `jax.checkpoint` of `f`. What `make` gave is kept: to trace `make` would fix the shapes of its arrays."""
+        """`jax.checkpoint` of `f`. The result of `make` is kept: to trace `make` would fix the shapes of its arrays."""
         operand = make()
         return jax.checkpoint(lambda: f(operand))()
 
@@ -224,7 +224,7 @@ class JaxEngine(Engine):
         return jax.jvp(f, (primal,), (tangent,))
 
     def jacobian(self, f: Callable) -> Callable:
-        """By forward-mode autodiff, all unknowns in one vectorised pass."""
+        """The Jacobian by forward-mode autodiff, all unknowns in one vectorised pass."""
 
         def call(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
             along = jnp.eye(vector.size, dtype=vector.dtype)

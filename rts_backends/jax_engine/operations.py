@@ -64,7 +64,7 @@ _specifying = contextvars.ContextVar("rts_specifying", default=False)
 
 @contextlib.contextmanager
 def by_specification() -> Iterator[None]:
-    """Within it no operation `fits`."""
+    """A context within which no operation `fits`."""
     token = _specifying.set(True)
     try:
         yield
@@ -318,7 +318,7 @@ def _whole(operation: HostPrimitive, params: tuple) -> Callable:
 
 
 def _spread(given: Sequence, wanted: Wanted) -> list:
-    """The given things in the places that are wanted, and None in the others."""
+    """A list with the items at wanted places, and None elsewhere."""
     it = iter(given)
     return [next(it) if wish else None for wish in wanted]
 
@@ -348,5 +348,5 @@ def _name(operation: Operation) -> str:
 
 
 def _summed(x: jax.Array, rank: int) -> jax.Array:
-    """The sum over items, for what they share."""
+    """The sum over items of a batch, for an operand that they share."""
     return x.sum(0) if x.ndim > rank else x

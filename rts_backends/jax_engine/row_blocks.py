@@ -121,9 +121,9 @@ class _Pieces:
         """The rows of a piece."""
         return jax.lax.dynamic_slice_in_dim(x, start, self._size)
 
-    def among(self, x: Any, there: jax.Array, other: Any) -> Any:
-        """The rows of a piece that are there, and others."""
-        return jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, other)
+    def among(self, x: Any, in_use: jax.Array, other: Any) -> Any:
+        """The rows of a piece that are in use; `other` in place of the rest."""
+        return jnp.where(in_use.reshape(-1, *[1] * (x.ndim - 1)), x, other)
 
     def index(self, start: Any) -> jax.Array:
         """The number of each row of a piece."""
@@ -132,7 +132,7 @@ class _Pieces:
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
         """The value of a piece as a function of the wanted operands, closed ones and pieces; and these operands."""
         operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
-        there = self.index(start) < self._used
+        in_use = self.index(start) < self._used
 
         def function(*varied: Any) -> jax.Array:
             it = iter(varied)
@@ -141,7 +141,7 @@ class _Pieces:
             for x, whole in zip(values[self.fixed :], self._rows, strict=True):
                 # Unused rows may hold values at which there are no derivatives.
                 other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
-                own.append(self.among(x, there, other))
+                own.append(self.among(x, in_use, other))
             return eval_jaxpr(self._jaxpr, [], *values[: self.fixed], *own)[0]
 
         return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
@@ -252,7 +252,7 @@ _pull = _primitive("pull", _pulled, _like_operands)
 
 def _value_jvp(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
     results, wanted = _value.bind(*primals, **params), _present(tangents[2:])
-    along = [t for t, there in zip(tangents[2:], wanted, strict=True) if there]
+    along = [t for t, wish in zip(tangents[2:], wanted, strict=True) if wish]
     if not along:
         return results, [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in results]
     return results, _push.bind(*primals, *along, wanted=wanted, **params)

@@ -158,13 +158,13 @@ def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray
     groups = [(own, band.corners, np.zeros(count, np.uint8), np.zeros(count, np.int8))]
     last = np.array(lattice.shape) - 2
     for side in np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) if closed else ():
-        there = np.flatnonzero(((side == 0) | (band.cells == np.where(side < 0, 0, last))).all(axis=1))
-        if not side.any() or not len(there):
+        at_side = np.flatnonzero(((side == 0) | (band.cells == np.where(side < 0, 0, last))).all(axis=1))
+        if not side.any() or not len(at_side):
             continue
         # Along an axis of the border, both corners are the lattice's last ones.
         beside = np.where(side == 0, CORNERS, side > 0).astype(np.int64) @ np.array([1, 2, 4])
         outer = ((side != 0) & (CORNERS == (side > 0))).any(axis=1) @ (1 << np.arange(8))
         cap = (side != 0) @ (1, 2, 4)
-        of_all = np.full(len(there), outer, np.uint8), np.full(len(there), cap, np.int8)
-        groups.append((own[there], band.corners[there][:, beside], *of_all))
+        of_all = np.full(len(at_side), outer, np.uint8), np.full(len(at_side), cap, np.int8)
+        groups.append((own[at_side], band.corners[at_side][:, beside], *of_all))
     return tuple(np.concatenate(x) for x in zip(*groups, strict=True))

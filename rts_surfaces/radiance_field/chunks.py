@@ -1,4 +1,4 @@
-"""Functions of many rows, called on some at a time so that memory stays bounded; and how far they have come."""
+"""Functions of many rows, called on some at a time so that memory stays bounded; and their progress bar."""
 
 from __future__ import annotations
 
