@@ -33,7 +33,7 @@ def bounds(nets, out):
 
 @compiled
 def _crossed(across, flips, patch, u, v, inside):
-    """The patch across the side that u and v are farthest beyond, or -1; and u and v in it, moved `inside`."""
+    """The patch across the side that u and v are farthest beyond, or -1; and u and v in it, `inside` of its edge."""
     side, most = 0, -v
     if u - 1 > most:
         side, most = 1, u - 1

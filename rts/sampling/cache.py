@@ -28,7 +28,7 @@ class Entry(NamedTuple):
     Attributes:
         proxy: the triangles.
         prepared: the sampler's structure.
-        size: the largest number among the inputs, or a larger one; None if it was not computed.
+        size: the largest number that the triangles were made of, or a larger one; None if it was not computed.
         inputs: inputs of the proxy, where samples are refined later.
     """
 

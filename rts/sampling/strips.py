@@ -81,7 +81,7 @@ class FineGrid(NamedTuple):
 
 
 class Room(NamedTuple):
-    """The room of a layout.
+    """The size of a layout: columns of strips, and fine cells.
 
     Attributes:
         columns: columns of strips, a pixel wide, those of aprons included.

@@ -34,7 +34,7 @@ NEAR_SINGULAR = 1e-3
 """An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
 
 BESIDE = 1e-3
-"""Distance before the bounds at which rays begin if the surface is capped, so that they meet the caps; a share."""
+"""Distance before the bounds at which rays begin, if the surface is capped, to meet the caps; a share of the bounds."""
 
 STEPS_PER_CELL = 2
 """Steps of rays across the narrowest side of a cell, where there is no Lipschitz bound."""

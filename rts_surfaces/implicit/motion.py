@@ -88,7 +88,7 @@ ALONG_NORMAL = Operation(
     packed_result=True,
 )
 """(N, 3): where samples are, less their vector times the change of the level `sign * (value - isovalue)`, by weights
-of six values. A sample's params (16) are barycentrics, these weights, place, vector, and their sum."""
+of six values. A sample's params (16) are barycentrics, these weights, place, vector, and the sum at sampling."""
 
 
 # ------------------------------------------------------------------------------------------------ along edges

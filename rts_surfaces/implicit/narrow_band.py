@@ -61,7 +61,7 @@ class NarrowBand:
         lipschitz: how fast the level changes at most, per unit of length; None where this is not known.
         coarse: cells along each side of the blocks to begin with, a power of two; None for 16 with a Lipschitz bound
             and 8 without one.
-        margin: coarse cells halved around each one whose corners differ in sign, in cells. With a Lipschitz
+        margin: width, in coarse cells, of the border around these cells that is halved with them. With a Lipschitz
             bound it does not count.
         chunk: the largest number of points at which the level is evaluated together.
 
