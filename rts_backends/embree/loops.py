@@ -72,7 +72,7 @@ def _pointer(typing_context, address):
 
 @compiled
 def _decide(t, state, work, vertices, faces):
-    """Whether a triangle is hit, and at which depth; see `cast` for `work`."""
+    """True if a triangle is hit, and the depth of the hit; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -194,7 +194,7 @@ def cast(
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
         planes: (4,) depths outside of which near or far plane clips, and between which neither does.
         keep: sign of the determinants to keep, or 0.
-        left_out: 1 to leave out what is seen from behind, −1 what is seen from the front, or 0.
+        left_out: 1 to leave out triangles seen from behind, −1 from the front, 0 for none.
         vertices: (V, 3) of the proxy.
         faces: (T, 3).
         owners: (M,) of `Covers`.
@@ -288,7 +288,7 @@ def cast(
 
 @compiled
 def _pixels(tile, across, width, height, cells, at, columns, lines):
-    """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; how many there are."""
+    """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; and their number."""
     count = 0
     if len(cells) > 0:
         for m in range(tile * TILE * TILE, min(len(cells), (tile + 1) * TILE * TILE)):
