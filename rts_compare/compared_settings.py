@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import Adaptive, Engine, plugin, plugins
+from rts.diagnostics.command_tools import engine_named
 from rts.errors import InputError, PluginError
-from rts.plugin_api.arrays import engine_named
 from rts.plugin_api.checks import quoted
 from rts_compare.pareto_front import LEVELS
 

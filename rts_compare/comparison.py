@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Adaptive, Engine
+from rts.diagnostics.command_tools import output_folder, writing
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
-from rts.plugin_api.files import output_folder, writing
 from rts_compare.compared_settings import Setting, as_text, finest, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment

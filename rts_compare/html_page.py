@@ -11,8 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from rts.diagnostics.command_tools import writing
 from rts.errors import InputError, PluginError
-from rts.plugin_api.files import writing
 from rts_compare.chart_style import (
     OTHER_COLORS,
     PEER_COLORS,

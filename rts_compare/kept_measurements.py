@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rts.diagnostics.command_tools import writing
 from rts.errors import InputError
-from rts.plugin_api.files import writing
 
 
 class KeptMeasurements:

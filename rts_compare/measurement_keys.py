@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from rts import Camera, Part, engine_of, plugin, render, sample
+from rts.diagnostics.command_tools import check_scene
 from rts.plugin_api.arrays import leaves
-from rts.plugin_api.checks import check_scene, fingerprint
+from rts.plugin_api.checks import fingerprint
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 """The library's own."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rts.diagnostics.command_tools import writing
 from rts.errors import PluginError
-from rts.plugin_api.files import writing
 from rts_compare.chart_style import (
     PEER_SYMBOL,
     Looks,

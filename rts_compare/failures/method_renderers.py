@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from rts import Engine, engine_of, render
+from rts.diagnostics.command_tools import engine_named
 from rts.errors import RtsWarning
-from rts.plugin_api.arrays import Array, Tree, engine_named, leaves, map_leaves
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.derivative_scores import loss_weights
 from rts_compare.failures.table_columns import Method
 from rts_compare.left_out import one_line

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, plugin
+from rts.diagnostics.command_tools import check_scene
 from rts.errors import InputError
 from rts.plugin_api.arrays import map_leaves
-from rts.plugin_api.checks import check_scene
 from rts_compare.moving_scenes import Scene
 
 EDGE = 4.0
