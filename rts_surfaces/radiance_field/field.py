@@ -110,9 +110,13 @@ def load_radiance_field(path: Any) -> RadianceField:
             layer is missing, unknown, or its shape does not fit.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise InputError(f"the path is {quoted(path)}; expected a string or a Path")
+        raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path")
     path = Path(os.fsdecode(path))
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except OSError as error:
+        raise InputError(f"the path {quoted(str(path))} is no good ({error.strerror}); choose another name") from None
+    if not there:
         raise InputError(f"there is no file {path} of weights; check the path (relative paths start at {Path.cwd()})")
     networks: dict[str, Any] = {}
     for key, array in _arrays(path).items():

@@ -135,9 +135,8 @@ def _color(background: Any) -> np.ndarray:
     """(3,) float32 of "white", "black" or three numbers in [0, 1]."""
     if isinstance(background, str) and background not in BACKGROUNDS:
         raise InputError(f"background is {quoted(background)}; expected 'white', 'black' or a colour (3,)")
-    color = check_numbers(
-        "background", BACKGROUNDS.get(background) if isinstance(background, str) else background, (3,)
-    )
+    value = BACKGROUNDS[background] if isinstance(background, str) else background
+    color = check_numbers("background", value, (3,))
     if color is None or color.min() < 0 or color.max() > 1:
         raise InputError(f"background is {quoted(background)}; expected a colour (3,) of numbers from 0 to 1")
     return color.astype(np.float32)
