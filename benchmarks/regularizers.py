@@ -26,8 +26,8 @@ from benchmarks.report import environment, table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
 from rts.arrays.engines import engine_named
+from rts.compiling.threads import thread_count
 from rts.regularizers import ARAP, EdgeLength, Laplacian, NormalConsistency, Regularizer
-from rts.threads import thread_count
 
 ENERGIES: dict[str, Callable[[np.ndarray, np.ndarray], Regularizer]] = {
     "ARAP": ARAP,

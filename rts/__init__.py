@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rts import errors, registry, regularizers
 from rts.arrays.engines import Engine, engine_of, namespace
+from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
@@ -48,7 +49,6 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
-from rts.warming import warmup
 
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "

@@ -1,4 +1,4 @@
-"""Capabilities of registered plugins: what `rts plugins` and `rts.plugins(…, details=True)` says of each."""
+"""Capabilities of registered plugins, for `rts plugins` and `rts.plugins(…, details=True)`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BASES = {
     "rts.splatters": "Splatter",
     "rts.engines": "Engine",
 }
-"""Group → the name of the base in `rts`."""
+"""Group → name of the base class in `rts`."""
 
 METHODS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "rts.surfaces": {
@@ -30,7 +30,7 @@ METHODS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "sums": ("SummingSplatter", "normal_equations"),
     },
 }
-"""Group → capability → the base and its method that a plugin with it overrides."""
+"""Group → capability → base class, and its method that a plugin with this capability overrides."""
 
 VARIABLES: Mapping[str, tuple[str, ...]] = {
     "rts.engines": ("differentiates",),
@@ -38,18 +38,18 @@ VARIABLES: Mapping[str, tuple[str, ...]] = {
     "rts.shaders": ("opaque", "uniform", "takes_views", "reads"),
     "rts.splatters": ("layers", "reach", "reads", "fills_interiors"),
 }
-"""Group → class variables of its base that are told."""
+"""Group → class variables of its base class that are reported."""
 
 
 def capabilities(group: str, plugin: Any) -> dict[str, Any]:
-    """Name → value: of class variables of the group's base, and whether certain methods are overridden.
+    """Capabilities by name: class variables of the group's base, and whether certain methods are overridden.
 
     Args:
         group: such as "rts.samplers".
-        plugin: what the entry point names.
+        plugin: the object that the entry point names.
 
     Raises:
-        PluginError: it is not of the group's base.
+        PluginError: the plugin does not subclass the group's base.
     """
     if group not in BASES:
         return {}
@@ -59,21 +59,21 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
         if group == "rts.shaders" and callable(plugin) and plugin is not kind:  # A function.
             return {name: getattr(plugin, name, None if name == "reads" else False) for name in VARIABLES[group]}
         raise PluginError(f"{plugin!r}, which is registered in {group}, does not subclass rts.{BASES[group]}")
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: base in bases and overrides(plugin, method, bases[base])
         for name, (base, method) in METHODS.get(group, {}).items()
     }
-    # What depends on settings is that of the default ones.
-    own = [getattr(kind, name) for name in VARIABLES.get(group, ())]
-    by_settings = any(isinstance(value, (property, functools.cached_property)) for value in own)
-    told = kind() if by_settings and plugin is kind else plugin
+    # Values that depend on settings are read off an instance with default settings.
+    declared = [getattr(kind, name) for name in VARIABLES.get(group, ())]
+    by_settings = any(isinstance(value, (property, functools.cached_property)) for value in declared)
+    instance = kind() if by_settings and plugin is kind else plugin
     for name in VARIABLES.get(group, ()):
-        found[name] = promised(told, name) if name in PROMISES else getattr(told, name)
-    return found
+        values[name] = promised(instance, name) if name in PROMISES else getattr(instance, name)
+    return values
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:
-    """Capabilities in a line: what is true by its name, what has a value with it."""
+    """Capabilities in a line: names of true ones, names and values of others."""
     words = []
     for name, value in capabilities.items():
         shown = name.replace("_", " ")

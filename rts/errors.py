@@ -1,7 +1,7 @@
 """Errors that the library raises on purpose, and its kinds of warnings; a public module, as `rts.errors`.
 
-Each message says what was given, what was expected, and what to do next. Warnings say what an image lacks that was
-rendered nevertheless, or what in the input looks like a mistake.
+Each message says what was given, what was expected, and what to do next. A warning names a defect of an image that was
+rendered nevertheless, or a likely mistake in the input.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class InputError(RtsError, ValueError):
 
 
 class EngineError(RtsError, TypeError):
-    """Arrays of two frameworks, or of none that is known, met in one call."""
+    """Arrays of two frameworks, or of an unknown one, met in one call."""
 
 
 class PluginError(RtsError, ImportError):
@@ -31,31 +31,31 @@ class RtsWarning(UserWarning):
 
 
 class LayersWarning(RtsWarning):
-    """`layers="auto"` came to its limit."""
+    """`layers="auto"` reached its limit."""
 
 
 class SamplerWarning(RtsWarning):
-    """Another sampler stands in for the one that was chosen."""
+    """Another sampler replaces the chosen one."""
 
 
 class AspectWarning(RtsWarning):
-    """An image of another ratio of width to height than its camera is for: it is stretched."""
+    """An image is stretched: its ratio of width to height is not its camera's."""
 
 
 class EmptyImageWarning(RtsWarning):
-    """An image in which nothing is seen."""
+    """Nothing is seen in an image."""
 
 
 class ToleranceWarning(RtsWarning):
-    """No setting is as accurate as was asked for."""
+    """No setting is as accurate as required."""
 
 
 class InputWarning(RtsWarning):
-    """Input that is allowed, and is likely to mean something else than was meant."""
+    """Input is allowed, but is probably a mistake."""
 
 
 class FileWarning(RtsWarning):
-    """A file was read, but not all that it says could be followed."""
+    """A file was read, but some of its content was ignored."""
 
 
 def warn(message: str, category: type[RtsWarning]) -> None:

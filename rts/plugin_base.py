@@ -1,4 +1,4 @@
-"""The base of all bases of plugins: what a class overrides, which promises hold for it, and misspelt members."""
+"""The common base class of plugins, with checks of overridden methods, promises and misspelt members."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rts.errors import PluginError
 
 
 class Plugin(abc.ABC):  # noqa: B024
-    """The base of all bases. A plugin subclasses the base of its kind."""
+    """The common base of the base classes; a plugin subclasses the one of its kind."""
 
 
 PROMISES: Mapping[str, tuple[str, ...]] = {
@@ -22,11 +22,11 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
     "reads": ("__call__", "base_color"),
     "fills_interiors": ("image", "accumulate"),
 }
-"""Promise → the methods that it speaks of, in classes that have them."""
+"""Promise → the methods that it is about, in classes that have them."""
 
 
 def overrides(plugin: Any, method: str, base: type) -> bool:
-    """Whether a plugin, or a class of plugins, has another method of this name than `base`, of which it is."""
+    """True if a plugin of this base class, or a class of such plugins, overrides a method of the base."""
     return _overrides(plugin if isinstance(plugin, type) else type(plugin), method, base)
 
 
@@ -36,10 +36,10 @@ def _overrides(kind: type, method: str, base: type) -> bool:
 
 
 def promised(plugin: Any, name: str) -> Any:
-    """A promise of a plugin, or of a class of plugins, as far as it holds.
+    """The value of a promise that holds for a plugin, or for a class of plugins.
 
-    It holds for the class that states it. Where a class below overrides a method that it speaks of, it is as the base
-    has it; a promise of a class that has no such method yet is for those that will.
+    A promise holds for the class that states it. If a subclass overrides a method that the promise is about, the value
+    is the default of the base. A class without such a method states the promise for its subclasses.
     """
     holds, default = _holds(plugin if isinstance(plugin, type) else type(plugin), name)
     return getattr(plugin, name) if holds or name in getattr(plugin, "__dict__", ()) else default
@@ -47,7 +47,7 @@ def promised(plugin: Any, name: str) -> Any:
 
 @functools.lru_cache(maxsize=4096)
 def _holds(kind: type, name: str) -> tuple[bool, Any]:
-    """Whether a promise of a class holds, and the value that its base has."""
+    """True if a promise of a class holds; also the value of its base."""
     stated = [c for c in kind.__mro__ if name in vars(c)]
     own, base = stated[0], stated[-1]
     there = {m for c in own.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}
@@ -56,12 +56,12 @@ def _holds(kind: type, name: str) -> tuple[bool, Any]:
 
 @functools.lru_cache(maxsize=1024)
 def check_members(kind: type[Plugin]) -> None:
-    """Refuse a class with a function whose name is one letter from an optional method that it lacks, or that is final.
+    """Refuse a class that overrides a final method, or has a function named almost like an optional method.
 
-    Optional methods are those of the bases of the library, which are its abstract classes.
+    Names count as almost alike if one letter differs. Optional methods belong to the library's abstract classes.
 
     Raises:
-        PluginError: there is one; it is looked for once.
+        PluginError: the class has such a function. The check runs once for each class.
     """
     bases = [c for c in kind.__mro__ if inspect.isabstract(c) and c.__module__.partition(".")[0] == "rts"]
     members = {n: f for c in reversed(bases) for n, f in vars(c).items() if isinstance(f, FunctionType) and n[0] != "_"}
@@ -84,11 +84,11 @@ def check_members(kind: type[Plugin]) -> None:
 
 def _line(function: Any) -> str:
     """The first line of a function's docstring."""
-    return inspect.getdoc(function).partition("\n")[0]  # pyright: ignore[reportOptionalMemberAccess]  # It has one.
+    return inspect.getdoc(function).partition("\n")[0]  # pyright: ignore[reportOptionalMemberAccess]  # Methods of bases have docstrings.
 
 
 def _one_edit(a: str, b: str) -> bool:
-    """Whether one character added, left out or exchanged makes one name of the other."""
+    """True if one name becomes the other by one character added, left out or exchanged."""
     if abs(len(a) - len(b)) > 1 or a == b:
         return False
     short, long = sorted((a, b), key=len)

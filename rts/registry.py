@@ -33,13 +33,13 @@ class PluginInfo(NamedTuple):
     Attributes:
         group: the entry-point group.
         name: the plugin's name.
-        distribution: name and version of the distribution that brings it.
-        error: why it does not load, or None.
-        missing: packages of the extra with the plugin's name that are not installed; a plugin may be ready without
-            them, for part of what it does.
-        install: what to install for what is missing, such as "rasterize-then-splat[torch]"; None where nothing is, or
-            no extra brings it.
-        capabilities: what it can do, by name; of its class, see `rts.capabilities`. Empty where it does not load.
+        distribution: name and version of the distribution that registers it.
+        error: the reason why it does not load, or None.
+        missing: packages of the extra with the plugin's name that are not installed. A plugin may be ready without
+            them, with fewer features.
+        install: the requirement that brings the missing packages, such as "rasterize-then-splat[torch]". None if no
+            package is missing, or no extra brings it.
+        capabilities: its capabilities by name, see `rts.capabilities`. Empty if it does not load.
     """
 
     group: str
@@ -52,21 +52,21 @@ class PluginInfo(NamedTuple):
 
     @property
     def ready(self) -> bool:
-        """Whether it loads."""
+        """True if the plugin loads."""
         return self.error is None
 
 
-_found: dict[str, dict[str, list[EntryPoint]]] = {}
+_entry_points: dict[str, dict[str, list[EntryPoint]]] = {}
 _defaults: dict[tuple[str, str | type], Any] = {}
 
 
 def _entries(group: str) -> dict[str, list[EntryPoint]]:
-    if group not in _found:
+    if group not in _entry_points:
         names: dict[str, list[EntryPoint]] = {}
         for entry in entry_points(group=group):
             names.setdefault(entry.name, []).append(entry)
-        _found[group] = names
-    return _found[group]
+        _entry_points[group] = names
+    return _entry_points[group]
 
 
 def _group(group: str) -> str:
@@ -100,8 +100,8 @@ def plugins(group: str, *, details: bool = False) -> list[str] | list[PluginInfo
 
     Args:
         group: the group.
-        details: whether to say more of each than its name: its distribution, whether it is ready or what is missing,
-            and what it can do. Every plugin is imported for that.
+        details: whether to return a `PluginInfo` for each, with distribution, state and capabilities. This imports
+            every plugin.
 
     Raises:
         InputError: no such group.
@@ -114,23 +114,23 @@ def plugins(group: str, *, details: bool = False) -> list[str] | list[PluginInfo
 
 def _entry(group: str, name: str) -> EntryPoint:
     if name not in _entries(group):
-        _found.clear()  # A distribution may have been installed since the last look.
-    found = _entries(group).get(name)
+        _entry_points.clear()  # A distribution may have been installed since the last look.
+    claims = _entries(group).get(name)
     kind = group.removeprefix("rts.").removesuffix("s")
-    if not found:
+    if not claims:
         names = plugins(group)
         hint = "; is its distribution installed, and was it again after its entry points changed (pip install .)?"
         raise InputError(f"no {kind} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
-    if len(found) > 1:
+    if len(claims) > 1:
         raise PluginError(
-            f"the {kind} {name!r} is claimed by {' and '.join(sorted(map(_distribution, found)))}; "
+            f"the {kind} {name!r} is claimed by {' and '.join(sorted(map(_distribution, claims)))}; "
             f"uninstall one of them"
         )
-    return found[0]
+    return claims[0]
 
 
 def check_name(group: str, name: str) -> None:
-    """Refuse a name that no plugin of a group has, or several have; nothing is imported.
+    """Refuse a name that no plugin of a group has, or several have, without importing any.
 
     Args:
         group: such as "rts.shaders".
@@ -141,7 +141,7 @@ def check_name(group: str, name: str) -> None:
 
 
 def plugin(group: str, name: str) -> Any:
-    """Load one plugin: what its entry point names, usually a class.
+    """Load one plugin: the object that its entry point names, usually a class.
 
     Args:
         group: such as "rts.samplers" (or "samplers").
@@ -195,8 +195,8 @@ def attribute(name: str, known: Iterable[str]) -> Any:
     """The built-in surface of a class's name, such as `rts.Mesh`, or the function of a name, such as `rts.tune`.
 
     Args:
-        name: of the attribute.
-        known: names that there are besides, for a hint.
+        name: the attribute of `rts`.
+        known: the other attributes of `rts`, for a hint in errors.
 
     Raises:
         AttributeError: there is no such thing, or it cannot be imported.
@@ -214,18 +214,18 @@ def attribute(name: str, known: Iterable[str]) -> Any:
 def instance(group: str, chosen: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
-    A name or a class gives one shared instance with default settings; anything else is returned.
+    A name or a class gives one shared instance with default settings; an object is returned as it is.
     """
     if not isinstance(chosen, (str, type)):
         return chosen
     if (group, chosen) not in _defaults:
-        found = plugin(group, chosen) if isinstance(chosen, str) else chosen()
-        _defaults[group, chosen] = instance(group, found)
+        loaded = plugin(group, chosen) if isinstance(chosen, str) else chosen()
+        _defaults[group, chosen] = instance(group, loaded)
     return _defaults[group, chosen]
 
 
 def survey() -> list[PluginInfo]:
-    """Every registered plugin, each tried, in order of group and name."""
+    """The details of every registered plugin, in order of group and name."""
     return [info for group in GROUPS for info in plugins(group, details=True)]
 
 
@@ -241,8 +241,8 @@ def _details(group: str, name: str) -> PluginInfo:
 
 
 def _missing(entry: EntryPoint) -> tuple[str, ...]:
-    """The packages that the extra of the plugin's name asks for, and that are not installed."""
-    found = []
+    """Packages that the extra of the plugin's name requires, and that are not installed."""
+    missing = []
     for requirement in (entry.dist.requires if entry.dist else None) or ():
         wanted, _, marker = requirement.partition(";")
         if re.search(rf"""extra\s*==\s*["']{re.escape(entry.name)}["']""", marker):
@@ -250,5 +250,5 @@ def _missing(entry: EntryPoint) -> tuple[str, ...]:
             try:
                 distribution(package)
             except PackageNotFoundError:
-                found.append(package)
-    return tuple(found)
+                missing.append(package)
+    return tuple(missing)

@@ -1,1 +1,1 @@
-"""Samplers, engines and compiled splatters that come with the library, a file or folder each; and what they share."""
+"""Samplers, engines and compiled splatters that come with the library, a file or folder each; and shared loops."""

@@ -60,7 +60,7 @@ def places(vertices, faces):
 
 @compiled
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
-    """Whether a triangle covers a pixel exactly, its least barycentric there, its depth, two barycentrics."""
+    """True if a triangle covers a pixel exactly; its least barycentric there, its depth, two barycentrics."""
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
     to_corner(matrix, vertices, ib, corners, 1)
@@ -81,7 +81,7 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
 def settle(
     first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
 ):  # fmt: skip
-    """Settle the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop what covers nothing.
+    """Correct the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop triangles that miss.
 
     `around` are the faces by place, `offsets` and `members` their `corner_lists`.
     """
@@ -109,7 +109,7 @@ def settle(
                             inside_s, least_s, z_s, a_s, b_s = look(
                                 s, x, y, matrix, row, keep, vertices, faces, corners
                             )
-                            # Those found already have hits of their own; so coplanar layers all stay.
+                            # Triangles that were found already have hits of their own; so coplanar layers all stay.
                             for n in range(count):
                                 if found[n] == s:
                                     inside_s, least_s = False, -np.inf

@@ -26,11 +26,11 @@ class NumpyEngine(Engine):
     differentiates = False
 
     def owns(self, x: Any) -> bool:
-        """Whether `x` is a NumPy array."""
+        """True for a NumPy array."""
         return isinstance(x, np.ndarray)
 
     def constant(self, value: Any, like: Array | None = None) -> np.ndarray:
-        """`value` as an array, floats in the dtype of `like`, else as they are."""
+        """`value` as an array; floats in the dtype of `like`, if given."""
         array = np.asarray(value)
         return array.astype(like.dtype, copy=False) if like is not None and array.dtype.kind == "f" else array
 

@@ -46,7 +46,7 @@ MANY = 1 << 16
 """Triangles from which on they are put in clusters; fewer gain nothing."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
-"""What stands for an order of triangles that is that of their indices."""
+"""Stands for the order of triangles by index."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -65,7 +65,7 @@ class Raster(TriangleSampler):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """See `TriangleSampler`: scratch memory is nobody else's."""
+        """See `TriangleSampler`: copies have scratch memory of their own."""
         return {name: value for name, value in super().__getstate__().items() if name != "_scratch"}
 
     def arrange(self, prepared: Any) -> Any:
@@ -109,7 +109,7 @@ class Raster(TriangleSampler):
 
     @property
     def _draws(self) -> bool:
-        """Whether it draws itself, not a subclass, which may look at what was prepared."""
+        """True unless a subclass draws, which may look at what was prepared."""
         kind = type(self)
         return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
 
@@ -144,11 +144,11 @@ class _List(NamedTuple):
     """Triangles that may cover a pixel's centre, as `draw` takes them.
 
     Attributes:
-        keep: sign of the determinants of those to draw, or 0.
+        keep: sign of the determinants of triangles to draw, or 0.
         turns: (bands,), bands of rows, those with most items first: so threads end together.
         offsets: (bands + 1,), where the items of each band begin.
-        items: uint32, places in `rows`, in the order in which triangles were looked at.
-        rows: (T, LISTED) int32, what is known of a triangle.
+        items: uint32, places in `rows`, in the order of the search.
+        rows: (T, LISTED) int32, the numbers listed for each triangle.
     """
 
     keep: float
@@ -166,7 +166,7 @@ class _Seen:
         camera: the camera.
         size: (height, width).
         keep: sign of the determinants of triangles to draw, or 0.
-        both: whether those that face the other way are asked for, too.
+        both: True if triangles that face the other way are asked for, too.
         asked: the blocks of cells that are asked for.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
@@ -202,7 +202,7 @@ class _Seen:
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
     def select(self) -> list[_List]:
-        """The triangles that may cover cells that are asked for; and those that face the other way, if `both` are."""
+        """Triangles that may cover cells that are asked for; with `both` also a list of triangles facing away."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
@@ -253,7 +253,7 @@ def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray,
     return _List(keep, np.argsort(-sums), offsets, items, rows)
 
 
-@loop(error_model="numpy")
+@loop
 def _project(first, last, used, vertices, m, screen):
     """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others.
 
@@ -280,7 +280,7 @@ def _project(first, last, used, vertices, m, screen):
             written[v] = (pixels[1, v] << SIXTEEN) | (pixels[0, v] & LOWER)
 
 
-@loop(error_model="numpy")
+@loop
 def _select(
     first,
     last,
@@ -298,13 +298,13 @@ def _select(
     fronts,
     backs,
 ):
-    """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
+    """List the triangles that may cover a pixel's centre in cells that `bits` of `Blocks` mark; and count them.
 
-    Looked at are some blocks of triangles, of which `sides` tell as bits which they may hold: FRONTS, BACKS.
+    The search goes through some blocks of triangles; `sides` are bits of the kinds that each may hold: FRONTS, BACKS.
 
-    A list is what is known of triangles (T, LISTED), where each chunk begins and ends in it (chunks, 2), and how many
-    of a chunk touch a band of rows (chunks, bands). Chunks of one call follow on each other. Of `backs`, if there is
-    room, are those that may face the other way.
+    A list is the rows of triangles (T, LISTED), the first and last row of each chunk (chunks, 2), and the number of a
+    chunk's triangles that touch a band (chunks, bands). Chunks of one call follow on each other. `backs`, if it has
+    room, lists triangles that may face the other way.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
@@ -327,9 +327,9 @@ def _select(
         fronts[1][chunk, 1], backs[1][chunk, 1] = places[0], places[1]
 
 
-@compiled(inline="always", error_model="numpy")
+@compiled(inline="always")
 def _look(count, xy, height, width, step, sign, box, clips, near):
-    """Fill in the box of pixels of each triangle, whether it is clipped, and whether it may cover a pixel's centre."""
+    """Fill in the box of pixels of each triangle, and marks: it is clipped; it may cover a pixel's centre."""
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
     middle, center = np.float32(width / 2), np.float32(height / 2)
     for b in range(count):
@@ -357,7 +357,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 @compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
-    """List the triangles of a block that are near, from a place on; what comes after is the next place."""
+    """List the triangles of a block that are near, from place `found` on. Returns the next place."""
     vertices, matrix, height, width, step, bits = given
     listed, _, counts = made
     count = 0

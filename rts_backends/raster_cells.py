@@ -1,4 +1,4 @@
-"""Where the rasterizer may pass over triangles, if only some cells of the grid are asked for."""
+"""Blocks of the cells that are asked for; the rasterizer passes over triangles that touch none of them."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class Blocks(NamedTuple):
 
 
 EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
-"""What stands for all cells: no blocks, and no bits."""
+"""Stands for all cells: no blocks, and no bits."""
 
 
 @loop
 def _fill(cells, width, table, numbers, bits):
-    """Number the blocks that hold any cells, and fill in what these are; how many there are.
+    """Number the blocks that hold any cells, and fill in their cells. Returns the number of blocks.
 
-    With it comes the place of a cell that is not in the grid or there twice, at which it stops, or −1.
+    The second result is −1, or the place of a cell outside of the grid or listed twice, where the loop stops.
     """
     count, m, side, size = 0, 0, np.uint32(SIDE), len(bits) * width
     while m < len(cells):
@@ -89,7 +89,7 @@ def _fill(cells, width, table, numbers, bits):
 
 @compiled
 def _following(cells, first):
-    """How many cells follow on each other from the first one on."""
+    """The number of cells from the first on whose indices follow one another."""
     same = True
     for n in range(len(cells)):
         same &= cells[n] == first + n
@@ -103,7 +103,7 @@ def _following(cells, first):
 
 @compiled
 def touching(places, box, begin, end, bits):
-    """Put those places first whose boxes hold cells that are asked for in some lines; how many there are.
+    """Put places first whose boxes hold cells that are asked for in some lines. Returns their number.
 
     `box` has the first and last column, and the first and last row, of each box (4, ·). All is in one loop, since
     compiled code counts references to arrays that it hands on.

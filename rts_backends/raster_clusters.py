@@ -1,4 +1,4 @@
-"""Triangles in clusters of what lies together: those out of view, or that all face away, are passed over at once.
+"""Clusters of triangles that lie together: a cluster out of view, or that faces away, is passed over as a whole.
 
 They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their
 middles, those that face other ways apart, and vertices in the order of their use. Of each cluster a box tells where it
@@ -20,13 +20,13 @@ SIZE = 256
 """Triangles of a cluster, and vertices of a block."""
 
 FRONTS, BACKS = 1, 2
-"""Bits that say whether a cluster may hold triangles that face as asked for, and others."""
+"""Bits of a cluster: it may hold triangles that face as asked for; it may hold others."""
 
 AROUND = 1e-9
-"""What counts as nothing beside the terms of a sum, in float64: a cluster so near to the border of the view is kept."""
+"""Rounding of a sum in float64, as a share of its terms: a cluster so near to the border of the view is kept."""
 
 NOISE = 1e-13
-"""How far off the determinant of three corners may be, of the product of the largest numbers in it."""
+"""Rounding error of the determinant of three corners, as a share of the product of the largest numbers in it."""
 
 STEPS = np.float64(2**10 - 1)
 """The largest place on an axis."""
@@ -79,18 +79,18 @@ class Clusters(NamedTuple):
     def seen(
         self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool, asked: Blocks = EVERYTHING
     ) -> tuple[np.ndarray, ...]:
-        """What may be in view.
+        """Clusters and blocks of vertices that may be in view.
 
         Args:
             matrix: (4, 4) to homogeneous pixels.
             size: (height, width).
             keep: sign of the determinants of triangles that are asked for; 0 for all.
-            both: whether the others are asked for, too.
+            both: True if the others are asked for, too.
             asked: the blocks of cells that are asked for.
 
         Returns:
-            Numbers of clusters (N,) int32, which triangles these may hold (N,) uint8 as bits, and numbers of blocks of
-            vertices, int32.
+            Numbers of clusters (N,) int32, the triangles that these may hold (N,) uint8 as bits `FRONTS` and `BACKS`,
+            and numbers of blocks of vertices, int32.
         """
         height, width = size
         # Positions a pixel outside of the image are not rounded into it.
@@ -111,7 +111,7 @@ class Clusters(NamedTuple):
 
 @loop
 def _extent(vertices):
-    """The least x, y and z (3,) of vertices, and how far these reach at most; without what is not finite."""
+    """The least x, y and z (3,) of vertices, and their largest extent; numbers that are not finite are left out."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for v in range(len(vertices)):
         for r in range(3):
@@ -123,7 +123,7 @@ def _extent(vertices):
 
 @loop
 def _keys(start, stop, vertices, faces, low, scale, keys):
-    """Fill in 33 bits of where triangles are to be, and below the indices: what sorts alike on every machine."""
+    """Fill in keys of triangles: 33 bits of their place, and below them the index. Keys sort alike on every machine."""
     for t in range(start, stop):
         key = np.uint64(0)
         for r in range(3):
@@ -144,7 +144,7 @@ def _keys(start, stop, vertices, faces, low, scale, keys):
 
 @loop
 def _renumber(vertices, faces, order, new_vertices, new_faces):
-    """Fill in the triangles in this order, and the vertices in the order of their use; how many there are."""
+    """Fill in the triangles in this order, and the vertices in the order of their use. Returns the vertices' number."""
     numbers, count = np.full(len(vertices), -1, np.int32), 0
     for t in range(len(order)):
         for c in range(3):
@@ -160,7 +160,7 @@ def _renumber(vertices, faces, order, new_vertices, new_faces):
 
 @loop
 def _find_blocks(faces, last, offsets, blocks):
-    """Fill in which blocks of vertices each cluster uses, and where these begin; how many there are."""
+    """Fill in the blocks of vertices that each cluster uses, and where these begin. Returns their number."""
     count = 0
     for t in range(len(faces)):
         cluster = t // SIZE
@@ -174,7 +174,7 @@ def _find_blocks(faces, last, offsets, blocks):
     return count
 
 
-@loop(error_model="numpy")
+@loop
 def _bound(start, stop, vertices, faces, boxes, cones):
     """Fill in boxes and cones of clusters."""
     normals = np.empty((SIZE, 3))
@@ -227,9 +227,9 @@ def _same(vertices, i, j):
     return vertices[i, 0] == vertices[j, 0] and vertices[i, 1] == vertices[j, 1] and vertices[i, 2] == vertices[j, 2]
 
 
-@loop(error_model="numpy")
+@loop
 def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
-    """Fill in which clusters may hold what is wanted, and what these may hold; how many there are.
+    """Fill in the clusters that may hold wanted triangles, and bits of these triangles. Returns the clusters' number.
 
     Args:
         boxes: see `Clusters`.
@@ -259,7 +259,7 @@ def _minor(rows, i, j, k):
     return a[i] * (b[j] * c[k] - b[k] * c[j]) + a[j] * (b[k] * c[i] - b[i] * c[k]) + a[k] * (b[i] * c[j] - b[j] * c[i])
 
 
-@compiled(inline="always", error_model="numpy")
+@compiled(inline="always")
 def _test(boxes, cones, planes, towards, rows, sides):
     """Fill in for each cluster as bits which triangles it may hold: FRONTS, BACKS; none if it is out of view."""
     qx, qy, qz, s = towards
@@ -286,9 +286,9 @@ def _test(boxes, cones, planes, towards, rows, sides):
         sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
 
 
-@loop(error_model="numpy")
+@loop
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
-    """Fill in for some clusters whether they may touch blocks that are asked for; `there` counts these from the first.
+    """Mark the clusters that may touch blocks that are asked for; `there` counts these blocks from the first.
 
     Where a box reaches behind the eye, its cluster may.
     """
@@ -321,7 +321,7 @@ def _touch(start, stop, kept, boxes, rows, height, width, there, near):
 
 @loop
 def _use(kept, offsets, blocks, used):
-    """Fill in which blocks of vertices some clusters use; how many there are."""
+    """Fill in the blocks of vertices that some clusters use. Returns their number."""
     every = len(kept) == len(offsets) - 1
     marks = np.full(len(used), every)
     if not every:

@@ -17,13 +17,13 @@ BAND_ROWS = raster_cells.SIDE
 BLOCK = 64
 
 LISTED = 8
-"""What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
+"""Numbers listed for a triangle: its index, its three corners, and its first and last column and row of pixels."""
 
 NUMBERS = 18
 """Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
 
 
-@loop(error_model="numpy")
+@loop
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
     """Fill the three fragment arrays (K, H · W), band by band.
 
@@ -45,9 +45,9 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
             _depths(depths[k, start:stop], nearest[k])
 
 
-@loop(error_model="numpy")
+@loop
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
-    """As `draw`, of some cells: arrays (K, M), which `clear` has emptied, are of their list; depths are left to it.
+    """`draw` for a list of M cells: fills arrays (K, M), which `clear` has emptied, but no depths.
 
     `asked` are the arrays of `Blocks`. Where it `narrows`, triangles may touch none of these cells.
     """
@@ -86,7 +86,7 @@ def _depths(depths, nearest):
         depths[i] = nearest[i] if nearest[i] < np.inf else 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _draw(items, given, top, end, width, asked, layered):
     """Insert the triangles of a band of rows from `top` to the one before `end`, `width` wide, into layers of cells.
 
@@ -133,7 +133,7 @@ def _draw(items, given, top, end, width, asked, layered):
 
 @compiled
 def _asked(hits, found, top, asked, cells):
-    """Leave out hits (n, 2) in cells that are not asked for, and number the others if some are; how many are left."""
+    """Drop hits (n, 2) in cells that are not asked for, and number the rest if only some are. Returns their number."""
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
     if len(bits) == 0:
@@ -152,7 +152,7 @@ def _asked(hits, found, top, asked, cells):
 
 @compiled(inline="always")
 def _gather(block, rows, vertices, entries, points):
-    """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
+    """Gather the triangles' list entries (LISTED, BLOCK) and corners (3, 3, BLOCK).
 
     The loops are so short that the processor overlaps their waits for memory.
     """
@@ -205,7 +205,7 @@ def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, c
 
 @compiled(inline="always")
 def _cover(count, entries, numbers, covers):
-    """Which of the first 2 × 2 pixels of its box each triangle may cover, as bits."""
+    """Bits of the first 2 × 2 pixels of each triangle's box that it may cover."""
     for b in range(count):
         bits = 0
         for n in range(4):
@@ -218,7 +218,7 @@ def _cover(count, entries, numbers, covers):
         covers[b] = bits
 
 
-@compiled(error_model="numpy")
+@compiled
 def _insert(hits, met, drawn, layered):
     """Insert the block's triangles into the layers of cells; hits (n, 2) are triangle and row of the band, column."""
     top, width, entries, numbers, clips = drawn
@@ -234,9 +234,9 @@ def _insert(hits, met, drawn, layered):
             _put(depths[h], entries[0, b], p, q, place, cell, nearest, triangle_ids, barycentrics)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and whether it is surely one."""
+    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and True for hits that are certain."""
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
@@ -252,7 +252,7 @@ def _meet(hits, top, numbers, clips, sure, depths, within):
 
 @compiled
 def _covers(b, x, y, numbers, clips):
-    """Whether triangle b of a block covers a point that may lie on its edges, or where it is clipped."""
+    """True if triangle b of a block covers a point that may lie on its edges, or where it is clipped."""
     xa, ya, xb, yb, xc, yc = numbers[0, b], numbers[1, b], numbers[3, b], numbers[4, b], numbers[6, b], numbers[7, b]
     ea, eb, ec = (
         xa * x + (ya * y + numbers[2, b]),
@@ -266,7 +266,7 @@ def _covers(b, x, y, numbers, clips):
 
 @compiled(inline="always")
 def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers of a cell, at its place of `nearest` and of the rest: behind what is as near."""
+    """Put a hit into the layers of a cell, at its place of `nearest` and of the rest: behind hits that are as near."""
     moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, place], triangle_ids[k, cell]
@@ -282,7 +282,7 @@ def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
 
 @compiled
 def _outside(numbers, b, ea, eb, ec):
-    """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
+    """True if the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
     near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]
     far = ea * numbers[15, b] + eb * numbers[16, b] + ec * numbers[17, b]
     return near < 0 or far < 0

@@ -50,12 +50,12 @@ class Rays(Sampler):
         rows = every if capacity is None else capacity
 
         def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
-            found = np.flatnonzero(hit)
+            hits = np.flatnonzero(hit)
             row = np.full(every, -1, np.int32)
-            row[found[:rows]] = np.arange(min(rows, len(found)), dtype=np.int32)
-            index = np.zeros(max(1, len(found)) if capacity is None else rows, np.int32)
-            index[: len(found)] = found[: len(index)]
-            return index, row.reshape(hit.shape), np.asarray(max(0, len(found) - rows), np.int32)
+            row[hits[:rows]] = np.arange(min(rows, len(hits)), dtype=np.int32)
+            index = np.zeros(max(1, len(hits)) if capacity is None else rows, np.int32)
+            index[: len(hits)] = hits[: len(index)]
+            return index, row.reshape(hit.shape), np.asarray(max(0, len(hits) - rows), np.int32)
 
         packed = ArraySpec((rows,), np.int32, packed=capacity is None)
         specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
@@ -72,15 +72,15 @@ class Rays(Sampler):
 
 
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
-    """What `intersect` of a surface gave, which must have the right shapes."""
+    """The result of a surface's `intersect`, refused if its shapes are wrong."""
     if not isinstance(hits, RayHits):
         raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected RayHits")
     grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths
-    given = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
+    shapes = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
     expected = grid, grid, (*grid, p), *([] if hits.ids is None and i == 0 else [(*grid, i)])
-    if given != expected:
+    if shapes != expected:
         raise InputError(
-            f"intersect of {surface!r} gave shapes {given}; expected {expected}: hit, distance, params, ids"
+            f"intersect of {surface!r} gave shapes {shapes}; expected {expected}: hit, distance, params, ids"
         )
     if not namespace(hits.hit).isdtype(hits.hit.dtype, "bool"):
         raise InputError(f"intersect of {surface!r} gave hit of dtype {hits.hit.dtype}; expected bool")

@@ -29,17 +29,17 @@ class Reference(TriangleSampler):
         first, last, kept = _pixel_boxes(corners, size)
         if cull != "none":
             kept &= _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
-        found = []
+        hits = []
         counts = np.where(kept, (last - first + 1).clip(0).prod(axis=1), 0)
         for chunk in _chunks(counts):
             triangle = np.repeat(chunk, counts[chunk])
             within = np.arange(len(triangle)) - np.repeat(np.cumsum(counts[chunk]) - counts[chunk], counts[chunk])
             columns = (last - first + 1)[triangle, 0]
             x, y = first[triangle, 0] + within % columns, first[triangle, 1] + within // columns
-            found.append(_hits(triangle, x, y, corners, depth, size))
-        if not found:
+            hits.append(_hits(triangle, x, y, corners, depth, size))
+        if not hits:
             return _empty(size, layers)
-        triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*found, strict=True))
+        triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*hits, strict=True))
         return _nearest(triangle, pixel, barycentrics, depth, size, layers)
 
 
@@ -53,7 +53,7 @@ def _chunks(counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First and last pixel (x, y) that each triangle may cover, and whether it may cover any."""
+    """First and last pixel (x, y) that each triangle may cover, and marks of triangles that may cover any."""
     height, width = size
     w = corners[..., 3]
     whole = np.all(w > 0, axis=1)
@@ -69,7 +69,7 @@ def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray
 
 
 def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """Whether each triangle's outward normal points to the viewer's side; corners in homogeneous camera space."""
+    """Marks of triangles whose outward normal points to the viewer's side; corners in homogeneous camera space."""
     a, b, c = corners[:, 0, :3], corners[:, 1, :3], corners[:, 2, :3]
     toward = a * camera.projection[3, 2] + [0, 0, camera.projection[3, 3]]
     outward = np.cross(b - a, c - a) * np.sign(np.linalg.det(camera.view[:3, :3]))

@@ -83,13 +83,13 @@ def edge(corners, i, j):
 
 @compiled
 def owns(x, y):
-    """Whether an edge with these coefficients, turned inward, owns the pixels exactly on it: top and left edges do."""
+    """True if an edge with these coefficients, turned inward, owns the pixels exactly on it: a top or left edge."""
     return x > 0 or (x == 0 and y > 0)
 
 
 @compiled
 def edge_values(corners, ia, ib, ic, x, y):
-    """Edge functions at a pixel position, positive inside, and whether the position belongs to the triangle."""
+    """Edge functions at a pixel position, positive inside, and True if the position belongs to the triangle."""
     xa, ya, wa = edge(corners, ib, ic)
     xb, yb, wb = edge(corners, ic, ia)
     xc, yc, wc = edge(corners, ia, ib)
@@ -106,7 +106,7 @@ def edge_values(corners, ia, ib, ic, x, y):
 
 @compiled
 def clipped(corners, ia, ib, ic, ea, eb, ec):
-    """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
+    """True if the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
     near = ea * (corners[ia, 2] + corners[ia, 3]) + eb * (corners[ib, 2] + corners[ib, 3])
     far = ea * (corners[ia, 3] - corners[ia, 2]) + eb * (corners[ib, 3] - corners[ib, 2])
     return near + ec * (corners[ic, 2] + corners[ic, 3]) < 0 or far + ec * (corners[ic, 3] - corners[ic, 2]) < 0

@@ -81,7 +81,7 @@ class Bezier(Patches):
         return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
 
     def bezier_rows(self, values: Array) -> Array:
-        """The control points themselves."""
+        """The control points, which are Bézier's already."""
         return values
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
@@ -126,12 +126,12 @@ def _text(path: Path) -> tuple[np.ndarray, np.ndarray]:
             raise InputError(f"{path} ends before {what}; the file may be cut short: export it again")
         (line, text), at = lines[at], at + 1
         try:
-            found = [kind(x) for x in text.replace(",", " ").split()]
+            values = [kind(x) for x in text.replace(",", " ").split()]
         except ValueError:
-            found = []
-        if len(found) != width:
+            values = []
+        if len(values) != width:
             raise InputError(f"{path}, line {line}: {text.strip()[:40]!r} is not {width} numbers, for {what}")
-        return found
+        return values
 
     indices = np.array(rows(int, 16, "patches"), np.int64).reshape(-1, 16) - 1
     return indices, np.array(rows(float, 3, "points"), np.float64).reshape(-1, 3)

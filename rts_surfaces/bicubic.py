@@ -49,7 +49,7 @@ def _bernstein(t: Array) -> tuple[Array, Array]:
 
 
 def _sum(rows: Array, ids: Array, a: Array, b: Array) -> Array:
-    """Sums of the rows (N, 16), with weights from those along u (N, 4) and along v (N, 4)."""
+    """Sums of the rows (N, 16), weighted by the products of weights along u (N, 4) and along v (N, 4)."""
     return combine(rows, ids, namespace(a).reshape(a[:, :, None] * b[:, None, :], (-1, 16)))
 
 
@@ -120,9 +120,9 @@ def _pull_values(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequenc
 
     if results[0] is not None:
         _, params, patch, table = operands
-        found = _shares(_nets(results[0], operands))
-        parallel(bicubic_loops.pull_values, len(found), patch, params, read_only(g), found, work=30 * len(g))
-        bicubic_loops.scatter(table, found, results[0])
+        shares = _shares(_nets(results[0], operands))
+        parallel(bicubic_loops.pull_values, len(shares), patch, params, read_only(g), shares, work=30 * len(g))
+        bicubic_loops.scatter(table, shares, results[0])
 
 
 def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, ...]:
@@ -133,8 +133,8 @@ def _normals(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
     from rts_surfaces import bicubic_loops
 
     rows, params, patch, _ = operands
-    given = _nets(rows, operands), patch, params, rows.dtype.type(COLLAPSED)
-    parallel(bicubic_loops.normals, len(out), *given, out, work=60 * len(out))
+    arguments = _nets(rows, operands), patch, params, rows.dtype.type(COLLAPSED)
+    parallel(bicubic_loops.normals, len(out), *arguments, out, work=60 * len(out))
 
 
 def _push_normals(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray | None], out: np.ndarray) -> None:
@@ -142,8 +142,8 @@ def _push_normals(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray 
 
     rows, params, patch, _ = operands
     moved = _nets(read_only(tangents[0]), operands)  # pyright: ignore[reportArgumentType]  # Only rows have tangents.
-    given = _nets(rows, operands), moved, patch, params, rows.dtype.type(COLLAPSED)
-    parallel(bicubic_loops.push_normals, len(out), *given, out, work=120 * len(out))
+    arguments = _nets(rows, operands), moved, patch, params, rows.dtype.type(COLLAPSED)
+    parallel(bicubic_loops.push_normals, len(out), *arguments, out, work=120 * len(out))
 
 
 def _pull_normals(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
@@ -152,10 +152,10 @@ def _pull_normals(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequen
     if results[0] is not None:
         rows, params, patch, table = operands
         nets = _nets(rows, operands)
-        found = _shares(nets)
-        given = nets, patch, params, rows.dtype.type(COLLAPSED), read_only(g), found
-        parallel(bicubic_loops.pull_normals, len(found), *given, work=80 * len(g))
-        bicubic_loops.scatter(table, found, results[0])
+        shares = _shares(nets)
+        arguments = nets, patch, params, rows.dtype.type(COLLAPSED), read_only(g), shares
+        parallel(bicubic_loops.pull_normals, len(shares), *arguments, work=80 * len(g))
+        bicubic_loops.scatter(table, shares, results[0])
 
 
 VALUES = Operation(

@@ -96,7 +96,7 @@ def gather(start, stop, rows, table, out):
 
 @loop
 def scatter(table, found, out):
-    """Add to `out` (V, C) what patches have in all shares of `found` (S, n, 16, C)."""
+    """Add to `out` (V, C) the gradients of patches in all shares of `found` (S, n, 16, C)."""
     for n in range(len(table)):
         for k in range(16):
             for c in range(out.shape[1]):
@@ -122,7 +122,7 @@ def values(start, stop, nets, patch, params, out):
 
 @loop
 def pull_values(start, stop, patch, params, g, found):
-    """Add to `found` (S, n, 16, C), for each of S shares of the samples, what g (N, C) pulls back to control points."""
+    """Add to `found` (S, n, 16, C), for each of S shares of the samples, the pullback of g (N, C) to control points."""
     for share in range(start, stop):
         _pull_values(*_share(share, len(found), len(patch)), patch, params, g, found[share])
 
@@ -237,7 +237,7 @@ def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
 
 @loop
 def pull_normals(start, stop, nets, patch, params, collapsed, g, found):
-    """Add to `found` (S, n, 16, 3), for each of S shares of the samples, what g (N, 3) pulls back to control points."""
+    """Add to `found` (S, n, 16, 3), for each of S shares of the samples, the pullback of g (N, 3) to control points."""
     for share in range(start, stop):
         _pull_normals(*_share(share, len(found), len(patch)), nets, patch, params, collapsed, g, found[share])
 

@@ -64,7 +64,7 @@ class BSpline(Patches):
         )
 
     def bezier_rows(self, values: Array) -> Array:
-        """Those of all patches, by knot insertion: sums of control points with weights of at least zero."""
+        """Bézier control points of all patches, by knot insertion: sums of control points, weights at least zero."""
         xp, engine = namespace(values), engine_of(values)
         a, b = (engine.constant(m, values) for m in self._along)
         (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
@@ -94,7 +94,7 @@ class Revolution(BSpline):
 
     Args:
         heights: (n,) numbers, the y of the profile's control points, at least 4.
-        count: how many control points there are around the axis, at least 4.
+        count: the number of control points around the axis, at least 4.
         ends: "clamped" or "open", of the profile.
         tolerance: pixels that triangles may be off the surface near outlines.
 
@@ -107,10 +107,10 @@ class Revolution(BSpline):
     def __init__(self, heights: Any, count: int = 8, ends: str = "clamped", tolerance: float = TOLERANCE):
         if not is_count(count) or count < 4:
             raise InputError(f"count is {quoted(count)}; expected an integer of at least 4")
-        given = shape_of(from_numbers(heights, "heights"))
-        if len(given) != 1 or given[0] < 4:
+        shape = shape_of(from_numbers(heights, "heights"))
+        if len(shape) != 1 or shape[0] < 4:
             raise InputError(f"heights is {quoted(heights)}; expected (n,), at least 4 numbers")
-        heights = np.asarray(check_numbers("heights", heights, given), np.float64)
+        heights = np.asarray(check_numbers("heights", heights, shape), np.float64)
         super().__init__((len(heights), count), (ends, "periodic"), tolerance)
         angle = 2 * np.pi * np.arange(count) / count
         # A closed spline runs inside its control points; a control point's own radius is met at its angle.

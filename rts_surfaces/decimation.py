@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 FEWEST = 20_000
-"""Meshes of fewer faces are left as they are: what they cost is not the faces."""
+"""Meshes of fewer faces are left as they are: their faces are not what takes time."""
 SHARES = (1 / 16, 1 / 4)
 
 

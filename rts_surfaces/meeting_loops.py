@@ -1,4 +1,4 @@
-"""Where rays meet bicubic patches, on the host, compiled: Newton's method, across the edges of patches.
+"""Hits of rays with bicubic patches, compiled: Newton's method, which may cross the edges of patches.
 
 Patches are in the form of powers, see `rts_surfaces.bicubic_loops`. It imports numba.
 """
@@ -33,7 +33,7 @@ def bounds(nets, out):
 
 @compiled
 def _crossed(across, flips, patch, u, v, inside):
-    """The patch beyond the side that u and v are farthest beyond, or -1, and u and v in it, so far inside of it."""
+    """The patch across the side that u and v are farthest beyond, or -1; and u and v in it, `inside` of its edge."""
     side, most = 0, -v
     if u - 1 > most:
         side, most = 1, u - 1
@@ -131,7 +131,7 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
                 if met or ended:
                     if crossed == crossings:
                         break
-                    # Beside a fold what lies beyond the edge attracts: each time it begins farther within a patch.
+                    # Beside a fold the far side of the edge attracts: each time the start moves farther into the patch.
                     patch, u, v = _crossed(across, flips, patch, out_u, out_v, min(beyond * 2.0**crossed, 0.5))
                     if patch < 0:
                         break

@@ -110,14 +110,14 @@ class Mesh(TriangleSurface):
         plain = len(self._tables) == 1 and "normals" not in theta and "uv" not in theta
         if not plain or exemplar(theta["vertices"]) is not None:
             return ()
-        found = []
+        rates = []
         for faces, vertices, nearest in fewer_faces(np.asarray(theta["vertices"]), self.faces):
             change = partial(self._thinned, vertices, nearest)
-            found.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces), change))
-        return found
+            rates.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces), change))
+        return rates
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-        """θ with other vertices, which have the attributes of those that they stand for."""
+        """θ with other vertices, which have the attributes of the vertices that they stand for."""
         kept = {name: theta[name] for name in self._attributes(theta)}
         attributes = {name: take(x, engine_of(x).constant(nearest, x)) for name, x in kept.items()}
         return {**theta, **attributes, "vertices": vertices}
@@ -131,7 +131,7 @@ class Mesh(TriangleSurface):
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """Those of its faces, found once."""
+        """The pieces of the mesh's faces, computed once."""
         if self._pieces is None:
             self._pieces = pieces(self.faces)
         return self._pieces
@@ -150,7 +150,7 @@ class Mesh(TriangleSurface):
         return interpolate(rows, samples.ids, column, samples.params)
 
     def vertex_normals(self, vertices: Array) -> Array:
-        """(V, 3) unit normals, the area-weighted mean of the faces around each vertex; zero where there is none."""
+        """Unit normals (V, 3), the area-weighted mean of the faces around each vertex; zero without faces."""
         if exemplar(vertices) is not None:
             return self._vertex_normals(vertices)
         key, kept = fingerprint(vertices), self._normals

@@ -1,4 +1,4 @@
-"""Entries of θ as surfaces know them: names, widths, and what is refused."""
+"""Names, widths and checks of entries of θ."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from rts import InputError, namespace
 from rts.plugin_api.arrays import Tree, shape_of
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
-"""What the G-buffer calls an entry, if not by its own name."""
+"""Names in the G-buffer of entries of θ that have another name there."""
 WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
-"""How many numbers there are for each vertex or control point."""
+"""Numbers for each vertex or control point."""
 
 RESERVED = ("vertices", "points", "position", "normal")
 """Names that no further attribute may have."""
 
 
 def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
-    """Refuse names of attributes that mean something else, or are among those that are taken."""
+    """Refuse names of attributes that mean something else, or are taken."""
     for name in names:
         if name in RESERVED or name in taken:
             raise InputError(f"indices declares {name!r}, which is no further attribute; expected another name")
@@ -53,8 +53,8 @@ def check_rows(who: str, theta: Mapping[str, Tree], name: str, rows: int) -> Non
         return None if fits else f"(rows, {' or '.join(map(str, widths or 'C'))})"
 
     check_entry(who, theta, name, expected)
-    if (given := shape_of(theta[name])[0]) < rows:
+    if (count := shape_of(theta[name])[0]) < rows:
         raise InputError(
-            f"theta[{name!r}] of {who} has {given} rows, but its faces refer to row {rows - 1}; check the indices "
+            f"theta[{name!r}] of {who} has {count} rows, but its faces refer to row {rows - 1}; check the indices "
             f"(they count from 0)"
         )

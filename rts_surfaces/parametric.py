@@ -23,7 +23,7 @@ TOLERANCE = 0.1
 """Pixels that a triangle may be off the surface where there may be an outline."""
 
 TOLERANCES = (0.8, 0.3, 0.1, 0.05)
-"""Those of `rates`."""
+"""Tolerances that `rates` offers."""
 
 RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS = 1e-4, 6, 0.25, 0.02, 8
 """Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, how far a sample may lie
@@ -85,14 +85,14 @@ class Parametric(TriangleSurface):
                     array.flags.writeable = False
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Other tolerances."""
-        found = []
+        """The surface at other tolerances."""
+        rates = []
         for tolerance in TOLERANCES:
             if tolerance != self.tolerance:
                 other = copy.copy(self)
                 other.tolerance = tolerance
-                found.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
-        return found
+                rates.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
+        return rates
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
         """Rates of the edges of `whole` and within it, for so many cuts along each side of a patch."""
@@ -111,17 +111,17 @@ class Parametric(TriangleSurface):
         return self.control_points(theta)
 
     def proxy_key(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """The cell of views: so images do not depend on what was rendered before."""
+        """The cell of views, so that images do not depend on earlier renders."""
         return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
         """Triangles that are off the surface by less than `tolerance` pixels near outlines, and coarse elsewhere."""
         points = self.finite(inputs)
         geometry, center = self.geometry(points), self._center(points)
-        found = self.shapes(geometry)
+        tile_shapes = self.shapes(geometry)
         view = view_of(view_key(camera, size, center), center)
-        allowed = allowed_in(view, found, self.tolerance, self.coarse * self.tolerance)
-        return triangles(self.tiles, geometry.points, *by_error(self.tiles, found, allowed))
+        allowed = allowed_in(view, tile_shapes, self.tolerance, self.coarse * self.tolerance)
+        return triangles(self.tiles, geometry.points, *by_error(self.tiles, tile_shapes, allowed))
 
     def shapes(self, geometry: Geometry) -> Shapes:
         """The shapes of the tiles."""
@@ -148,14 +148,14 @@ class Parametric(TriangleSurface):
             tiles, cuts = self.whole, self.uniform(min(int(rate), MOST))
         else:
             check_positive("rate", rate)
-            tiles, found = self.tiles, self.shapes(geometry)
-            cuts = by_error(tiles, found, Allowed.everywhere(len(found.bends), float(rate)))
+            tiles, tile_shapes = self.tiles, self.shapes(geometry)
+            cuts = by_error(tiles, tile_shapes, Allowed.everywhere(len(tile_shapes.bends), float(rate)))
         proxy = triangles(tiles, geometry.points, *cuts)
         a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
-        """(u, v) and depth where rays meet the patches, by Newton's method; what does not meet is dropped."""
+        """Samples where rays meet the patches, by Newton's method; samples whose rays miss are dropped."""
         return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:

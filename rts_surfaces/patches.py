@@ -54,8 +54,8 @@ class Bicubic(Geometry):
         ids, params, row, depth = (np.array(x) for x in (samples.ids, samples.params, samples.row, samples.depth))
         lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
-        given = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
-        parallel(meeting_loops.meet, len(lines[0]), *given, work=200 * len(samples.ids))
+        arguments = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
+        parallel(meeting_loops.meet, len(lines[0]), *arguments, work=200 * len(samples.ids))
         return samples.replace(ids=ids, params=params, row=row, depth=depth)
 
 
@@ -88,14 +88,14 @@ class Patches(Parametric):
 
     @abc.abstractmethod
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """What is wrong with the shape of an entry of θ but for its last axis, in words; None for nothing."""
+        """The shape expected of an entry of θ without its last axis, in words; None if it is right."""
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
         """The control points, as `bezier_rows` takes them."""
         return theta["points"]
 
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
-        """What shape an entry of θ is to have, in words; None if it has it."""
+        """The shape expected of an entry of θ, in words; None if it is right."""
         wrong = self.control_shape(shape[:-1]) if shape else "an array"
         if wrong is None and shape[-1] not in WIDTHS[name]:
             return f"a last axis of {' or '.join(map(str, WIDTHS[name]))}"
@@ -142,8 +142,8 @@ class Patches(Parametric):
 def across(sides: np.ndarray) -> np.ndarray:
     """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
 
-    Where more than two patches share an edge it is the one half way round. So a side that is a single point leads to
-    the patch on the other side of the point.
+    Where more than two patches share an edge, the one half way round follows. So a side that is a single point leads
+    to the patch on the other side of the point.
 
     Args:
         sides: (n, 4), the edges of `Tiles`.
@@ -153,9 +153,9 @@ def across(sides: np.ndarray) -> np.ndarray:
     count = np.bincount(flat)[flat[order]]
     first = np.searchsorted(flat[order], flat[order])
     other = order[first + (np.arange(len(flat)) - first + count // 2) % count]
-    found = np.empty(len(flat), np.int32)
-    found[order] = np.where(count > 1, other, -1)
-    return found.reshape(sides.shape)
+    beyond = np.empty(len(flat), np.int32)
+    beyond[order] = np.where(count > 1, other, -1)
+    return beyond.reshape(sides.shape)
 
 
 def _tiles(table: np.ndarray) -> Tiles:

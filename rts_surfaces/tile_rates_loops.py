@@ -1,4 +1,4 @@
-"""How finely tiles are to be cut: their shapes, where outlines may be, and rates. Compiled.
+"""Rates at which tiles are cut, from their shapes and from where outlines may be. Compiled.
 
 Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
 """
@@ -25,7 +25,7 @@ def _dot(a, b):
 
 @compiled
 def _slopes(found, frame, slopes):
-    """Derivatives along s and t (2, 3), of those in parameters of the patch."""
+    """Derivatives along s and t (2, 3), from derivatives in parameters of the patch."""
     for k in range(2):
         for c in range(3):
             slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
@@ -39,7 +39,7 @@ def _second(found, a, b, c):
 
 @compiled
 def _normal(slopes, out):
-    """Fill the unit normal, and return whether there is one; else it is zero."""
+    """Fill the unit normal and return True; fill zeros and return False if there is none."""
     for c in range(3):
         x, y = (c + 1) % 3, (c + 2) % 3
         out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
@@ -52,7 +52,7 @@ def _normal(slopes, out):
 
 @loop
 def shapes(start, stop, found, frames, normals, places, bends):
-    """Fill what is asked of the shape of tiles.
+    """Fill normals, places and bends of tiles.
 
     Args:
         start: first tile.
@@ -117,7 +117,7 @@ def curves(start, stop, found, frames, along, out):
 def outlines(
     start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
 ):
-    """Fill how far triangles of tiles may be off the surface, in units of space; infinity where out of view.
+    """Fill the allowed distances of tiles' triangles from the surface, in units of space; infinity out of view.
 
     Args:
         start: first tile.
@@ -127,7 +127,7 @@ def outlines(
         bends: (n, 3), the largest second derivatives along the normal.
         eye: (3,), or the direction towards the viewer if `parallel`.
         toward: (3,) unit, from the middle of the surface to the eye.
-        parallel: whether rays are.
+        parallel: True if rays are parallel.
         aside: how far the eye may be off sideways; where parallel, how far the direction.
         depth: how far it may be off along `toward`.
         spread: (2,), width of a pixel at depth z.
@@ -171,7 +171,7 @@ def outlines(
                 if not parallel:
                     far = math.sqrt(_dot(view, view))
                     nearest = min(nearest, far - move)
-                    # What moves along the line of sight does not turn it.
+                    # Movement along the line of sight does not turn it.
                     ahead = _dot(view, toward)
                     slack += depth * math.sqrt(max(far * far - ahead * ahead, 0.0)) / far if far > 0 else depth
                 faces[i, j] = _dot(normals[t, i, j], view) / far if far > 0 else 0.0
@@ -189,7 +189,7 @@ def outlines(
 
 @loop
 def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
-    """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
+    """Fill the numbers of cuts of tiles and their sides: inner (n, 2) along s and t, edges (E,).
 
     Args:
         bends: (n, 3).

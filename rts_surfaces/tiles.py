@@ -1,4 +1,4 @@
-"""Patches in tiles, and triangles of these that meet without cracks whatever the rates at which tiles are cut.
+"""Tiles of patches, and their triangles, which meet without cracks at any rates of cutting.
 
 A tile is a quadrilateral or a triangle, with local coordinates (s, t): the unit square, or the triangle (0, 0), (1, 0),
 (0, 1). Tiles that share an edge share its points.
@@ -22,14 +22,14 @@ MOST = 256
 MOST_TRIANGLES = 2**27
 """The largest number of triangles: 8 GiB."""
 LEAST = {4: 2, 3: 3}
-"""How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
+"""Least number of cuts of a tile of so many sides, if it is cut at all, so that points lie within it."""
 AT_ONCE = 2048
-"""Tiles whose shapes are looked at together."""
+"""Tiles whose shapes are computed together."""
 GRID = {4: 3, 3: 5}
-"""Points along each side of a tile of so many sides at which its shape is looked at."""
+"""Points along each side of a tile of so many sides at which its shape is measured."""
 ENOUGH, FINEST = 500, 4
-"""Where patches are fewer than this, they are looked at in smaller tiles, at most so many along a side: so that they
-need not be as fine all over as they are at outlines."""
+"""Patches that are fewer than this are split into smaller tiles, at most so many along a side. So only tiles at
+outlines need to be fine."""
 
 Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 """(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), these and
@@ -76,7 +76,7 @@ class Tiles(NamedTuple):
 
 
 class Shapes(NamedTuple):
-    """What triangles by error need to know of tiles, float64.
+    """Shapes of tiles, float64, from which their errors as triangles follow.
 
     Attributes:
         normals: (n, G, G, 3) of unit length, or zero, at a grid of points.
@@ -162,17 +162,17 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
     normals, places = np.empty((2, count, grid, grid, 3))
     out = Shapes(normals, places, np.empty((count, 3)), np.empty(edges))
     for some in _slices(count):
-        found = _expanded(tiles, points, np.arange(count)[some], local[None])
+        derivatives = _expanded(tiles, points, np.arange(count)[some], local[None])
         part = out.normals[some], out.places[some], out.bends[some]
-        work = 100 * len(local) * len(found)
-        parallel(tile_rates_loops.shapes, len(found), found, tiles.frames[some], *part, work=work)
+        work = 100 * len(local) * len(derivatives)
+        parallel(tile_rates_loops.shapes, len(derivatives), derivatives, tiles.frames[some], *part, work=work)
     corners = _CORNERS[width]
     along = np.roll(corners, -1, axis=0) - corners
     for some in _slices(edges):
         tile, side = tiles.edge_tiles[some].T
-        found = _expanded(tiles, points, tile, corners[side][:, None] + steps[:, None] * along[side][:, None])
-        given = found, tiles.frames[tile], along[side], out.curves[some]
-        parallel(tile_rates_loops.curves, len(found), *given, work=100 * grid * len(found))
+        derivatives = _expanded(tiles, points, tile, corners[side][:, None] + steps[:, None] * along[side][:, None])
+        arguments = derivatives, tiles.frames[tile], along[side], out.curves[some]
+        parallel(tile_rates_loops.curves, len(derivatives), *arguments, work=100 * grid * len(derivatives))
     return out
 
 
@@ -184,16 +184,16 @@ def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray)
     """Points and derivatives (n, P, 6, 3) of tiles (n,) at local coordinates (n or 1, P, 2)."""
     frames, width = tiles.frames[tile][:, None], local.shape[1]
     params = frames[:, :, 0] + local[..., :1] * frames[:, :, 1] + local[..., 1:] * frames[:, :, 2]
-    found = points(np.repeat(tiles.patch[tile], width), params.reshape(-1, 2), 2)
-    return found.reshape(len(tile), width, 6, 3)
+    derivatives = points(np.repeat(tiles.patch[tile], width), params.reshape(-1, 2), 2)
+    return derivatives.reshape(len(tile), width, 6, 3)
 
 
 class Allowed(NamedTuple):
-    """How far triangles may be off the surface, in units of space; infinity where out of view.
+    """Allowed distance of triangles from the surface, in units of space; infinity out of view.
 
     Attributes:
         chord: (n,), of each tile.
-        edge: (n,), those at its edges, should they be outlines.
+        edge: (n,), at the edges of each tile, should these be outlines.
         facing: (n,) int8: 1 where all of a tile faces the viewer, −1 where none does, else 0.
     """
 
@@ -203,37 +203,37 @@ class Allowed(NamedTuple):
 
     @classmethod
     def everywhere(cls, count: int, chord: float) -> Allowed:
-        """So many tiles alike."""
+        """The same distance for `count` tiles."""
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 
-def allowed_in(view: View, found: Shapes, fine: float, coarse: float) -> Allowed:
-    """How far triangles may be off in a view.
+def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> Allowed:
+    """The allowed distances of triangles from the surface in a view.
 
     Args:
-        view: what the camera sees.
-        found: the shapes of the tiles.
+        view: the camera's view.
+        tile_shapes: the shapes of the tiles.
         fine: pixels, where a tile or an edge may have an outline.
         coarse: pixels elsewhere.
     """
     from rts_surfaces import tile_rates_loops
 
-    count, angle = len(found.bends), min(view.angle, math.pi / 2)
+    count, angle = len(tile_shapes.bends), min(view.angle, math.pi / 2)
     allowed = Allowed(np.empty(count), np.empty(count), np.empty(count, np.int8))
     cone = np.array([*view.axis, math.sin(angle), math.cos(angle)])
     seen = view.eye, view.toward, view.parallel, view.aside, view.along, view.spread, cone, np.array([fine, coarse])
-    given = found.places, found.normals, found.bends, *seen
-    parallel(tile_rates_loops.outlines, count, *given, *allowed, work=500 * count)
+    arguments = tile_shapes.places, tile_shapes.normals, tile_shapes.bends, *seen
+    parallel(tile_rates_loops.outlines, count, *arguments, *allowed, work=500 * count)
     return allowed
 
 
-def by_error(tiles: Tiles, found: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
+def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
     """Rates of edges (E,) and of tiles (n, 2), int32, so that triangles are off by no more than is allowed."""
     from rts_surfaces import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
     tile_rates_loops.rates(
-        found.bends, found.curves, *allowed, tiles.sides, LEAST[tiles.sides.shape[1]], MOST, inner, edges
+        tile_shapes.bends, tile_shapes.curves, *allowed, tiles.sides, LEAST[tiles.sides.shape[1]], MOST, inner, edges
     )
     return edges, inner
 
@@ -278,8 +278,8 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
     tiles_loops.counts(inner, tiles.sides, edges, first)
     out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
     loop = tiles_loops.quadrilaterals if width == 4 else tiles_loops.triangles
-    given = *tiles[:5], edges, edge_first, inner, inner_first, first
-    parallel(loop, count, *given, out, work=30 * total)
+    arguments = *tiles[:5], edges, edge_first, inner, inner_first, first
+    parallel(loop, count, *arguments, out, work=30 * total)
     return Proxy(vertices, *out)
 
 

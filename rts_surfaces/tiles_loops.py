@@ -63,7 +63,7 @@ def within_triangles(owner, frames, inner, inner_first, patch, params):
 
 @compiled
 def _count(rates, sides, edges):
-    """How many triangles a tile has."""
+    """The number of triangles of a tile."""
     width, rs, rt = len(sides), rates[0], rates[1]
     if rs == 1:
         return width - 2
@@ -75,7 +75,7 @@ def _count(rates, sides, edges):
 
 @loop
 def counted(inner, sides, edges):
-    """How many triangles there are."""
+    """The number of triangles of all tiles."""
     total = 0
     for n in range(len(inner)):
         total += _count(inner[n], sides[n], edges)
@@ -203,7 +203,7 @@ def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
 
 @loop
 def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
-    """Fill the triangles of triangular tiles; the arguments are as those of `quadrilaterals`, of three sides."""
+    """Fill the triangles of triangular tiles; arguments as for `quadrilaterals`, with three sides."""
     faces, ids, params = out
     for n in range(start, stop):
         r, t, base, frame = inner[n, 0], first[n], inner_first[n], frames[n]

@@ -1,4 +1,4 @@
-"""Views in cells: triangles are made for a cell of views, so that images do not depend on earlier ones."""
+"""Cells of views: triangles are made for a whole cell, so that images do not depend on earlier ones."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ EVEN = 0.5
 
 
 class View(NamedTuple):
-    """What triangles depend on: a cell of views, by its middle and how far a view may be off it.
+    """The cell of views that triangles are made for: its middle, and the largest deviations of a view from it.
 
     Attributes:
         eye: (3,), or where rays are parallel the direction towards the viewer.
-        parallel: whether they are.
-        aside: how far the eye may be off sideways, local units; where parallel, how far the direction.
-        along: how far it may be off towards the surface and away from it.
+        parallel: True if rays are parallel.
+        aside: largest deviation of the eye sideways, local units; if parallel, of the direction.
+        along: largest deviation of the eye towards the surface and away from it.
         toward: (3,) unit, from the surface to the eye.
         spread: (2,): at distance d from the eye a pixel is `spread[0] + spread[1] d` wide, at its least.
-        axis: (3,) what the camera looks along.
+        axis: (3,) the direction in which the camera looks.
         angle: half the angle of a cone around the axis that holds the view, radians.
     """
 

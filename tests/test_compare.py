@@ -433,7 +433,7 @@ class TestStrangers:
 
         entries = dict(registry._entries("rts.splatters"))
         entries["gauss5"] = [EntryPoint("gauss5", "second_plugin.gauss5:Gauss5", "rts.splatters")]
-        monkeypatch.setitem(registry._found, "rts.splatters", entries)
+        monkeypatch.setitem(registry._entry_points, "rts.splatters", entries)
         comparison = compare(scene("translation"), truths=kept, **{**SMALL, "supersample": [1]})
         timed = {r["settings"]["splatter"] for r in comparison.rows if r["ms"]}
         assert {"gauss5", "visible"} <= timed

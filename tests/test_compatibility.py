@@ -1,14 +1,17 @@
 """Every surface with every sampler in every engine, on the example of each surface."""
 
 import functools
+import io
 
 import numpy as np
 import pytest
 from analytic import Ellipsoid
+from rich.console import Console
 from typer.testing import CliRunner
 
 import rts
 from rts.cli.main import app
+from rts.cli.plugin_tables import print_matrix
 from rts.testing import compatibility
 from rts_surfaces.implicit.fields import swept_sphere
 
@@ -96,13 +99,64 @@ def test_the_matrix_names_each_pair_and_why_one_does_not_work(monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
     done = CliRunner().invoke(app, ["plugins", "--matrix"])
     assert done.exit_code == 0
-    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.output.splitlines() if "│" in line]
+    lines = [[cell.strip() for cell in line.split("│")] for line in done.output.splitlines() if "│" in line]
     cells = {(surface, sampler): rest for surface, sampler, *rest in lines}
     assert cells["mesh", "raster"] == ["ok", ""]
     assert cells["mesh", "rays"][0] == "no" and "use a sampler of triangles" in cells["mesh", "rays"][1]
+    assert "Mesh(" not in cells["mesh", "rays"][1]
     assert cells["bare", ""] == ["no", "no example"]
     assert cells["broken", "rays"] == ["no", "KeyError: 'lost'"]
     assert "has no triangles" in cells["broken", "raster"][1]
+
+
+def test_rows_of_the_matrix_come_one_by_one(monkeypatch):
+    """Each is written and flushed before the next pair is tried."""
+    written, flushed = [], []
+
+    class Pipe(io.StringIO):
+        def flush(self):
+            flushed.append(self.getvalue().count("mesh"))
+
+    pipe = Pipe()
+
+    def tried(part, sampler, engine):
+        written.append(pipe.getvalue().count("mesh"))
+
+    monkeypatch.setattr(compatibility, "attempt", tried)
+    print_matrix(Console(file=pipe, width=200), ["mesh", "raster", "rays", "reference", "numpy"])
+    assert written == [0, 1, 2] and {1, 2, 3} <= set(flushed)
+
+
+def test_the_matrix_of_some_plugins(monkeypatch):
+    tried = []
+    monkeypatch.setattr(compatibility, "attempt", lambda part, sampler, engine: tried.append((sampler, engine)))
+    done = CliRunner().invoke(app, ["plugins", "--matrix", "--only", "mesh", "--only", "numpy"])
+    assert done.exit_code == 0 and tried == [(sampler, "numpy") for sampler in rts.plugins("samplers")]
+    assert "jax" not in done.output and "bezier" not in done.output
+    done = CliRunner().invoke(app, ["plugins", "--matrix", "--only", "meshes"])
+    assert done.exit_code == 1 and "there is no surface, sampler or engine 'meshes'; expected" in done.stderr
+    done = CliRunner().invoke(app, ["plugins", "--only", "mesh"])
+    assert done.exit_code == 2 and "goes with --matrix" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "error, said",
+    [
+        (
+            TypeError("got <rts.Odd object at 0x7f00ff12>\nTraceback (most recent call last)\n" + "x " * 500),
+            "TypeError: got rts.Odd",
+        ),
+        (rts.InputError("<odd.Thing object at 0x7f00> does not fit; give another"), "odd.Thing does not fit; give"),
+    ],
+)
+def test_errors_of_others_are_a_short_line(monkeypatch, error, said):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(compatibility, "attempt", fails)
+    (pair,) = compatibility.pairs(["mesh", "raster", "numpy"])
+    reason = pair.problems["numpy"]
+    assert reason.startswith(said) and "0x" not in reason and "\n" not in reason and len(reason) <= 120
 
 
 @pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")

@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib.metadata import entry_points
 
 import numpy as np
+import planted
 import pytest
 from analytic import Ellipsoid
 from helpers import splats_of
@@ -1084,17 +1085,29 @@ LAMBERTIAN = {"color": np.array([0.9, 0.8, 1.0], np.float32)}
 
 
 def surface_part(surface):
+    if isinstance(surface, Part):
+        return surface
     return Mesh.example().replace(surface=surface) if isinstance(surface, Mesh) else ellipsoid(surface)
+
+
+def shader_fixtures(shader):
+    shader, theta = shader if isinstance(shader, tuple) else (shader, LAMBERTIAN)
+    return {"shader": shader, "theta": theta, "gbuffer": shaders.random_gbuffer()}
+
+
+def both(broken, strangers):
+    """Broken plugins by the check that finds them, of two tables."""
+    return {check: {**broken.get(check, {}), **strangers.get(check, {})} for check in {**broken, **strangers}}
 
 
 KIT = {
     SamplerConformance: (SAMPLERS, lambda sampler: {"sampler": sampler, "parts": [scenes.ball(), CULLED]}),
-    SurfaceConformance: (SURFACES, lambda surface: {"part": surface_part(surface), "sampler": "auto"}),
-    ShaderConformance: (
-        SHADERS,
-        lambda shader: {"shader": shader, "theta": LAMBERTIAN, "gbuffer": shaders.random_gbuffer()},
+    SurfaceConformance: (
+        both(SURFACES, planted.SURFACES),
+        lambda surface: {"part": surface_part(surface), "sampler": "auto"},
     ),
-    SplatterConformance: (SPLATTERS, lambda splatter: {"splatter": splatter}),
+    ShaderConformance: (both(SHADERS, planted.SHADERS), shader_fixtures),
+    SplatterConformance: (both(SPLATTERS, planted.SPLATTERS), lambda splatter: {"splatter": splatter}),
     OperationConformance: (
         ODD_OPERATIONS,
         lambda operation: {
@@ -1136,6 +1149,13 @@ def test_a_broken_plugin_fails_the_check(kit, check, fixtures, plugin, engine):
     with pytest.raises((AssertionError, rts.InputError)) as failure:
         method(**{name: value for name, value in arguments.items() if name in wanted})
     assert str(failure.value)
+
+
+@pytest.mark.parametrize("check", planted.SOUND)
+def test_without_its_mistake_a_plugin_passes(check):
+    method = getattr(SurfaceConformance(), f"test_{check}")
+    given = {"part": planted.SOUND[check], "sampler": "auto"}
+    method(**{name: given[name] for name in inspect.signature(method).parameters})
 
 
 def test_what_is_wrong_anyway_is_not_taken_for_a_change_in_place_unseen():

@@ -304,6 +304,8 @@ class Gaussian5(rts.Splatter):
     def image(self, splats):
         xp, engine = rts.namespace(splats.positions), rts.engine_of(splats.positions)
         row = splats.row[0]
+        if splats.rgba.shape[0] == 0:  # Nothing can be taken by index.
+            return xp.stack([xp.zeros_like(row, dtype=splats.rgba.dtype)] * 4, axis=-1)
         height, width = row.shape
         index = xp.reshape(xp.where(row >= 0, row, 0), (-1,))
         position = xp.reshape(xp.take(splats.positions, index, axis=0), (height, width, 3))

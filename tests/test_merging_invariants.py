@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PROPERTIES, masks, rows_of, steps, told_apart
 
-from rts import threads
+from rts.compiling import threads
 from rts.contracts.records import Cells
 from rts.sampling import merging
 from rts.sampling.merging import merge

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rts.cli.main import app
-from rts.cli.new_plugin import KINDS, PLACES
+from rts.cli.new_plugin import KINDS, PLACES, TRIANGLES
 
 pytestmark = pytest.mark.plugins
 
@@ -34,29 +34,24 @@ def install(folder):
     (info / "entry_points.txt").write_text("".join(lines))
 
 
-def test_a_new_surface_passes_the_kit_as_it_is(tmp_path, monkeypatch):
+def test_new_plugins_pass_the_kit_as_they_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    said = run("surface", "wavy-blob")
-    folder = tmp_path / "rts-wavy-blob"
-    written = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    files = {"pyproject.toml", "README.md", "tests/test_wavy_blob.py"}
-    assert written == files | {"rts_wavy_blob/__init__.py", "rts_wavy_blob/surface.py"}
-    assert all(name in said for name in written)
-    assert not [p for p in folder.rglob("*") if p.is_file() and "$" in p.read_text()]
-    install(folder)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+    folders = []
+    for number, options in enumerate([*([kind] for kind in KINDS), ["surface", "--triangles"]]):
+        said = run(*options, f"wavy-blob-{number}")
+        folder, package = tmp_path / f"rts-wavy-blob-{number}", f"rts_wavy_blob_{number}"
+        written = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+        files = {"pyproject.toml", "README.md", f"tests/test_wavy_blob_{number}.py"}
+        assert written == files | {f"{package}/__init__.py", f"{package}/{options[0]}.py"}
+        assert all(name in said for name in written)
+        assert not [p for p in folder.rglob("*") if p.is_file() and "$" in p.read_text()]
+        install(folder)
+        folders.append(str(folder))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*folders, str(ROOT)])}
     # What compiles long, and what jax adds, the kit's own tests have.
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-k",
-        "not jax and not compiled and not agree",
-    ]
-    done = subprocess.run([*command, str(folder)], env=environment, cwd=folder, capture_output=True, text=True)
+    chosen = ["-q", "-p", "no:cacheprovider", "-k", "not jax and not compiled and not agree"]
+    command = [sys.executable, "-m", "pytest", *chosen, *folders]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
     assert " passed" in done.stdout and "failed" not in done.stdout
 
@@ -66,7 +61,9 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path, monkeypa
     for name in ("Blob", "2d", "a b", "", "../x", "blob-", "class", "a.b", "ü"):
         assert "is no name for a plugin" in run("surface", "--", name, code=1)
     assert "there is a surface 'mesh' already" in run("surface", "mesh", code=1)
-    assert "no template of 'sampler'; there is surface" in run("sampler", "blob", code=1)
+    assert "no template of 'engine'; there is surface, sampler, shader, splatter" in run("engine", "blob", code=1)
+    assert "a shader is not made of triangles" in run("shader", "--triangles", "blob", code=1)
+    assert "there is a splatter 'multi' already" in run("splatter", "multi", code=1)
     (tmp_path / "rts-blob").mkdir()
     assert "rts-blob exists" in run("surface", "blob", code=1)
     (tmp_path / "file").write_text("")
@@ -77,8 +74,9 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path, monkeypa
 
 
 def test_every_template_has_a_place_and_is_in_the_wheel():
-    for kind in KINDS:
-        assert {p.name for p in (ROOT / "rts/cli/templates" / kind).iterdir()} == set(PLACES)
+    templates = ROOT / "rts/cli/templates"
+    there = {str(p.relative_to(templates)) for p in templates.rglob("*") if p.is_file()}
+    assert there == {place.format(template=kind) for place in PLACES for kind in (*KINDS, TRIANGLES)}
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["rts"]
     packed = {p for pattern in data for p in (ROOT / "rts").glob(pattern)}
     assert {p for p in (ROOT / "rts/cli/templates").rglob("*") if p.is_file()} <= packed

@@ -71,7 +71,7 @@ def test_interpolation_is_combine_with_the_weight_that_the_others_lack_of_one():
 
 
 def combine_loops_read(*given):
-    from rts.threads import read_only
+    from rts.compiling.threads import read_only
 
     return [read_only(x) for x in given]
 

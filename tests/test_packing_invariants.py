@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PROPERTIES, grids, masks, rows_of, steps, table, told_apart
 
-from rts import threads
+from rts.compiling import threads
 from rts.plugin_api.records import Fragments, Proxy
 from rts.sampling.packing import lift, repack
 

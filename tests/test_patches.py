@@ -11,12 +11,12 @@ from thin_patches import lacking, thin_patches
 
 import rts
 from rts import Camera, InputError, Part
+from rts.compiling.threads import read_only
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
 from rts.sampling import settling
 from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON
-from rts.threads import read_only
 from rts_surfaces import bicubic, tiles
 
 pytestmark = pytest.mark.sampling

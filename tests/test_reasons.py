@@ -9,8 +9,10 @@ from helpers import arrays, box, icosphere, quad
 
 import rts
 from rts.arrays.engines import engine_of
-from rts.diagnostics import gradients
+from rts.arrays.trees import leaves
+from rts.diagnostics.explanation import disagreeing, shared_budget
 from rts.diagnostics.explanation.reasons import KINDS
+from rts.diagnostics.explanation.subject import Subject
 
 pytestmark = pytest.mark.rendering
 
@@ -387,14 +389,60 @@ def test_a_minimum_is_not_flat():
 
 
 def test_what_a_spent_budget_leaves_out_of_a_number_is_told(monkeypatch):
-    from rts.diagnostics.explanation import disagreeing
-
     clock = iter([True] * 3)
     scene, start, _ = outlines(False)
-    monkeypatch.setattr(gradients._Clock, "going", lambda self, share=1.0: share < 1 or next(clock, False))
+    monkeypatch.setattr(shared_budget.Clock, "going", lambda self, share=1.0: share < 1 or next(clock, False))
     monkeypatch.setattr(disagreeing, "EXPERIMENTS", disagreeing.EXPERIMENTS[:1] * 9)
     found = rts.check_gradient(scene, arrays("torch-cpu", start), SIZE, splatter="none", samples=3)
     assert not found.reasons and "or not all, in 2 of them" in found.note
+
+
+@pytest.fixture
+def costly(monkeypatch):
+    """A clock on which only hard renders take time; the square roots of their samples a pixel, and the numbers."""
+    now, drawn, hard = [0.0], [], Subject.hard
+
+    def slow(subject, direction, by, samples, change=None):
+        now[0] += 0.15 * samples**2  # A number by 8² and 9² samples takes a minute.
+        if by:
+            drawn.append((samples, tuple(np.concatenate([np.ravel(x) for x in leaves(direction)]))))
+        return hard(subject, direction, by, samples, change)
+
+    monkeypatch.setattr(shared_budget, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(Subject, "hard", slow)
+    return now, drawn
+
+
+@pytest.mark.parametrize("budget, finest", [(60, 4), (130, 6), (500, 9)])
+def test_every_number_has_its_turn_within_the_budget(costly, budget, finest):
+    now, drawn = costly
+    scene, start, given = outlines(True)
+    found = rts.check_gradient(scene, arrays("torch-cpu", start), SIZE, budget_s=budget, **given)
+    numbers = {number for _, number in drawn}
+    assert now[0] <= budget and len(found.slopes) == len(numbers) == 2
+    assert max(samples for samples, _ in drawn) == finest
+    if finest < 9:
+        first = drawn[: len(drawn) // 2]
+        assert {number for _, number in first} == numbers and all(samples <= 3 for samples, _ in first)
+        assert "the differences of 2 are of fewer samples than asked for" in found.note
+
+
+def test_reasons_are_looked_for_in_every_number_before_any_is_tried_twice(monkeypatch):
+    now, tried = [0.0], []
+
+    def slow(case, touched):
+        now[0] += 5
+        tried.append(case.number.slope.name)
+
+    scene, start, _ = outlines(False)
+    monkeypatch.setattr(shared_budget, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(disagreeing, "EXPERIMENTS", (slow,) * 4)
+    found = rts.check_gradient(scene, arrays("torch-cpu", start), SIZE, splatter="none", samples=3, budget_s=20)
+    first, second = (s.name for s in found.slopes)
+    assert tried == [first, first, second, second]
+    now[0], tried[:] = 0.0, []
+    rts.check_gradient(scene, arrays("torch-cpu", start), SIZE, splatter="none", samples=3, budget_s=42)
+    assert tried == [first] * 4 + [second] * 4
 
 
 def test_pixels_are_where_the_derivatives_disagree():

@@ -36,7 +36,7 @@ HEAVY = (
 @pytest.fixture
 def install(tmp_path, monkeypatch):
     """Install a small distribution in a folder of its own, uninstalled after the test."""
-    monkeypatch.setattr(registry, "_found", {})
+    monkeypatch.setattr(registry, "_entry_points", {})
     monkeypatch.setattr(registry, "_defaults", {})
     modules_before = set(sys.modules)
 
@@ -229,9 +229,9 @@ def test_a_surface_that_cannot_be_loaded_is_an_attribute_error_too(monkeypatch):
 
 
 def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_them():
-    loaded = modules_after("import rts\nassert not rts.registry._found\nassert not hasattr(rts, 'regulrizers')")
+    loaded = modules_after("import rts\nassert not rts.registry._entry_points\nassert not hasattr(rts, 'regulrizers')")
     assert not {m for m in loaded if m.startswith("rts_surfaces")}
-    loaded = modules_after("import rts\nassert rts.registry._found == {}\nrts.Mesh")
+    loaded = modules_after("import rts\nassert rts.registry._entry_points == {}\nrts.Mesh")
     expected = {"rts_surfaces.parameter_checks", "rts_surfaces.mesh"}
     assert {m for m in loaded if m.startswith("rts_surfaces.")} == expected
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import PROPERTIES, masks, rows_of, table, told_apart
 
-from rts import Camera, threads
+from rts import Camera
+from rts.compiling import threads
 from rts.sampling.settling import SAME_ROOT, SAME_ROOT_PIXELS, settle
 
 pytestmark = pytest.mark.sampling

@@ -118,15 +118,15 @@ def test_threads_may_share_a_part_and_a_handle(name):
 
 @pytest.fixture
 def helpers(monkeypatch):
-    """The helpers of `rts.threads`, as if nothing had been run yet."""
-    from rts import threads
+    """The helpers of `rts.compiling.threads`, as if nothing had been run yet."""
+    from rts.compiling import threads
 
     monkeypatch.setattr(threads, "_helpers", threads._Helpers())
     return threads._helpers
 
 
 def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
-    from rts import threads
+    from rts.compiling import threads
 
     start, done = threading.Barrier(8), []
 
@@ -151,7 +151,7 @@ def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
 
 def cores_of_helper(monkeypatch, run):
     """The core of the caller of `run`, given a function of a range, and the cores on which its helper may run."""
-    from rts import threads
+    from rts.compiling import threads
 
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     caller, both, seen = threading.get_ident(), threading.Barrier(2), {}
@@ -176,7 +176,7 @@ needs_cores = pytest.mark.skipif(
 
 @needs_cores
 def test_helpers_keep_off_the_core_of_the_thread_that_asks(monkeypatch, helpers):
-    from rts import threads
+    from rts.compiling import threads
 
     found = [cores_of_helper(monkeypatch, lambda loop: threads.parallel(loop, 9)) for _ in range(20)]
     cores = os.sched_getaffinity(0)
@@ -188,7 +188,7 @@ def test_helpers_keep_off_the_core_of_the_thread_that_asks(monkeypatch, helpers)
 @needs_cores
 def test_helpers_that_call_any_function_run_on_all_cores(monkeypatch, helpers):
     """Though the caller has loops of its own meanwhile, for which idle helpers are to keep off."""
-    from rts import threads
+    from rts.compiling import threads
 
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     caller, cores, seen = threading.get_ident(), os.sched_getaffinity(0), []
@@ -208,7 +208,7 @@ def test_helpers_that_call_any_function_run_on_all_cores(monkeypatch, helpers):
 
 
 def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeypatch, helpers):
-    from rts import threads
+    from rts.compiling import threads
 
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     caller, both, seen = threading.get_ident(), threading.Barrier(2), []
@@ -229,7 +229,7 @@ def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeyp
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_after_an_error_what_has_not_begun_is_left(monkeypatch, helpers, error):
-    from rts import threads
+    from rts.compiling import threads
 
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     monkeypatch.setattr(threads, "TASKS_PER_THREAD", 20)
@@ -249,7 +249,7 @@ def test_after_an_error_what_has_not_begun_is_left(monkeypatch, helpers, error):
 
 
 def test_of_several_items_that_fail_the_error_is_that_of_the_first(monkeypatch, helpers):
-    from rts import threads
+    from rts.compiling import threads
 
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
 

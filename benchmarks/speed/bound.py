@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-import rts.threads
+import rts.compiling.threads
 from benchmarks.meshes import MESHES, kept_mesh
 from benchmarks.report import table
 from benchmarks.speed.pose_iteration import Task, torch_iteration
@@ -37,11 +37,11 @@ STAGES = {
 
 def bandwidth(size: int, rounds: int = 9) -> float:
     """Bytes a second that all threads read together, of an array of so many bytes that they read again and again."""
-    shares = np.array_split(np.ones(size // 4, np.float32), rts.threads.thread_count())
+    shares = np.array_split(np.ones(size // 4, np.float32), rts.compiling.threads.thread_count())
     times, again = [], max(1, (1 << 28) // size)
     for _ in range(rounds):
         start = time.perf_counter()
-        rts.threads.each(lambda share: [share.max() for _ in range(again)], shares)
+        rts.compiling.threads.each(lambda share: [share.max() for _ in range(again)], shares)
         times.append(time.perf_counter() - start)
     return again * size / statistics.median(times)
 
@@ -84,7 +84,7 @@ def _sizes(arguments: Any) -> Iterator[tuple[int, bool]]:
 @contextmanager
 def listening(loops: Loops) -> Iterator[None]:
     """Have loops noted."""
-    own = rts.threads.parallel
+    own = rts.compiling.threads.parallel
 
     def noted(loop: Callable, count: int, *arguments: Any, **options: Any) -> None:
         start = time.perf_counter()

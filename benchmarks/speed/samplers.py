@@ -23,8 +23,8 @@ import numpy as np
 import rts
 from benchmarks.camera import camera
 from benchmarks.meshes import MESHES, mesh, subdivided
+from rts.compiling.threads import thread_count
 from rts.contracts.records import Proxy
-from rts.threads import thread_count
 from rts_backends.triangles import pixel_matrix
 
 MEASURED = ("teapot_2464", "bunny", "spot", "nefertiti")

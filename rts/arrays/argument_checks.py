@@ -1,4 +1,4 @@
-"""Numbers and small arrays that callers give: refused by name, in one line, where they are of the wrong kind."""
+"""Checks of numbers and small arrays that callers give; errors name the argument in one line."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ Shape = tuple[int, ...]
 
 
 def quoted(value: Any) -> str:
-    """What an error shows of a value: one line, and not a long one."""
+    """A value for an error message, in one line of at most 60 characters."""
     shape = shape_of(value)
     if len(shape) > 1 or max(shape, default=0) > 4:
         return kind_of(value)
     text = " ".join(repr(value).split())
-    if isinstance(value, FunctionType):  # Without where in memory it is.
+    if isinstance(value, FunctionType):  # Its repr shows an address in memory.
         text = f"<function {value.__name__}>"
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def one_line(error: Exception) -> str:
-    """The message of an error that is not the library's, in one line, and not a long one."""
+    """The message of a foreign error, in one line of at most 120 characters."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 120 else f"{text[:117]}..."
 
 
 def check_numbers(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
-    """Refuse what is not a finite real array, or list of numbers, of one of these shapes.
+    """Refuse anything but a finite real array, or list of numbers, of one of these shapes.
 
     Returns:
-        The value, where it is known; None for what is traced, or of a batch.
+        The value as NumPy; None if it is traced, or batched.
     """
     expected = " or ".join("a number" if s == () else str(s) for s in shapes)
     wrong = InputError(f"{name} is {quoted(value)}; expected {'' if () in shapes else 'numbers of shape '}{expected}")
@@ -51,12 +51,12 @@ def check_numbers(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
     if not namespace(value).isdtype(dtype, ("real floating", "integral")):
         raise InputError(f"{name} has dtype {dtype}; expected real numbers")
     if shape not in shapes:
-        given = f"is {quoted(value)}" if shape == () else f"has shape {shape}"
-        raise InputError(f"{name} {given}; expected {expected}")
-    known = value_of(value)
-    if known is not None and not np.isfinite(known).all():
-        raise InputError(f"{name} is {quoted(known)}; expected finite numbers")
-    return None if known is None or known.shape != shape else known
+        fault = f"is {quoted(value)}" if shape == () else f"has shape {shape}"
+        raise InputError(f"{name} {fault}; expected {expected}")
+    array = value_of(value)
+    if array is not None and not np.isfinite(array).all():
+        raise InputError(f"{name} is {quoted(array)}; expected finite numbers")
+    return None if array is None or array.shape != shape else array
 
 
 def _shape_and_dtype(value: Any) -> tuple[Shape, Any]:
@@ -70,19 +70,19 @@ def _shape_and_dtype(value: Any) -> tuple[Shape, Any]:
 
 
 def check_flag(name: str, value: Any) -> None:
-    """Refuse what is neither True nor False."""
+    """Refuse anything but True and False."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{name} is {quoted(value)}; expected True or False")
 
 
 def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
-    """Refuse what `check_numbers` does, and numbers of zero or less."""
-    known = check_numbers(name, value, *(shapes or ((),)))
-    if known is not None and not (known > 0).all():
+    """As `check_numbers`, and refuse numbers of zero or less."""
+    array = check_numbers(name, value, *(shapes or ((),)))
+    if array is not None and not (array > 0).all():
         raise InputError(
             f"{name} is {quoted(value)}; expected {'a positive number' if not shapes else 'positive numbers'}"
         )
-    return known
+    return array
 
 
 def check_planes(near: Any, far: Any, *, positive: bool) -> None:
@@ -95,22 +95,22 @@ def check_planes(near: Any, far: Any, *, positive: bool) -> None:
 
 
 def check_rotation(name: str, matrix: Any) -> None:
-    """Refuse what is not a (3, 3) rotation, to about three digits."""
-    known = check_numbers(name, matrix, (3, 3))
-    if known is None:
+    """Refuse anything but a (3, 3) rotation, to about three digits."""
+    rotation = check_numbers(name, matrix, (3, 3))
+    if rotation is None:
         return
-    off = float(np.abs(known @ known.T - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(known) < 0:
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         what = "mirrors" if off <= ROTATION_TOLERANCE else f"is off by {off:.2g} (its product with its transpose)"
         raise InputError(f"{name} {what}; expected a rotation: move scale to the points, and mirror the image instead")
 
 
 ROTATION_TOLERANCE = 2e-3
-"""How far R Rᵀ may be from the identity: rotations that are written with three digits are accepted."""
+"""Largest difference of R Rᵀ from the identity. It accepts rotations that are written with three digits."""
 
 
 def is_invertible(matrix: np.ndarray) -> bool:
-    """Whether a matrix has an inverse; lengths of its rows and columns do not matter."""
+    """True if a matrix has an inverse. Lengths of its rows and columns do not matter."""
     for axis in (1, 0):
         length = np.linalg.norm(matrix, axis=axis, keepdims=True)
         matrix = matrix / np.where(length > 0, length, 1)
@@ -119,7 +119,7 @@ def is_invertible(matrix: np.ndarray) -> bool:
 
 
 def check_pixels(size: Any) -> tuple[int, int]:
-    """(height, width) as integers, refused where they make no image."""
+    """The size (height, width) as integers; anything but two positive ones is refused."""
     if type(size) is tuple and len(size) == 2 and type(size[0]) is int is type(size[1]) and min(size) > 0:
         return size
     try:

@@ -1,4 +1,4 @@
-"""Small functions of arrays of any engine: numbers made arrays, shapes in words, unit vectors, borders."""
+"""Small functions of arrays of any engine: conversion, shapes in words, unit vectors, borders."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from rts.errors import EngineError, InputError
 def from_numbers(tree: Tree, name: str = "an array") -> Tree:
     """A copy of a tree whose leaves are arrays or numbers that the library can work with.
 
-    Every list or tuple that holds only numbers, nested or not, becomes a float32 array. NumPy arrays in another than
-    this machine's byte order, in half and in extended precision become ordinary ones.
+    Every list or tuple that holds only numbers, nested or not, becomes a float32 array. NumPy arrays of foreign byte
+    order, of half and of extended precision become ordinary ones.
 
     Args:
         tree: nested dicts, lists, tuples and records.
-        name: what an error calls it.
+        name: the name in error messages.
 
     Raises:
-        InputError: what is no array, of complex numbers, or without values in one piece of memory.
+        InputError: a leaf is no array, is complex, or has no values in one piece of memory.
     """
     kind = type(tree)
     if kind is np.ndarray:
@@ -35,12 +35,12 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
     if tree is None or kind in _NUMBERS:
         return tree
     if isinstance(tree, Mapping):
-        found = {}
+        entries = {}
         for key, value in tree.items():
             if not isinstance(key, str):
                 raise InputError(f"{name} has the key {key!r}; expected names")
-            found[key] = value if _is_plain(value) else from_numbers(value, f"{name}[{key!r}]")
-        return found
+            entries[key] = value if _is_plain(value) else from_numbers(value, f"{name}[{key!r}]")
+        return entries
     if isinstance(tree, (list, tuple)):
         if tree and not is_named(tree) and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
             try:
@@ -67,7 +67,7 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
 
 
 def _is_plain(x: Any) -> bool:
-    """Whether an array is taken as it is."""
+    """True for an array that needs no conversion."""
     if type(x) is np.ndarray:
         return x.dtype in _ORDINARY
     owner = OWNERS.get(type(x))
@@ -79,7 +79,7 @@ _ORDINARY = frozenset(np.dtype(t) for t in "? b h i l q B H I L Q f d".split())
 
 
 def _ordinary(array: np.ndarray, name: str) -> np.ndarray:
-    """An array of unusual numbers as one of ordinary numbers."""
+    """A copy of an array in an ordinary dtype."""
     dtype = array.dtype.newbyteorder("=")
     if dtype.kind == "f" and dtype not in _ORDINARY:
         dtype = np.dtype(np.float32 if dtype.itemsize < 4 else np.float64)
@@ -98,12 +98,12 @@ def shape_of(x: Any) -> tuple[int, ...]:
 
 
 def described(x: Any) -> str:
-    """What an error says of a value: "has shape (2, 3)" of an array, what it is of anything else."""
+    """A predicate for error messages: "has shape (2, 3)" for an array, "is a str" for anything else."""
     return f"is a {type(x).__name__}" if _shape(x) is None else f"has shape {shape_of(x)}"
 
 
 def kind_of(x: Any) -> str:
-    """What an error calls a value that it did not expect: "a torch.Tensor of shape (2, 3)", "a str", "None"."""
+    """The kind of a value for error messages: "a torch.Tensor of shape (2, 3)", "a str", "None"."""
     if x is None:
         return "None"
     kind, shape = type(x), shape_of(x)
@@ -112,9 +112,9 @@ def kind_of(x: Any) -> str:
 
 
 def promote(*values: Any) -> tuple[Any, list[Array]]:
-    """Namespace and arrays: the arguments of a call, numbers and lists included, as floating arrays of one engine.
+    """Namespace and arrays: the arguments of a call as floating arrays of one engine.
 
-    Where all are NumPy or numbers the result is float64.
+    Numbers and lists become arrays. If all arguments are NumPy arrays or numbers, the result is float64.
     """
     owner = OWNERS.get(type(values[0]))
     if owner is not None:
@@ -168,19 +168,19 @@ def without_border(image: Array, border: int) -> Array:
 
 
 def is_finite(*arrays: Array) -> bool:
-    """Whether all values are finite, as far as they are known; quick where they are."""
+    """True if all known values are finite; quick if they are."""
     return all(map(_is_finite, arrays))
 
 
 def _is_finite(x: Array) -> bool:
     engine = engine_of(x)
     if not engine.on_host(x):
-        known = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
-        return known is None or bool(known.all())
-    known = engine.known(x)
-    if known is None or not known.size:
+        values = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
+        return values is None or bool(values.all())
+    values = engine.known(x)
+    if values is None or not values.size:
         return True
     from rts.arrays.extremes import largest
 
-    # What is repeated is looked at but once. Sums and products would take threads of their own, or overflow.
-    return math.isfinite(largest(known[tuple([slice(None) if step else slice(1) for step in known.strides])]))
+    # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
+    return math.isfinite(largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]))

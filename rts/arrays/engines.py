@@ -1,4 +1,4 @@
-"""The base class of engines, which are the array frameworks; and which engine owns an array."""
+"""The base class of engines, which wrap array frameworks, and the lookup of an array's engine."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Engine(Plugin):
     namespace: ClassVar[Any]
     differentiates: ClassVar[bool] = True
 
-    # ------------------------------------------------------------------------------------------- every framework writes
+    # ------------------------------------------------------------------------------------- methods of every framework
 
     @abc.abstractmethod
     def owns(self, x: Any) -> bool:
-        """Whether this is an array of the framework, traced ones included."""
+        """True for an array of the framework, traced ones included."""
 
     @abc.abstractmethod
     def constant(self, value: Any, like: Array | None = None) -> Array:
@@ -71,14 +71,14 @@ class Engine(Plugin):
         for cls in STATIC_FIELDS:
             yield cls, split_record, functools.partial(join_record, cls)
 
-    # -------------------------------------------------------------------------------------- one with derivatives writes
+    # --------------------------------------------------------------------------------------- methods with derivatives
 
     def value_and_grad(self, f: Callable) -> Callable:
         """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
         raise self._no_derivatives()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
-        """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
+        """The value of `f` and its derivative along `tangent`, differentiable in arrays that `f` closes over."""
         raise self._no_derivatives()
 
     def jacobian(self, f: Callable) -> Callable:
@@ -90,21 +90,21 @@ class Engine(Plugin):
         raise self._no_derivatives()
 
     def traced(self, x: Array) -> bool:
-        """Whether an array has a shape but not yet a value."""
+        """True for an array that has a shape but not yet a value."""
         return False
 
     def known(self, x: Array) -> np.ndarray | None:
-        """The value of an array on the host, where it can be had while Python runs; None for what is traced.
+        """The value of an array on the host; None while it is traced.
 
-        Under transforms of batches it may have more axes than the array.
+        Under transforms of batches the value may have more axes than the array.
         """
         return None if self.traced(x) else self.to_numpy(self.stop_gradient(x))
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
         """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.
 
-        The result has no derivative. In compiled programs it is a loop, too: unrolled, it would take minutes to
-        compile. What `body` closes over must have no derivatives by itself (`stop_gradient`); θ has none where rays are
+        The result has no derivative. Compiled programs keep the loop: unrolled, it would take minutes to compile.
+        Arrays that `body` closes over must have no derivatives (`stop_gradient`); θ has none where rays are
         intersected.
 
         Args:
@@ -122,49 +122,49 @@ class Engine(Plugin):
             state = body(state)
         return state
 
-    # --------------------------------------------------------------------- what makes it faster, or serves its compiler
+    # -------------------------------------------------------------------------------- methods for speed and compilers
 
     def apply(self, operation: Any, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
         """The result of an operation. The default runs its specification; override it to run compiled code."""
         return operation.specification(*operands, **params)
 
     def on_host(self, *arrays: Array) -> bool:
-        """Whether compiled code for the host may work on these arrays, in place of array code."""
+        """True if compiled loops on the host may work on these arrays, in place of array code."""
         return False
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
-        """Call `f` if `on_host` holds for the arrays, else `otherwise`; both give the same results.
+        """Call `f` if `on_host` holds for the arrays, else `otherwise`; both return the same results.
 
-        Engines that trace decide when the compiled program knows its device.
+        Engines that trace decide once the compiled program knows its device.
         """
         return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
 
     def exact_products(self, *arrays: Array) -> bool:
-        """Whether matrix products of these arrays keep their precision: some devices' matrix units round float32."""
+        """True if matrix products keep the arrays' precision. Matrix units of some devices round float32."""
         return False
 
     def plain(self, x: Array) -> bool:
-        """Whether `admitted` would give the array itself; asked of every array that a user gives."""
+        """True if `admitted` would return the array itself. Called for every array that a user gives."""
         return False
 
     def admitted(self, x: Array, name: str) -> Array:
-        """The array, or one like it that the library can work with.
+        """The array, or an equivalent one that the library can work with.
 
         Args:
             x: an array of this engine that a user gave.
-            name: what an error calls it.
+            name: the name in error messages.
 
         Raises:
-            InputError: it cannot be used, such as a sparse one.
+            InputError: the array cannot be used, such as a sparse one.
         """
         return x
 
     def padded(self, x: Array) -> bool:
-        """Whether packed arrays like this one may have rows that no cell refers to."""
+        """True if packed arrays like this one may have rows that no cell refers to."""
         return False
 
     def fill_unused(self, x: Array, row: Array) -> Array:
-        """Packed x (N, ·), with its first row in place of all that no cell of `row` (K, H, W) names.
+        """Packed x (N, ·), with its first row in place of every row that no cell of `row` (K, H, W) names.
 
         Only called if `padded(row)` is True.
         """
@@ -175,13 +175,13 @@ class Engine(Plugin):
     ) -> Array:
         """The value `whole` of `f(rows)`, a function that treats each row by itself.
 
-        The default returns `whole`. An engine whose compiled programs allot more rows than are used may return, in its
-        place, what takes no time for most of the others; it calls `f` with fewer rows, then.
+        The default returns `whole`. Compiled programs may allot more rows than are used. Their engine may call `f` with
+        fewer rows instead, and so skip most of the unused ones.
 
         Args:
             f: packed arrays (n, ·) by name → (n, ·).
             rows: packed arrays (N, ·).
-            row: (K, H, W) integers, the rows that are in use: those up to the largest.
+            row: (K, H, W) integers; rows up to the largest of them are in use.
             whole: `f(rows)`, (N, ·).
 
         Returns:
@@ -194,7 +194,7 @@ class Engine(Plugin):
         return x
 
     def concurrent(self) -> bool:
-        """Whether other threads may call host functions with its arrays now, as this thread would; False by default."""
+        """True if other threads may now call host functions with the engine's arrays; False by default."""
         return False
 
     def split(self, x: Array, sizes: Sequence[int]) -> Sequence[Array]:
@@ -203,9 +203,9 @@ class Engine(Plugin):
         return [x[end - size : end, ...] for size, end in zip(sizes, ends.tolist(), strict=True)]
 
     def map_rows(self, f: Callable[[Array], Array], rows: Array, size: int) -> Array:
-        """The values `f(rows)` of a function that treats each row by itself, so many rows at a time.
+        """The values `f(rows)` of a function that treats each row by itself, `size` rows at a time.
 
-        What is computed of more rows than memory has room for at once; it is not for derivatives.
+        For more rows than memory has room for at once. It has no derivatives.
 
         Args:
             f: rows (size, ·) → (size, ·).
@@ -218,14 +218,14 @@ class Engine(Plugin):
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
         """The result of `f(make())`, computed once more for its gradient instead of keeping intermediate arrays.
 
-        `make` has no derivative. An engine may keep what it gave instead of calling it again.
+        `make` has no derivative. An engine may keep its result instead of calling it again.
         """
         return f(make())
 
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
-        """The gradient (N, C) of a function of rows (N, C), each value (N,) of which depends on its own row alone.
+        """The gradient (N, C) of a function of rows (N, C) whose values (N,) depend on their own rows alone.
 
-        Differentiable in turn in the rows and in what `f` closes over. The default takes C derivatives in forward mode.
+        Differentiable in the rows and in arrays that `f` closes over. The default takes C derivatives in forward mode.
         """
         xp, zero, columns = self.namespace, self.namespace.zeros_like(rows), []
         for i in range(rows.shape[1]):
@@ -246,11 +246,11 @@ class Engine(Plugin):
         return f
 
     def uncompiled(self, f: Callable) -> Callable:
-        """A function like `f` that the framework's compiler of Python code calls as it is, without looking into it."""
+        """A function like `f` that the framework's compiler of Python code calls without tracing it."""
         return f
 
     def take_error(self) -> RtsError | None:
-        """The last error raised inside a host call, once, where the framework wraps such errors in its own."""
+        """The last error raised inside a host call, once; for frameworks that wrap such errors in their own."""
         return None
 
 
@@ -259,7 +259,7 @@ CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 
 def is_constant(tree: Tree) -> bool:
-    """Whether every leaf is a NumPy array or a Python number, which are never differentiated."""
+    """True if every leaf is a NumPy array or a Python number, which are never differentiated."""
     if type(tree) in OWNERS:
         return False
     for x in collected(tree):
@@ -271,17 +271,17 @@ def is_constant(tree: Tree) -> bool:
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
 _ENGINES: dict[str, Engine] = {}
 OWNERS: dict[type, Engine] = {}
-"""Engines by the types of arrays that have been met; NumPy's are not in it: they are constants beside any engine's."""
+"""Engines by the array types met so far. NumPy is missing: its arrays are constants beside those of any engine."""
 _BITS: dict[Any, int] = {}
 _BROKEN: set[str] = set()
-"""Engines that do not load."""
+"""Names of engines that failed to load."""
 
 
 def engine_named(name: str) -> Engine:
-    """The one object of the engine of a name, loaded if need be.
+    """The only instance of a named engine, loaded on first use.
 
     Raises:
-        PluginError: it cannot be loaded.
+        PluginError: the engine cannot be loaded.
     """
     if name not in _ENGINES:
         engine = registry.plugin("rts.engines", name)()
@@ -308,40 +308,40 @@ def engine_of(*trees: Tree) -> Engine:
     Raises:
         EngineError: arrays of two engines, or of an unknown type.
     """
-    found: Engine | None = None
+    common: Engine | None = None
     for x in trees:
         engine = OWNERS.get(type(x))
         if engine is None:
             if type(x) is np.ndarray:
                 continue
             return _engine_of_leaves(collected(trees))
-        if found is not None and engine is not found:
+        if common is not None and engine is not common:
             return _engine_of_leaves(trees)
-        found = engine
-    return found if found is not None else _ENGINES.get("numpy") or engine_named("numpy")
+        common = engine
+    return common if common is not None else _ENGINES.get("numpy") or engine_named("numpy")
 
 
-def _engine_of_leaves(found: Sequence[Any]) -> Engine:
-    only: Engine | None = None
-    for x in found:
+def _engine_of_leaves(arrays: Sequence[Any]) -> Engine:
+    common: Engine | None = None
+    for x in arrays:
         engine = OWNERS.get(type(x))
         if engine is None:
             if isinstance(x, CONSTANT_TYPES):
                 continue
             engine = OWNERS[type(x)] = _owner(x)
-        if only is not None and engine is not only:
+        if common is not None and engine is not common:
             raise EngineError(
-                f"arrays of {' and '.join(sorted((engine.name, only.name)))} met in one call; convert one side "
+                f"arrays of {' and '.join(sorted((engine.name, common.name)))} met in one call; convert one side "
                 f"(NumPy arrays may stand beside either, as constants)"
             )
-        only = engine
-    return only if only is not None else _ENGINES.get("numpy") or engine_named("numpy")
+        common = engine
+    return common if common is not None else _ENGINES.get("numpy") or engine_named("numpy")
 
 
 class Context(NamedTuple):
     """An engine to compute with, and an array that sets dtype and device of its constants, or None.
 
-    It is found once for a call, and handed on.
+    The context is determined once for each call, and handed on.
     """
 
     engine: Engine
@@ -349,27 +349,27 @@ class Context(NamedTuple):
 
     def constants(self, tree: Tree) -> Tree:
         """A copy of a tree in which every NumPy array and number is a constant of the engine."""
-        if tree is None or type(tree) in OWNERS:  # As most are.
+        if tree is None or type(tree) in OWNERS:  # The usual case.
             return tree
         return constants(tree, self.engine, self.like)
 
 
 def context_of(*trees: Tree) -> Context:
     """The engine of these trees, and their `exemplar`."""
-    found = collected(trees)
-    return Context(_engine_of_leaves(found), _widest(found))
+    arrays = collected(trees)
+    return Context(_engine_of_leaves(arrays), _widest(arrays))
 
 
 def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> Context:
     """The engine of a scene, and an array of its dtype: the one rule for dtypes.
 
-    The dtype is the widest floating one of the torch or jax arrays. Where all is NumPy it is that of the widest array
+    The dtype is the widest floating one of the torch or jax arrays. If all arrays are NumPy, it is that of the widest
     in θ: cameras, transforms and backgrounds in NumPy are constants, and widen nothing. It is float32 at least.
 
     Args:
         parts: the parts.
         *others: further arrays of the scene.
-        engine: the name of an engine to use, whatever the arrays are; those of another are refused.
+        engine: the name of an engine to use in any case; arrays of another one are refused.
     """
     own, like = context_of(parts, *others)
     if engine is not None:
@@ -384,10 +384,10 @@ def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = N
     if like is not None:
         return Context(own, like)
     thetas = collected([part.theta for part in parts])
-    wide = any(x.dtype == np.float64 for x in thetas if isinstance(x, (np.ndarray, np.generic)))
+    is_wide = any(x.dtype == np.float64 for x in thetas if isinstance(x, (np.ndarray, np.generic)))
     if own.name == "numpy":
-        return Context(own, _FLOAT64 if wide else _FLOAT32)
-    return Context(own, own.constant(np.zeros((), np.float32)) if not wide else _float64(own))
+        return Context(own, _FLOAT64 if is_wide else _FLOAT32)
+    return Context(own, own.constant(np.zeros((), np.float32)) if not is_wide else _float64(own))
 
 
 _FLOAT32, _FLOAT64 = np.zeros((), np.float32), np.zeros((), np.float64)
@@ -396,7 +396,7 @@ _FLOAT32, _FLOAT64 = np.zeros((), np.float32), np.zeros((), np.float64)
 def _float64(engine: Engine) -> Array:
     """A zero in float64, or in the widest dtype that the engine is set to."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # jax says that it is not set to float64.
+        warnings.simplefilter("ignore")  # jax warns that float64 is disabled.
         return engine.namespace.zeros((), dtype=engine.namespace.float64)
 
 
@@ -412,24 +412,24 @@ def _imported() -> list[Engine]:
     """The engines whose framework has been imported."""
     if not _names:
         _names.extend(registry.plugins("rts.engines"))
-    found = []
+    engines = []
     for name in _names:
         if sys.modules.get(name) is not None and name not in _BROKEN:
             if name not in _ENGINES:
                 try:
                     engine_named(name)
-                except PluginError:  # It is an error where arrays of this engine are given.
+                except PluginError:  # Reported once arrays of this engine are given.
                     _BROKEN.add(name)
                     continue
-            found.append(_ENGINES[name])
-    return found
+            engines.append(_ENGINES[name])
+    return engines
 
 
 def uncompiled(f: _F) -> _F:
-    """A function like `f` that compilers of Python code, such as `torch.compile`, call without looking into it.
+    """A function like `f` that compilers of Python code, such as `torch.compile`, call without tracing it.
 
-    They would follow it through checks, caches and plugins for most of a minute, and would see little of the work,
-    which is compiled already.
+    Tracing would follow checks, caches and plugins for most of a minute, and gain little: the work is compiled
+    already.
     """
 
     @functools.wraps(f)
@@ -439,11 +439,11 @@ def uncompiled(f: _F) -> _F:
             outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 
-    return call  # pyright: ignore[reportReturnType]  # A wrapper stands for what it wraps.
+    return call  # pyright: ignore[reportReturnType]  # The wrapper has the type of `f`.
 
 
 def is_traced(x: Array) -> bool:
-    """Whether an array has a shape but not yet a value."""
+    """True for an array that has a shape but not yet a value."""
     return engine_of(x).traced(x)
 
 
@@ -458,28 +458,28 @@ def value_of(x: Array) -> np.ndarray | None:
 
 
 def exemplar(*trees: Tree) -> Array | None:
-    """The widest floating array of an engine other than NumPy, which sets dtype and device for constants, or None."""
+    """The widest floating array of another engine than NumPy, or None. It sets dtype and device of constants."""
     return _widest(collected(trees))
 
 
-def _widest(found: Sequence[Any]) -> Array | None:
+def _widest(arrays: Sequence[Any]) -> Array | None:
     widest, bits = None, 0
-    for x in found:
+    for x in arrays:
         if isinstance(x, CONSTANT_TYPES):
             continue
-        own = floating_bits(x)
-        if own > bits:
-            widest, bits = x, own
+        width = floating_bits(x)
+        if width > bits:
+            widest, bits = x, width
     return widest
 
 
 def floating_bits(x: Array) -> int:
-    """How many bits the numbers of an array have, of real floating ones; 0 for others. It is known for each dtype."""
-    own = _BITS.get(x.dtype)
-    if own is None:
+    """Number of bits of a real floating dtype, of an array; 0 for other dtypes. Cached by dtype."""
+    bits = _BITS.get(x.dtype)
+    if bits is None:
         xp = namespace(x)
-        own = _BITS[x.dtype] = xp.finfo(x.dtype).bits if xp.isdtype(x.dtype, "real floating") else 0
-    return own
+        bits = _BITS[x.dtype] = xp.finfo(x.dtype).bits if xp.isdtype(x.dtype, "real floating") else 0
+    return bits
 
 
 def namespace(*arrays: Array) -> Any:
@@ -493,7 +493,7 @@ def namespace(*arrays: Array) -> Any:
 
 
 def stopped(tree: Tree) -> Tree:
-    """A copy of a tree whose arrays are without derivatives: what is made of it keeps no graph."""
+    """A copy of a tree without derivatives, so that results computed from it keep no graph."""
     if type(tree) is np.ndarray:
         return tree
     return map_leaves(lambda x: x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x), tree)

@@ -1,78 +1,78 @@
-"""How large the numbers of an array are, where the largest lie, and which indices name something."""
+"""Extreme values of an array, their positions, and the non-negative indices among integers."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts.threads import parallel, read_only
+from rts.compiling.threads import parallel, read_only
 
 
 def largest(x: np.ndarray) -> float:
-    """The largest size of a number in an array of floats; 0 for none, NaN where any is NaN."""
+    """The largest absolute value in an array of floats; 0 if it is empty, NaN if any value is NaN."""
     from rts.arrays import extremes_loops
 
     if x.dtype != np.float32:
         return float(max(x.max(initial=0), -x.min(initial=0)))
     bits = read_only(x).reshape(-1).view(np.int32)
-    found = np.zeros(max(1, -(-bits.size // extremes_loops.CHUNK)), np.int32)
-    parallel(extremes_loops.find, len(found), bits, found, work=bits.size // 12)
-    return float(found.max().view(np.float32))
+    maxima = np.zeros(max(1, -(-bits.size // extremes_loops.CHUNK)), np.int32)
+    parallel(extremes_loops.find, len(maxima), bits, maxima, work=bits.size // 12)
+    return float(maxima.max().view(np.float32))
 
 
 def extent(x: np.ndarray) -> tuple[int, int]:
-    """The least and the largest of an array of integers that is not empty."""
+    """The least and the largest number in a non-empty array of integers."""
     if x.dtype != np.int32:
         return int(x.min()), int(x.max())
     return _ends(x, np.empty(0, np.bool_))
 
 
 def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Where an array of indices is not negative, bool; and the least and the largest of them, and −1."""
+    """A bool mask of the non-negative indices, and the least and the largest of all indices and −1."""
     if not x.size:
         return np.zeros(x.shape, np.bool_), -1, -1
     if x.dtype == np.int32:
-        there = np.empty(x.shape, np.bool_)
-        least, most = _ends(x, there)
+        mask = np.empty(x.shape, np.bool_)
+        least, most = _ends(x, mask)
     else:
-        there, (least, most) = x >= 0, extent(x)
-    return there, min(least, -1), max(most, -1)
+        mask, (least, most) = x >= 0, extent(x)
+    return mask, min(least, -1), max(most, -1)
 
 
-def _ends(x: np.ndarray, there: np.ndarray) -> tuple[int, int]:
-    """The least and the largest of int32; `there`, of their shape or empty, is filled with which are not negative."""
+def _ends(x: np.ndarray, mask: np.ndarray) -> tuple[int, int]:
+    """The least and the largest of int32. `mask`, of the same shape or empty, is set where they are not negative."""
     from rts.arrays import extremes_loops
 
     numbers = read_only(x).reshape(-1)
-    found = np.empty((-(-numbers.size // extremes_loops.CHUNK), 2), np.int32)
-    parallel(extremes_loops.ends, len(found), numbers, found, there.reshape(-1), work=numbers.size // 8)
-    return int(found[:, 0].min()), int(found[:, 1].max())
+    bounds = np.empty((-(-numbers.size // extremes_loops.CHUNK), 2), np.int32)
+    parallel(extremes_loops.ends, len(bounds), numbers, bounds, mask.reshape(-1), work=numbers.size // 8)
+    return int(bounds[:, 0].min()), int(bounds[:, 1].max())
 
 
 def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
-    """Where the least and the largest covered number first stand: of those that are below, and above, zero."""
+    """Indices of the first covered minimum, if below zero, and of the first covered maximum, if above zero."""
     if x.dtype != np.float32:
         sizes = np.where(covered, x, 0).reshape(1, -1)
-        found, length = np.concatenate([-sizes, sizes]).max(axis=1, initial=0)[None], x.size
+        extremes, length = np.concatenate([-sizes, sizes]).max(axis=1, initial=0)[None], x.size
     else:
         from rts.arrays.extremes_loops import CHUNK as length
 
-        found = _sizes(x, covered).view(np.float32)
-    numbers, there = x.reshape(-1), covered.reshape(-1)
+        extremes = _sizes(x, covered).view(np.float32)
+    numbers, mask = x.reshape(-1), covered.reshape(-1)
     flat = []
-    for sign, sizes in zip((-1, 1), found.T, strict=True):
+    for sign, sizes in zip((-1, 1), extremes.T, strict=True):
         if size := sizes.max():
             first = int(sizes.argmax()) * length
             chunk = slice(first, first + length)
-            flat.append(first + int(((numbers[chunk] == sign * size) & there[chunk]).argmax()))
+            flat.append(first + int(((numbers[chunk] == sign * size) & mask[chunk]).argmax()))
     return list(zip(*(i.tolist() for i in np.unravel_index(np.array(flat, np.int64), x.shape)), strict=True))
 
 
 def _sizes(x: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """How far numbers (float32) of each chunk are below and above zero at most, as bits (·, 2) int32."""
+    """Largest distances below and above zero in each chunk of covered float32 numbers, as bits (·, 2) int32."""
     from rts.arrays import extremes_loops
 
     bits = read_only(x).reshape(-1).view(np.int32)
-    found = np.zeros((max(1, -(-bits.size // extremes_loops.CHUNK)), 2), np.int32)
-    given = bits, read_only(covered).reshape(-1), found
-    parallel(extremes_loops.bounds, len(found), *given, work=bits.size // 12)
-    return found
+    sizes = np.zeros((max(1, -(-bits.size // extremes_loops.CHUNK)), 2), np.int32)
+    arguments = bits, read_only(covered).reshape(-1), sizes
+    parallel(extremes_loops.bounds, len(sizes), *arguments, work=bits.size // 12)
+    return sizes

@@ -1,4 +1,4 @@
-"""Trees of arrays: nested dicts, lists, tuples and records; their leaves, and what makes a class a record."""
+"""Trees of arrays: nested dicts, lists, tuples and records; their leaves, and the decorator of records."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ _Class = TypeVar("_Class", bound=type)
 
 
 STATIC_FIELDS: dict[type, tuple[str, ...]] = {}
-"""The records that are pytrees, each with the names of its fields that are not arrays (engines register them)."""
+"""The record classes, which engines register as pytrees, each with the names of its fields that are not arrays."""
 
 _ARRAY_FIELDS: dict[type, tuple[str, ...]] = {}
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
 def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
-    """Make a class a frozen dataclass that every engine knows as a pytree, to be an argument of its transforms.
+    """Make a class a frozen dataclass, and a pytree of every engine, so that transforms take it as an argument.
 
     Args:
         static: the fields that are not arrays; jax compares them to decide whether to compile anew.
     """
 
     def decorate(cls: _Class) -> _Class:
-        made = dataclass(frozen=True, eq=False)(cls)
-        STATIC_FIELDS[made] = static
-        _ARRAY_FIELDS[made] = tuple(f.name for f in fields(made) if f.name not in static)
-        return made
+        decorated = dataclass(frozen=True, eq=False)(cls)
+        STATIC_FIELDS[decorated] = static
+        _ARRAY_FIELDS[decorated] = tuple(f.name for f in fields(decorated) if f.name not in static)
+        return decorated
 
     return decorate
 
 
 def record_arrays(value: Any) -> list[Any]:
     """A record's array fields in order of declaration."""
-    found = value.__dict__
-    return [found[name] for name in _ARRAY_FIELDS[type(value)]]
+    values = value.__dict__
+    return [values[name] for name in _ARRAY_FIELDS[type(value)]]
 
 
 def split_record(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
     """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
-    found = value.__dict__
-    return record_arrays(value), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
+    values = value.__dict__
+    return record_arrays(value), tuple([values[name] for name in STATIC_FIELDS[type(value)]])
 
 
 def join_record(cls: type, arrays: Iterable[Any], static: tuple[Any, ...]) -> Any:
@@ -68,25 +68,25 @@ def leaves(tree: Tree) -> Iterator[Any]:
 
 
 def collected(tree: Tree) -> list[Any]:
-    """`leaves` as a list. One loop, since it is called dozens of times a render."""
-    found, rest = [], [tree]
+    """`leaves` as a list. One loop for speed: every render calls it dozens of times."""
+    arrays, rest = [], [tree]
     while rest:
         x = rest.pop()
         kind = _KINDS.get(type(x)) or _kind(x)
         if kind == _LEAF:
-            found.append(x)
+            arrays.append(x)
         elif kind == _RECORD:
             rest.extend(record_arrays(x)[::-1])
         elif kind == _SEQUENCE:
             rest.extend(x[::-1])
         elif kind == _MAPPING:
             rest.extend([x[key] for key in sorted(x, reverse=True)])
-    return found
+    return arrays
 
 
 _LEAF, _NOTHING, _RECORD, _SEQUENCE, _MAPPING = range(1, 6)
 _KINDS: dict[type, int] = {}
-"""Which of these kinds trees of a type are."""
+"""The kind of each type of tree met so far."""
 
 
 def _kind(tree: Tree) -> int:
@@ -105,7 +105,7 @@ def _kind(tree: Tree) -> int:
 
 
 def placed_leaves(tree: Tree, place: tuple = ()) -> Iterator[tuple[tuple, Any]]:
-    """The leaves in the order of `leaves`, each with the keys, indices and names of fields that lead to it."""
+    """The leaves in the order of `leaves`, each with its path: keys, indices and names of fields."""
     kind = _KINDS.get(type(tree)) or _kind(tree)
     if kind == _LEAF:
         yield place, tree
@@ -139,5 +139,5 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
 
 
 def is_named(tree: Tree) -> bool:
-    """Whether a sequence is a named tuple."""
+    """True for a named tuple."""
     return hasattr(tree, "_fields")

@@ -1,4 +1,4 @@
-"""Where a scene is, and a camera that sees all of it."""
+"""The bounding sphere of a scene, and a camera that sees all of it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 ROUGHLY = 16
-"""Cuts along each side of a patch, to see how large a surface is."""
+"""Number of cuts along each side of a patch, for a rough mesh that shows a surface's extent."""
 MARGIN = 1.05
-"""Radius of what the default view shows, over the radius of the object."""
+"""Radius of the default view over the radius of the object."""
 
 FARTHEST = 1e9
 """Distance of a camera over the radius of the object beyond which float32 cannot tell the object from a point."""
@@ -26,7 +26,7 @@ class Bounds(NamedTuple):
 
     Attributes:
         center: (3,) middle of the bounding box.
-        radius: largest distance of a vertex from it.
+        radius: largest distance of a vertex from the centre.
     """
 
     center: np.ndarray
@@ -34,7 +34,7 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(parts: Sequence[Part]) -> Bounds:
-    """The bounding sphere of parts of NumPy arrays, of whose surfaces a mesh can be made."""
+    """The bounding sphere of parts of NumPy arrays, whose surfaces can become meshes."""
     points = []
     for part in parts:
         vertices = np.asarray(part.surface.tessellate(part.theta, ROUGHLY)[0], np.float64)
@@ -72,15 +72,15 @@ def orbit(
     Args:
         bounds: the object.
         size: (height, width) of the image.
-        azimuth: degrees about the upright axis; 0 looks from +z (from −y where z is up), 90 from +x.
+        azimuth: degrees about the upright axis; 0 looks from +z (from −y if z is up), 90 from +x.
         elevation: degrees above the horizon, −90 to 90.
         distance: the camera's distance from the centre; by default the whole object is seen.
         fov: vertical field of view, degrees.
-        up: "y" or "z", the axis that is upright.
+        up: "y" or "z", the upright axis.
 
     Raises:
         InputError: `up` is another axis; an angle is not finite or out of its range; the distance is not positive, or
-            more than a milliard times the radius of the object, or less than a milliardth.
+            more than 10⁹ times the radius of the object, or less than 10⁻⁹ times.
     """
     if up not in ("y", "z"):
         raise InputError(f'up is {up!r}; expected "y" or "z"')

@@ -63,31 +63,31 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
     floor = ground(float(bounds.center[1] - 1.02 * bounds.radius))
     camera = orbit(bounds._replace(radius=1.25 * bounds.radius), SIZE, 28, 24)
     true = np.asarray(rigid(np.array([*TRUE_ROTATION, *TRUE_TRANSLATION]), bounds.center))
-    # One layer, splatted as the fit does: two would widen the outline, as the knot's back faces are not culled.
+    # One layer, as in the fit: two would widen the outline, since back faces of the knot are not culled.
     target = silhouette_of(render(posed(model, true, "silhouette"), camera, SIZE, splatter="single", layers=1))
-    found = fit_pose(model, target, camera, bounds, engine=engine, progress=progress)
-    verdict = judged(found.pose, model, target)
-    files = write_report(folder, found, verdict, model, target, scenery=[floor])
+    result = fit_pose(model, target, camera, bounds, engine=engine, progress=progress)
+    verdict = judged(result.pose, model, target)
+    files = write_report(folder, result, verdict, model, target, scenery=[floor])
     errors = {
-        "rotation_error_degrees": {"start": _degrees(np.eye(4), true), "end": _degrees(found.pose.matrix, true)},
+        "rotation_error_degrees": {"start": _degrees(np.eye(4), true), "end": _degrees(result.pose.matrix, true)},
         "translation_error_over_radius": {
             "start": float(np.linalg.norm(TRUE_TRANSLATION) / bounds.radius),
-            "end": float(np.linalg.norm(found.translation - TRUE_TRANSLATION) / bounds.radius),
+            "end": float(np.linalg.norm(result.translation - TRUE_TRANSLATION) / bounds.radius),
         },
     }
     summary: dict[str, Any] = {
         **errors,
-        "loss": {"start": found.first_loss, "end": found.loss},
-        "iou": {"start": judged(found.start, model, target).iou, "end": verdict.iou},
-        "steps": len(found.history),
-        "seconds": found.seconds,
+        "loss": {"start": result.first_loss, "end": result.loss},
+        "iou": {"start": judged(result.start, model, target).iou, "end": verdict.iou},
+        "steps": len(result.history),
+        "seconds": result.seconds,
         "triangles": len(model[0].surface.faces),
         "pixels": list(shrunk(target, 256).shape),
     }
     with writing(folder / "summary.json"):
         (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         (folder / "summary.md").write_text(_markdown(summary, files))
-    return found, [*files, folder / "summary.json", folder / "summary.md"]
+    return result, [*files, folder / "summary.json", folder / "summary.md"]
 
 
 def _markdown(summary: dict[str, Any], files: list[Path]) -> str:

@@ -32,7 +32,7 @@ Examples:
 """
 
 
-# The base of BadParameter is click's UsageError, under whatever name typer has click.
+# The base of BadParameter is click's UsageError, wherever typer keeps click.
 UsageError: Any = typer.BadParameter.__base__
 
 
@@ -101,7 +101,7 @@ def _one_line(ctx: Any) -> Iterator[None]:
         command = error.ctx.info_name if error.ctx is not None and error.ctx.parent else ctx.invoked_subcommand
         help_ = " ".join(filter(None, ("rts", command, "--help")))
         _fail(error, f"{error.format_message().rstrip('.')}; try '{help_}'", 2)
-    except BrokenPipeError:  # The reader of our output has gone; click knows what to do.
+    except BrokenPipeError:  # The reader of the output has closed it; click handles that.
         raise
     except (RtsError, OSError, MemoryError) as error:
         if ctx.params.get("debug"):
@@ -126,7 +126,7 @@ def _warnings_in_a_line() -> Iterator[None]:
 
 
 def _line(text: str) -> str:
-    """The text in one line, without what would command the terminal: it may quote a file from elsewhere."""
+    """The text in one line. Control characters, which a quoted file may contain, are escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
@@ -146,7 +146,7 @@ app = typer.Typer(
 
 def main() -> None:
     """The entry point `rts`."""
-    # Idle threads of OpenMP, which torch and numba both use, would spin and take the processor from others.
+    # Idle OpenMP threads of torch and numba would spin, and take the processor from others.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     app(prog_name="rts")
 
@@ -179,7 +179,7 @@ def _supersample(text: str) -> Any:
 
 
 def _view(text: str) -> tuple[float, ...]:
-    """Azimuth, elevation and perhaps distance."""
+    """Azimuth, elevation and optional distance, from comma-separated numbers."""
     try:
         numbers = tuple(float(x) for x in text.split(","))
     except ValueError:
@@ -190,7 +190,7 @@ def _view(text: str) -> tuple[float, ...]:
 
 
 def _background(text: str) -> tuple[float, ...] | None:
-    """A linear colour, or None for transparent."""
+    """The linear colour of a colour's name; None for transparent."""
     from PIL import ImageColor
 
     from rts.files.srgb import decode_srgb
@@ -204,7 +204,7 @@ def _background(text: str) -> tuple[float, ...] | None:
 
 
 def _given(context: typer.Context, option: str) -> bool:
-    """Whether an option was given, and is not its default."""
+    """True if an option was given, and not left at its default."""
     source = context.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
 
@@ -260,11 +260,20 @@ def plugins(
             "(for triangles; else finite and not empty), and its gradient is finite and not zero.",
         ),
     ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="With --matrix: a surface, sampler or engine to try; may be repeated.", show_default=False),
+    ] = None,
 ) -> None:
     """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
-    from rts.cli.plugin_tables import matrix_table, plugin_table
+    from rts.cli.plugin_tables import plugin_table, print_matrix
 
-    Console().print(matrix_table() if matrix else plugin_table())
+    if matrix:
+        print_matrix(Console(), only or ())
+    elif only:
+        raise typer.BadParameter("goes with --matrix", param_hint="--only")
+    else:
+        Console().print(plugin_table())
 
 
 @app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")
@@ -395,16 +404,16 @@ def fit_pose(
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
     chosen = None if engine == "auto" else engine
     options: dict[str, Any] = {"method": method, "steps": steps, "fit_fov": fit_fov, "loss": loss, "f_scale": f_scale}
-    found = fit(parts, mask, seen, bounds, engine=chosen, **options)
-    verdict = judged(found.pose, parts, mask, picture, robust=loss != "linear")
-    files = write_report(output, found, verdict, parts, mask)
+    result = fit(parts, mask, seen, bounds, engine=chosen, **options)
+    verdict = judged(result.pose, parts, mask, picture, robust=loss != "linear")
+    files = write_report(output, result, verdict, parts, mask)
     _say(
-        f"loss {found.first_loss:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "
-        f"coarse and blurred pixels to fine, {found.seconds:.1f} s (at the finest, {found.reason}); wrote"
+        f"loss {result.first_loss:.3g} → {result.loss:.3g} in {len(result.history)} steps, {_sum(result.levels)} from "
+        f"coarse and blurred pixels to fine, {result.seconds:.1f} s (at the finest, {result.reason}); wrote"
     )
     _say_written(files)
     _say_skipped_plot(files)
-    seen_by = f", field of view {found.pose.fov_y:.1f} degrees" if fit_fov else ""
+    seen_by = f", field of view {result.pose.fov_y:.1f} degrees" if fit_fov else ""
     _say(f"{verdict.word}: IoU {verdict.iou:.3f}{seen_by}")
     for note in verdict.notes:
         _say(escape(f"  {note}"))
@@ -437,16 +446,19 @@ def export(
 
 @app.command(epilog="Example: rts new surface blob && pip install -e 'rts-blob[test]' && pytest rts-blob")
 def new(
-    kind: Annotated[str, typer.Argument(help="surface", show_default=False)],
+    kind: Annotated[str, typer.Argument(help="surface, sampler, shader or splatter", show_default=False)],
     name: Annotated[str, typer.Argument(help="The plugin's name.", show_default=False)],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder to make; rts-NAME by default.", show_default=False)
     ] = None,
+    triangles: Annotated[
+        bool, typer.Option("--triangles", help="A surface that is sampled by triangles; else by rays.")
+    ] = False,
 ) -> None:
     """Write a distribution that adds a plugin: its entry point, its class, and a test that passes as it is."""
     from rts.cli.new_plugin import write_plugin
 
-    files = write_plugin(kind, name, output)
+    files = write_plugin(kind, name, output, triangles)
     _say("wrote")
     _say_written(files)
 
@@ -461,8 +473,8 @@ def demo(
     from rts.files.paths import output_folder
 
     output_folder(output)
-    found, files = run(output, None if engine == "auto" else engine)
-    _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
+    result, files = run(output, None if engine == "auto" else engine)
+    _say(f"pose found in {len(result.history)} steps, {result.seconds:.1f} s; wrote")
     _say_written(files)
     _say_skipped_plot(files)
 
@@ -471,7 +483,7 @@ def demo(
 def warmup(
     processes: Annotated[int, typer.Option(min=0, help="Processes at once; 0 is as many as there are cores.")] = 0,
 ) -> None:
-    """Compile ahead what ordinary renders and fits use, in several processes; else it is compiled when first used."""
+    """Compile ahead the loops of ordinary renders and fits, in several processes. Otherwise first use compiles them."""
     import rts
 
     _say("compiling what is not on disk yet, up to a minute")

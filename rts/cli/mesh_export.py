@@ -18,9 +18,9 @@ def write_mesh(path: Path, parts: Sequence[Part], tolerance: float) -> tuple[int
     """Write a mesh of parts of NumPy arrays, in the coordinates of their scene.
 
     Args:
-        path: a name with one of these extensions; folders that do not exist are made.
+        path: a name with an extension of `FORMATS`; missing folders are made.
         parts: the parts.
-        tolerance: how far triangles may be off the surface, in the units of the scene.
+        tolerance: largest distance of triangles from the surface, in the units of the scene.
 
     Returns:
         The numbers of vertices and triangles.

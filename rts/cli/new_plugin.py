@@ -13,42 +13,47 @@ from rts import __version__, registry
 from rts.errors import InputError
 from rts.files.paths import output_folder, writing
 
-KINDS = ("surface",)
-"""What there are templates of."""
+KINDS = ("surface", "sampler", "shader", "splatter")
+"""The kinds of plugins that there are templates of."""
+TRIANGLES = "surface_of_triangles"
+"""The folder of templates of a surface that is sampled by triangles."""
 PLACES = {
-    "pyproject.toml.in": "pyproject.toml",
-    "README.md.in": "README.md",
-    "__init__.py.in": "{package}/__init__.py",
-    "surface.py.in": "{package}/surface.py",
-    "test_surface.py.in": "tests/test_{module}.py",
+    "common/pyproject.toml.in": "pyproject.toml",
+    "{template}/README.md.in": "README.md",
+    "common/__init__.py.in": "{package}/__init__.py",
+    "{template}/plugin.py.in": "{package}/{kind}.py",
+    "{template}/test_plugin.py.in": "tests/test_{module}.py",
 }
-"""Template → the file that it becomes, within the new folder."""
+"""Template → file in the new folder."""
 
 
-def write_plugin(kind: str, name: str, folder: Any = None) -> list[Path]:
+def write_plugin(kind: str, name: str, folder: Any = None, triangles: bool = False) -> list[Path]:
     """Write a distribution that adds a plugin; its test passes as it is.
 
     Args:
         kind: one of `KINDS`.
         name: the plugin's, such as "height-field".
         folder: where to; by default "rts-" and the name, in the current folder.
+        triangles: whether a surface is to be sampled by triangles, in place of rays.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: there is no such kind; the name is no good, or taken; the folder exists or cannot be written.
+        InputError: there is no such kind; the name is invalid or taken; the folder exists or cannot be written.
     """
     if kind not in KINDS:
         raise InputError(f"no template of {kind!r}; there is {', '.join(KINDS)}")
-    names = _names(name)
+    if triangles and kind != "surface":
+        raise InputError(f"a {kind} is not made of triangles; expected 'surface'")
+    names = {**_names(kind, name), "template": TRIANGLES if triangles else kind}
     folder = Path(names["distribution"]) if folder is None else Path(folder)
     output_folder(folder)
     if folder.exists():
         raise InputError(f"{folder} exists; expected the name of a new folder")
     written = []
     for template, place in PLACES.items():
-        text = (files("rts.cli") / "templates" / kind / template).read_text(encoding="utf-8")
+        text = (files("rts.cli") / "templates" / template.format(**names)).read_text(encoding="utf-8")
         path = folder / place.format(**names)
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,18 +62,21 @@ def write_plugin(kind: str, name: str, folder: Any = None) -> list[Path]:
     return written
 
 
-def _names(name: str) -> dict[str, str]:
-    """What the templates ask for, of a plugin's name."""
+def _names(kind: str, name: str) -> dict[str, str]:
+    """The values that templates ask for, of a plugin's kind and name."""
     module = name.replace("-", "_")
     if not re.fullmatch(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise InputError(
             f"{name!r} is no name for a plugin; expected small letters, digits, and - or _ between them, beginning "
             f"with a letter, and no word of Python's"
         )
-    if name in registry.plugins("rts.surfaces"):
-        raise InputError(f"there is a surface {name!r} already; choose another name")
+    group = f"{kind}s"
+    if name in registry.plugins(f"rts.{group}"):
+        raise InputError(f"there is a {kind} {name!r} already; choose another name")
     major, minor = map(int, __version__.split(".")[:2])
     return {
+        "kind": kind,
+        "group": group,
         "name": name,
         "module": module,
         "distribution": f"rts-{name.replace('_', '-')}",

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from rich.box import SQUARE
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
@@ -14,11 +18,11 @@ OK = (
     f"its pixels are more than {DIFFERING:g} off those of the sampler 'reference'; and its gradient in theta, "
     f"where the engine has derivatives, is finite and not zero"
 )
-"""What the matrix says of a pair that works, and all that it says."""
+"""Caption of the matrix: the exact meaning of "ok"."""
 
 
 def plugin_table() -> Table:
-    """Every plugin, whether it loads, and what it can do."""
+    """A table of all plugins, with their state and capabilities."""
     columns = (Column(name, no_wrap=True) for name in ("group", "name"))
     table = Table(*columns, "from", Column("state", overflow="fold"), Column("can", overflow="fold"))
     for info in registry.survey():
@@ -36,12 +40,28 @@ def _state(info: registry.PluginInfo) -> str:
     return "[green]ready[/]"
 
 
-def matrix_table() -> Table:
-    """Every surface with every sampler, tried in every engine."""
+def print_matrix(console: Console, only: Sequence[str] = ()) -> None:
+    """Print every surface with every sampler, tried in every engine: a row as soon as it is known.
+
+    Args:
+        console: where to; it is flushed after each row.
+        only: names of surfaces, samplers and engines to try.
+    """
     engines = registry.plugins("rts.engines")
-    table = Table("surface", "sampler", *engines, Column("why not", overflow="fold"), caption=OK)
-    for pair in pairs():
-        cells = ["[green]ok[/]" if pair.problems[e] is None else "[red]no[/]" for e in engines]
+    engines, rows = [e for e in engines if e in only] or engines, pairs(only)
+    first = [("surface", *registry.plugins("rts.surfaces")), ("sampler", *registry.plugins("rts.samplers"))]
+    widths = [max(map(len, names)) for names in first] + [max(len(e), 2) for e in engines]
+
+    def show(*cells: str) -> None:
+        columns = (Column(width=width, no_wrap=True) for width in widths)
+        row = Table(*columns, Column(overflow="fold"), show_header=False, show_edge=False, box=SQUARE)
+        row.add_row(*cells)
+        console.print(row)
+        console.file.flush()  # What is piped waits for its buffer to be full.
+
+    show("surface", "sampler", *engines, "why not")
+    for pair in rows:
+        marks = ["[green]ok[/]" if pair.problems[e] is None else "[red]no[/]" for e in engines]
         reasons = dict.fromkeys(p for p in pair.problems.values() if p is not None)
-        table.add_row(pair.surface, pair.sampler, *cells, escape("\n".join(reasons)))
-    return table
+        show(pair.surface, pair.sampler, *marks, escape("\n".join(reasons)))
+    console.print(OK)

@@ -1,4 +1,4 @@
-"""A pose with the camera that sees it, as `rts fit-pose` writes it and `rts render --pose` reads it."""
+"""The file of a pose and its camera, which `rts fit-pose` writes and `rts render --pose` reads."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from rts.scene.parts import Part
 
 
 class Pose(NamedTuple):
-    """Where a model is, and how it is seen.
+    """The pose of a model, and the camera that sees it.
 
     Attributes:
         matrix: (4, 4) world from the model as loaded.
-        camera: the camera, whose ratio of width to height is known.
+        camera: the camera, with its ratio of width to height.
         size: (height, width) of its image, pixels.
     """
 
@@ -37,7 +37,7 @@ class Pose(NamedTuple):
         return math.degrees(2 * math.atan(1 / self.camera.projection[1, 1]))
 
     def numbers(self) -> dict[str, Any]:
-        """What a pose is in JSON."""
+        """The entries of a pose in JSON."""
         view, projection = self.camera
         return {
             "matrix": self.matrix.tolist(),
@@ -51,41 +51,41 @@ def read_pose(path: Any) -> Pose:
     """The pose in a file of JSON with a `matrix`, a `size`, and a `camera` of `view` and `projection`.
 
     Raises:
-        InputError: there is no such file, it is not JSON, or an entry is missing or makes no pose.
+        InputError: there is no such file, it is not JSON, or an entry is missing or wrong.
     """
     path = as_path(path)
     if not path.is_file():
         raise InputError(f"no file {path}; expected the pose.json that `rts fit-pose` writes")
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        entries = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read as JSON ({' '.join(str(error).split())[:80]})") from error
     try:
-        return _pose(found)
+        return _pose(entries)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _pose(found: Any) -> Pose:
-    camera = _entry(found, "camera")
-    matrices = {"matrix": _entry(found, "matrix")}
+def _pose(entries: Any) -> Pose:
+    camera = _entry(entries, "camera")
+    matrices = {"matrix": _entry(entries, "matrix")}
     matrices |= {name: _entry(camera, name) for name in ("view", "projection")}
     for name, matrix in matrices.items():
-        known = check_numbers(name, matrix, (4, 4))
-        if known is None or not is_invertible(known):
+        values = check_numbers(name, matrix, (4, 4))
+        if values is None or not is_invertible(values):
             raise InputError(f"{name} is singular; expected an invertible matrix")
-        matrices[name] = np.asarray(known, np.float64)
-    size = check_pixels(_entry(found, "size"))
+        matrices[name] = np.asarray(values, np.float64)
+    size = check_pixels(_entry(entries, "size"))
     aspect = camera.get("aspect")
     if aspect is not None:
         check_numbers("aspect", aspect, ())
     return Pose(matrices["matrix"], Camera(matrices["view"], matrices["projection"], aspect), size)
 
 
-def _entry(found: Any, name: str) -> Any:
-    if not isinstance(found, dict) or name not in found:
+def _entry(entries: Any, name: str) -> Any:
+    if not isinstance(entries, dict) or name not in entries:
         raise InputError(f"there is no entry {name!r}; expected the pose.json that `rts fit-pose` writes")
-    return found[name]
+    return entries[name]
 
 
 def posed(parts: Sequence[Part], transform: Array, shader: Any = None) -> list[Part]:

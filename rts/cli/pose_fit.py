@@ -22,7 +22,7 @@ from rts.scene.parts import Part
 from rts.scene.rigid import rigid
 
 LARGEST_SIDE = 256
-"""Pixels of the longer side of the image that is fitted."""
+"""Number of pixels of the longer side of the fitted image."""
 
 
 class PoseFit(NamedTuple):
@@ -32,14 +32,14 @@ class PoseFit(NamedTuple):
         rotation: (3,) axis times angle, radians, about `center`.
         translation: (3,) world units.
         center: (3,) world.
-        trail: the best pose so far, at each step; the last is the pose found.
+        trail: the best pose so far, at each step; the last is the result.
         history: the loss at each step: mean square of the difference of silhouettes, or a robust loss of it, at that
             step's resolution and blur.
-        levels: how many steps were made at each stage, from coarse to fine.
+        levels: the number of steps at each stage, from coarse to fine.
         start: the model as loaded, seen by the camera given.
         first_loss: the loss of the start at full resolution.
         loss: the lowest loss at full resolution.
-        reason: why it stopped there.
+        reason: the reason why the last stage stopped.
         seconds: wall time.
     """
 
@@ -57,7 +57,7 @@ class PoseFit(NamedTuple):
 
     @property
     def pose(self) -> Pose:
-        """The pose found, and its camera."""
+        """The recovered pose, and its camera."""
         return self.trail[-1]
 
 
@@ -75,7 +75,7 @@ def silhouette_of(image: np.ndarray) -> np.ndarray:
     """(H, W) float32 in [0, 1] of a picture (H, W, 4): its alpha, or its luminance where it is opaque.
 
     Raises:
-        InputError: nothing, or everything, is inside.
+        InputError: no pixel, or every pixel, is inside.
     """
     alpha = image[..., 3]
     mask = alpha if (alpha < 1).any() else image[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -107,7 +107,7 @@ def fit_pose(
     f_scale: float | None = None,
     progress: bool | None = None,
 ) -> PoseFit:
-    """Turn and move a model until its silhouette is the target's, from coarse pixels to fine ones.
+    """Fit rotation and translation of a model to a target silhouette, from coarse pixels to fine ones.
 
     The field of view is fitted as the logarithm of the focal length over that of `camera`.
 
@@ -115,10 +115,10 @@ def fit_pose(
         parts: the model, NumPy arrays; its pose as loaded is the start.
         target: (H, W) silhouette.
         camera: the camera of the target, float64 NumPy and perspective, with its ratio of width to height.
-        bounds: those of the model; translations are fitted in units of its radius, so that they weigh like radians.
-        engine: "torch" or "jax"; default whichever is installed.
+        bounds: the bounds of the model; translations are fitted in units of its radius, to weigh like radians.
+        engine: "torch" or "jax"; by default the one installed.
         method: as in `rts.fit`.
-        steps: at most so many at each resolution; default that of `rts.fit`.
+        steps: the largest number of steps at each resolution; by default that of `rts.fit`.
         fit_fov: whether the camera's field of view is fitted, too.
         loss: as in `rts.ImageResiduals`.
         f_scale: as in `rts.ImageResiduals`.
@@ -126,10 +126,10 @@ def fit_pose(
     """
     chosen = _engine(engine or available_engine())
     weights = np.concatenate([np.repeat([1.0, bounds.radius], 3), np.ones(int(fit_fov))])
-    met: list[np.ndarray] = []
+    visited: list[np.ndarray] = []
 
     def note(step: int, unknowns: Array, loss: float) -> None:
-        met.append(chosen.to_numpy(unknowns).astype(np.float64) * weights)
+        visited.append(chosen.to_numpy(unknowns).astype(np.float64) * weights)
 
     residuals = _residuals(parts, camera, target, bounds, weights, chosen, loss=loss, f_scale=f_scale)
     start = chosen.constant(np.zeros(len(weights), np.float32))
@@ -143,11 +143,11 @@ def fit_pose(
         callback=note,
         progress=progress,
     )
-    found = chosen.to_numpy(result.parameters).astype(np.float64) * weights
-    trail = [_pose(unknowns, bounds, camera, target.shape) for unknowns in (*_best_so_far(met, result), found)]
+    solution = chosen.to_numpy(result.parameters).astype(np.float64) * weights
+    trail = [_pose(unknowns, bounds, camera, target.shape) for unknowns in (*_best_so_far(visited, result), solution)]
     return PoseFit(
-        found[:3],
-        found[3:6],
+        solution[:3],
+        solution[3:6],
         bounds.center,
         trail,
         result.history,
@@ -160,21 +160,21 @@ def fit_pose(
     )
 
 
-def _best_so_far(met: list[np.ndarray], result: Fit) -> list[np.ndarray]:
-    """The parameters with the lowest loss of each step and those before it at its stage.
+def _best_so_far(visited: list[np.ndarray], result: Fit) -> list[np.ndarray]:
+    """For each step, the parameters with the lowest loss so far at its stage.
 
-    Levenberg–Marquardt reports rejected trials too.
+    Levenberg–Marquardt reports rejected trials, too.
     """
-    found, first = [], 0
+    best, first = [], 0
     for count in result.stages:
         losses = result.history[first : first + count]
-        found += [met[first + min(range(k + 1), key=losses.__getitem__)] for k in range(count)]
+        best += [visited[first + min(range(k + 1), key=losses.__getitem__)] for k in range(count)]
         first += count
-    return found
+    return best
 
 
 def _engine(name: str) -> Engine:
-    """The engine of this name, which must have derivatives."""
+    """The engine of a name; it must have derivatives."""
     if name == "numpy":
         raise InputError("engine is 'numpy', which has no derivatives; expected torch or jax")
     return registry.plugin("rts.engines", name)()
@@ -201,7 +201,7 @@ def _pose(unknowns: np.ndarray, bounds: Bounds, camera: Camera, size: tuple[int,
 
 
 def _zoomed(camera: Camera, focal: Array) -> Camera:
-    """The camera with another focal length; (1,) the logarithm of how many times its own, or (0,) to leave it."""
+    """The camera with its focal length times exp(`focal`), for `focal` (1,); unchanged for (0,)."""
     if not len(focal):
         return camera
     xp = namespace(focal)

@@ -1,4 +1,4 @@
-"""A report of a pose that was fitted: numbers, pictures, an animation and the convergence."""
+"""The report on a fitted pose: numbers, pictures, an animation and the convergence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)
 
 def write_report(
     folder: Path,
-    found: PoseFit,
+    result: PoseFit,
     verdict: Verdict,
     parts: Sequence[Part],
     target: np.ndarray,
@@ -32,15 +32,15 @@ def write_report(
 ) -> list[Path]:
     """Write pose.json, pictures of the pose before and after, the target, an animation and the convergence.
 
-    The last, convergence.png, is only written where matplotlib is installed.
+    convergence.png is only written if matplotlib is installed.
 
     Args:
-        folder: where to; made if need be.
-        found: what `fit_pose` gave.
-        verdict: what to think of it.
+        folder: the folder for the files; made if missing.
+        result: the result of `fit_pose`.
+        verdict: the verdict on it.
         parts: the model.
         target: (H, W) silhouette.
-        scenery: parts that stand still, for the pictures.
+        scenery: further parts of the pictures, which do not move.
 
     Returns:
         The files written.
@@ -50,44 +50,44 @@ def write_report(
     """
     with writing(folder / "pose.json"):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "pose.json").write_text(json.dumps(_numbers(found) | verdict.numbers(), indent=2) + "\n")
+        (folder / "pose.json").write_text(json.dumps(_numbers(result) | verdict.numbers(), indent=2) + "\n")
     large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
 
     def picture(pose: Pose, mask: np.ndarray) -> np.ndarray:
         return _outlined([*posed(parts, pose.matrix), *scenery], pose.camera, mask)
 
-    save_image(folder / "before.png", picture(found.start, large))
-    save_image(folder / "after.png", picture(found.pose, large))
+    save_image(folder / "before.png", picture(result.start, large))
+    save_image(folder / "after.png", picture(result.pose, large))
     save_image(folder / "target.png", large)
-    moved = [found.trail[0]] + [b for a, b in zip(found.trail, found.trail[1:], strict=False) if _moved(a, b)]
+    moved = [result.trail[0]] + [b for a, b in zip(result.trail, result.trail[1:], strict=False) if _moved(a, b)]
     chosen = moved[:: -(-len(moved) // FRAMES)]
-    frames = [picture(p, small) for p in [chosen[0]] * 4 + chosen + [found.pose] * 10]
+    frames = [picture(p, small) for p in [chosen[0]] * 4 + chosen + [result.pose] * 10]
     save_animation(folder / "animation.gif", frames, fps=8)
     names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
-    return [folder / name for name in names] + _plot(folder / "convergence.png", found.history)
+    return [folder / name for name in names] + _plot(folder / "convergence.png", result.history)
 
 
-def _numbers(found: PoseFit) -> dict[str, Any]:
+def _numbers(result: PoseFit) -> dict[str, Any]:
     return {
-        "axis_angle": found.rotation.tolist(),
-        "translation": found.translation.tolist(),
-        "center": found.center.tolist(),
-        **found.pose.numbers(),
-        "loss": found.loss,
-        "iterations": len(found.history),
-        "seconds": found.seconds,
-        "reason": found.reason,
+        "axis_angle": result.rotation.tolist(),
+        "translation": result.translation.tolist(),
+        "center": result.center.tolist(),
+        **result.pose.numbers(),
+        "loss": result.loss,
+        "iterations": len(result.history),
+        "seconds": result.seconds,
+        "reason": result.reason,
     }
 
 
 def _moved(before: Pose, after: Pose) -> bool:
-    """Whether a step can be seen."""
+    """True if a step is visible."""
     changes = after.matrix - before.matrix, after.camera.projection - before.camera.projection
     return max(float(np.abs(c).max()) for c in changes) > 1e-4
 
 
 def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """The model in the scene, the outline of the target drawn over it."""
+    """A picture of the model in the scene, with the outline of the target drawn over it."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     paper = np.asarray(PAPER) + 0.6 * mask[..., None] * (np.asarray(MARKED) - PAPER)
@@ -98,7 +98,7 @@ def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.nda
 
 
 def _plot(path: Path, history: list[float]) -> list[Path]:
-    """The loss over the steps; nothing where matplotlib is not installed."""
+    """Plot the loss over the steps. Returns the file, or nothing if matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:

@@ -1,4 +1,4 @@
-"""What to think of a pose that was fitted: how well it covers the mask, and what about the mask is doubtful."""
+"""The verdict on a fitted pose: its overlap with the mask, and doubts about the mask."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from rts.rendering.image import render
 from rts.scene.parts import Part
 
 GOOD = 0.9
-"""Intersection over union from which on a fit is called good."""
+"""Least intersection over union of a good fit."""
 NEITHER = (0.01, 0.9)
-"""Linear brightness between that of a mask's outside and inside, noise of compression included."""
+"""Range of linear brightness that no mask has: neither outside nor inside, with noise of compression."""
 COLORED = 0.1
-"""Difference of linear channels from which on a pixel is coloured, as those of a mask are not."""
+"""Least difference of linear channels of a coloured pixel; masks have none."""
 PHOTO = 0.05
-"""Share of a picture's pixels that are as those of no mask, from which on it is taken for a photo."""
+"""Share of pixels unlike those of a mask, above which a picture counts as a photo."""
 
 
 class Verdict(NamedTuple):
-    """How good a pose is.
+    """The quality of a pose.
 
     Attributes:
-        iou: intersection over union of the model's silhouette and the mask, 0 to 1; pixels count as inside from 0.5 on.
-        notes: what is wrong, or doubtful, in sentences.
+        iou: intersection over union of the model's silhouette and the mask, 0 to 1; pixels are inside from 0.5 on.
+        notes: faults and doubts, in sentences.
     """
 
     iou: float
@@ -38,7 +38,7 @@ class Verdict(NamedTuple):
         return "good fit" if self.iou >= GOOD else "poor fit"
 
     def numbers(self) -> dict[str, Any]:
-        """What a verdict is in JSON."""
+        """The entries of a verdict in JSON."""
         return {"iou": self.iou, "verdict": self.word, "notes": self.notes}
 
 
@@ -48,11 +48,11 @@ def judged(
     """The verdict on a pose.
 
     Args:
-        pose: the pose that was found.
+        pose: the fitted pose.
         parts: the model as loaded, NumPy arrays.
         mask: (H, W) the silhouette that it was fitted to, in [0, 1].
-        picture: (H, W, 4) linear; the picture of which the mask was made.
-        robust: whether the loss was a robust one: a part of the mask may be missing, which the pose is right without.
+        picture: (H, W, 4) linear; the source of the mask.
+        robust: whether the loss was robust; the pose may then be right although a part of the mask is missing.
     """
     drawn = render(posed(parts, pose.matrix, "silhouette"), pose.camera, mask.shape, splatter="single", layers=1)
     iou = intersection_over_union(np.asarray(drawn)[..., 3], mask)
@@ -76,21 +76,21 @@ def judged(
 
 
 def intersection_over_union(a: np.ndarray, b: np.ndarray) -> float:
-    """Pixels inside both silhouettes (H, W) over those inside either; 1 where both are empty."""
+    """Number of pixels inside both silhouettes (H, W) over those inside either; 1 if both are empty."""
     one, other = a >= 0.5, b >= 0.5
     either = np.count_nonzero(one | other)
     return np.count_nonzero(one & other) / either if either else 1.0
 
 
 def touches_border(mask: np.ndarray) -> bool:
-    """Whether a silhouette (H, W) has inner pixels in its first or last row or column."""
+    """True if a silhouette (H, W) has inner pixels in its first or last row or column."""
     return bool(max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) >= 0.5)
 
 
 def unlike_a_mask(picture: np.ndarray) -> float:
-    """Share of the pixels of an opaque picture (H, W, 4), linear, that no mask has; 0 where there is transparency.
+    """Share of pixels of an opaque picture (H, W, 4), linear, that no mask has; 0 for a picture with transparency.
 
-    Such are coloured, or neither black nor white with all their neighbours, and so not an outline's.
+    Such pixels are coloured, or gray among gray neighbours, which excludes outlines.
     """
     from scipy.ndimage import minimum_filter
 

@@ -1,1 +1,1 @@
-"""What plugins implement: a base class for each kind, and the records that pass between them."""
+"""The interfaces of plugins: a base class for each kind, and the records that pass between them."""

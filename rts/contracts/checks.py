@@ -1,4 +1,4 @@
-"""Checks of what users and plugins give."""
+"""Checks of arguments that users give, and of results that plugins return."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from rts.scene.parts import Part
 
 @record(static=("surface", "shader", "cull"))
 class CheckedPart(Part):
-    """A part whose surface and shader are of their bases, as `rts.contracts.checks` makes it."""
+    """A part that passed the checks: its surface and its shader are objects of their base classes."""
 
     surface: Surface
     theta: Mapping[str, Tree]
@@ -39,17 +39,17 @@ class CheckedPart(Part):
 
     @functools.cached_property
     def uniform(self) -> bool:
-        """Whether its shader promises one colour."""
+        """True if the shader promises one colour for all samples."""
         return promised(self.shader, "uniform")
 
     @functools.cached_property
     def takes_views(self) -> bool:
-        """Whether its shader promises to take samples of several views."""
+        """True if the shader promises to take samples of several views in one call."""
         return promised(self.shader, "takes_views")
 
     @functools.cached_property
     def reads(self) -> tuple[str, ...] | None:
-        """The entries that its shader promises to do with, of the G-buffer and of θ; None for all."""
+        """Entries of the G-buffer and of θ that the shader promises to be content with; None for all."""
         return promised(self.shader, "reads")
 
 
@@ -69,10 +69,13 @@ MEMORY = _memory()
 
 
 def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[CheckedPart], Camera]:
-    """Checked parts, with shaders looked up and plain numbers made arrays; that all suit one engine is not checked."""
-    given: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
-    if not given or not all(isinstance(p, Part) for p in given):
-        kinds = ", ".join(sorted({type(p).__name__ for p in given})) or "nothing"
+    """Checked parts and camera. Shaders are looked up by name, and plain numbers become arrays.
+
+    Arrays of several engines are not detected here.
+    """
+    listed: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
+    if not listed or not all(isinstance(p, Part) for p in listed):
+        kinds = ", ".join(sorted({type(p).__name__ for p in listed})) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     if not isinstance(camera, Camera):
         several = isinstance(camera, (list, tuple)) and any(isinstance(c, Camera) for c in camera)
@@ -84,13 +87,13 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
             f"takes several, and camera.unstack() gives them one by one"
         )
     camera = _check_camera(camera)
-    checked = [_check_part(index, part) for index, part in enumerate(given)]
+    checked = [_check_part(index, part) for index, part in enumerate(listed)]
     check_channels(checked)
     return checked, camera
 
 
 def check_cameras(cameras: Any) -> list[Camera]:
-    """Checked cameras of several views, of a list or of what `Camera.stack` made."""
+    """Checked cameras of several views, from a list or from a stacked camera."""
     if isinstance(cameras, Camera):
         if not cameras.is_stacked:
             raise InputError("cameras is the camera of one view; expected several, or what Camera.stack made of them")
@@ -105,12 +108,12 @@ def check_cameras(cameras: Any) -> list[Camera]:
 
 
 def _check_camera(camera: Camera) -> Camera:
-    """The camera with arrays for matrices, turned to look along −z; values that are traced are checked later."""
+    """The camera with arrays for matrices, turned to look along −z. Traced values are checked later."""
     view, projection = (check_matrix(f"the camera's {n}", getattr(camera, n)) for n in ("view", "projection"))
     if view is not camera.view or projection is not camera.projection:
         camera = camera.replace(view=view, projection=projection)
-    known = projection[3, 2] if isinstance(projection, np.ndarray) else value_of(projection[3, 2])
-    return camera.turned() if known is not None and (known > 0).all() else camera
+    sign = projection[3, 2] if isinstance(projection, np.ndarray) else value_of(projection[3, 2])
+    return camera.turned() if sign is not None and (sign > 0).all() else camera
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
@@ -129,7 +132,7 @@ def _check_part(index: int, part: Part) -> CheckedPart:
 
 
 def check_channels(parts: Sequence[CheckedPart]) -> int:
-    """The number of channels besides alpha that the shaders of all parts give, refused where it is not one number."""
+    """The number of channels besides alpha, which must be the same for the shaders of all parts."""
     count = parts[0].shader.channels
     for index, part in enumerate(parts):
         if not is_count(part.shader.channels):
@@ -146,7 +149,7 @@ def check_channels(parts: Sequence[CheckedPart]) -> int:
 
 
 def check_colors(channels: int) -> None:
-    """Refuse images that are no colours, where they are to be looked at as such."""
+    """Refuse shaders that give another number of channels than three, where an image of colours is needed."""
     if channels != 3:
         raise InputError(
             f"the scene's shaders give {channels} channels besides alpha; expected 3: look at three of them at a "
@@ -155,7 +158,7 @@ def check_colors(channels: int) -> None:
 
 
 def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
-    """Refuse changes of one of so many prepared parts that are not of fields which may change."""
+    """Refuse changes of a prepared part: of fields that are fixed, or with an index outside of `count` parts."""
     if "surface" in changes:
         raise InputError("a prepared part keeps its surface; call rts.prepare for another one")
     unknown = set(changes) - {"theta", "shader", "transform", "cull"}
@@ -167,7 +170,7 @@ def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
 
 
 def changed_part(index: int, part: CheckedPart, changes: Mapping[str, Any]) -> CheckedPart:
-    """A checked part with some fields changed, which are checked."""
+    """A checked part with some fields changed; the changed fields are checked."""
     if set(changes) - {"transform"}:
         return _check_part(index, part.replace(**changes))
     transform = changes["transform"]
@@ -182,24 +185,24 @@ def check_sampler(chosen: Any) -> Sampler:
 
 
 def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sampler:
-    """The sampler that `chosen` takes for a part, itself or another."""
-    own = chosen.suited(part, camera)
-    return own if own is chosen else check_sampler(own)
+    """The sampler that `chosen` selects for a part: `chosen` itself or another."""
+    selected = chosen.suited(part, camera)
+    return selected if selected is chosen else check_sampler(selected)
 
 
 def check_splatter(chosen: Any) -> Splatter:
     """A usable splatter from a name, a class or an object."""
-    found = checked_plugin(registry.instance("rts.splatters", chosen), "the splatter", Splatter)
-    if not (is_count(found.reach)):
-        raise InputError(f"reach of {found!r} is {found.reach!r}; expected cells, an integer of at least 1")
-    return found
+    splatter = checked_plugin(registry.instance("rts.splatters", chosen), "the splatter", Splatter)
+    if not is_count(splatter.reach):
+        raise InputError(f"reach of {splatter!r} is {splatter.reach!r}; expected cells, an integer of at least 1")
+    return splatter
 
 
 def check_shader(chosen: Any, what: str) -> Shader:
     """A usable shader from a name, a class, an object or a function; `what` names it."""
-    found = registry.instance("rts.shaders", chosen)
-    found = FunctionShader(found) if callable(found) and not isinstance(found, Shader) else found
-    return checked_plugin(found, what, Shader, "a function, ")
+    shader = registry.instance("rts.shaders", chosen)
+    shader = FunctionShader(shader) if callable(shader) and not isinstance(shader, Shader) else shader
+    return checked_plugin(shader, what, Shader, "a function, ")
 
 
 def _check_surface(surface: Any, what: str) -> Surface:
@@ -211,16 +214,16 @@ def _check_surface(surface: Any, what: str) -> Surface:
 
 
 def checked_plugin(given: Any, what: str, base: type, others: str = "a name, ") -> Any:
-    """An object of a subclass of the base of its kind, whose members are not misspelt.
+    """The given plugin, after a check of its class and of the spelling of its members.
 
     Args:
-        given: the object.
-        what: names it, such as "the sampler".
-        base: the base.
-        others: what else may be given.
+        given: the plugin.
+        what: its name in error messages, such as "the sampler".
+        base: the base class of its kind.
+        others: alternatives to an object, for error messages.
 
     Raises:
-        InputError: it is of no such class.
+        InputError: its class does not subclass `base`.
         PluginError: a function of its class is named almost like an optional member.
     """
     if not isinstance(given, base):
@@ -244,7 +247,7 @@ def check_matrix(name: str, matrix: Any) -> Array:
 
 
 def check_ratio(camera: Camera, size: tuple[int, int]) -> None:
-    """Warn of an image that is not of the ratio that its camera is for, by more than a pixel."""
+    """Warn if the image's ratio of width to height is off the camera's by more than a pixel."""
     if not isinstance(camera.aspect, float):
         return
     height, width = size
@@ -257,7 +260,7 @@ def check_ratio(camera: Camera, size: tuple[int, int]) -> None:
 
 
 def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple[int, int]:
-    """(height, width) as integers, refused where they make no image; and the counts that go with them."""
+    """The image size as (height, width) integers, after checks of the size and of the counts given with it."""
     height, width = check_pixels(size)
     if not (isinstance(layers, str) and layers == "auto") and not is_count(layers):
         raise InputError(f'layers is {quoted(layers)}; expected an integer of at least 1, or "auto"')
@@ -269,7 +272,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
 
 
 def check_memory(height: int, width: int, layers: int, capacity: int | None, *, gradient: bool) -> None:
-    """Refuse what would not fit into this machine."""
+    """Refuse a render that needs more memory than this machine has."""
     bytes_ = BYTES_PER_CELL["gradient" if gradient else "forward"]
     if capacity is not None and capacity * bytes_ > MEMORY:
         raise InputError(
@@ -285,17 +288,17 @@ def check_memory(height: int, width: int, layers: int, capacity: int | None, *, 
 
 
 def is_count(value: Any) -> bool:
-    """Whether a value is an integer of at least 1, Python's or NumPy's."""
+    """True for an integer of at least 1, Python's or NumPy's."""
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
 
 
 def is_real(value: Any) -> bool:
-    """Whether a value is a real number, Python's or NumPy's, infinity and NaN included."""
+    """True for a real number, Python's or NumPy's, infinity and NaN included."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check_background(background: Any, size: tuple[int, int], channels: int) -> Array | None:
-    """The background as an array, refused where it fits no image of this size and number of channels."""
+    """The background as an array. Shapes that do not fit the image are refused."""
     if background is None:
         return None
     background = from_numbers(background, "background")
@@ -313,37 +316,37 @@ def check_background(background: Any, size: tuple[int, int], channels: int) -> A
 
 
 def check_floating(name: str, value: Array) -> None:
-    """Refuse integers: some would mean 0 to 255 by them, others 0 to 1."""
+    """Refuse integers: their range is ambiguous, 0 to 255 or 0 to 1."""
     if not floating_bits(value):
         raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
 
 
 def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
-    """Refuse what a shader should not have returned: another shape, or no floating numbers."""
+    """Refuse a shader's result if its shape is wrong or its numbers are not floating."""
     expected, shape = (count, shader.channels + 1), shape_of(rgba)
     if shape != expected:
         other = len(shape) == 2 and shape[0] == count and shape[1] > 4
         hint = f": {shader.channels} channels and alpha, as its attribute `channels` says" if other else ""
         raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected {expected}{hint}")
-    if not floating_bits(rgba):  # Else there is no need of words, which take longer.
+    if not floating_bits(rgba):  # Only then is the message put together, which takes time.
         check_floating(f"what the shader {quoted(shader)} returned", rgba)
 
 
 def check_splats(
     index: int, part: CheckedPart, gbuffer: GBuffer, positions: Array, rgba: Array, row: Array, first: int
 ) -> None:
-    """Refuse samples of a part whose position or colour is NaN or infinite, and say what made it so.
+    """Refuse samples of a part whose position or colour is NaN or infinite, and name the cause.
 
-    What is traced is not looked at. No shader or splatter of the library turns NaN into a number.
+    Traced values are skipped. No shader or splatter of the library turns NaN into a number.
 
     Args:
-        index: the part's.
+        index: the index of the part.
         part: the part.
-        gbuffer: what its shader read, in world space.
+        gbuffer: the attributes that its shader read, in world space.
         positions: (N, 3) pixel x, pixel y, depth.
         rgba: (N, 4).
-        row: (K, H, W) of all parts.
-        first: the row of all parts that is the first of this one.
+        row: (K, H, W) int32, the row of each cell's sample, counted over all parts.
+        first: the first row of this part.
     """
     if is_finite(positions, rgba):
         return
@@ -354,13 +357,13 @@ def check_splats(
     used = np.unique(rows[(rows >= first) & (rows < first + count)]) - first
 
     def wrong(x: Any) -> bool:
-        """Whether a value is not finite, where it is of samples in those that are seen."""
-        found = value_of(x)
-        if found is None or found.dtype.kind != "f":
+        """True if a value holds NaN or infinity; of an array with a row per sample, visible rows count."""
+        array = value_of(x)
+        if array is None or array.dtype.kind != "f":
             return False
-        return not np.isfinite(found[..., used, :] if found.shape[-2:-1] == (count,) else found).all()
+        return not np.isfinite(array[..., used, :] if array.shape[-2:-1] == (count,) else array).all()
 
-    if not (wrong(positions) or wrong(rgba)):  # Rows that are allotted, but not used, may hold anything.
+    if not (wrong(positions) or wrong(rgba)):  # Unused rows may hold anything.
         return
     for place, value in placed_leaves(part.theta):
         if wrong(value):

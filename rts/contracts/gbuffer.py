@@ -11,10 +11,10 @@ from rts.errors import InputError
 class GBuffer(dict):
     """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
 
-    Surfaces give it in local space; shaders get it with positions and normals in world space. An attribute may be
-    deferred: it is computed when first read, so a shader pays for what it reads. To read one that is missing raises an
+    Surfaces return attributes in local space; shaders receive positions and normals in world space. An attribute may be
+    deferred: it is computed when first read, so a shader pays for what it reads. Reading a missing attribute raises an
     `InputError`. Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
-    Where there is uv, shaders also get "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one sample to the right
+    With "uv" shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one sample to the right
     and one down, without derivative.
     """
 
@@ -25,7 +25,7 @@ class GBuffer(dict):
 
     @property
     def like(self) -> Any:
-        """An array (N, ·), a row for each sample, of their dtype and device; it costs nothing to read."""
+        """An array (N, ·), a row for each sample, for its dtype and device. Reading it costs nothing."""
         return self["position"] if self._like is None else self._like
 
     @like.setter
@@ -34,11 +34,11 @@ class GBuffer(dict):
 
     @property
     def computed(self) -> dict[str, Any]:
-        """The attributes that are there by now: all but those that are deferred, and have not been read."""
+        """Attributes computed so far; deferred ones count once they have been read."""
         return {name: self[name] for name in super().__iter__()}
 
     def defer(self, name: str, compute: Callable[[], Any]) -> None:
-        """Add an attribute that `compute()` gives when it is first read."""
+        """Add an attribute that is computed by `compute()` when first read."""
         self._deferred[name] = compute
 
     def __missing__(self, name: str) -> Any:

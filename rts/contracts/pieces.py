@@ -1,4 +1,4 @@
-"""Pieces of tables of triangles, by which cells tell which side of a surface they show."""
+"""Consistently oriented pieces of triangle tables, which tell the two sides of a surface apart."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from rts.scene.topology import fixed
 
 
 def pieces(faces: np.ndarray) -> np.ndarray:
-    """Which triangles hang together and are wound alike: (T,) int16, numbers from 1 on, the largest piece first.
+    """Number the consistently oriented pieces of a triangle table, the largest first.
 
-    Two triangles do where they are the only ones at an edge, and go along it in opposite directions. A piece with two
-    triangles that go along their edge in the same direction, as in a Möbius strip, has no sides: its number is 0. So is
-    that of pieces beyond those that have a number.
+    Two triangles belong to one piece if they alone share an edge and run along it in opposite directions. A piece has
+    no sides if some two of its triangles run along their edge in the same direction, as in a Möbius strip. The number
+    of such a piece is 0, and so is that of pieces beyond the range of numbers.
 
     Args:
         faces: (T, 3) integers.
+
+    Returns:
+        (T,) int16, for each triangle the number of its piece, from 1 on, or 0.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

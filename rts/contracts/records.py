@@ -66,12 +66,12 @@ class Fragments(NamedTuple):
 
 
 class RayHits(NamedTuple):
-    """Where R rays meet a surface that intersects them itself, nearest first, K for each.
+    """The K nearest hits of R rays with a surface that intersects rays itself.
 
     Attributes:
-        hit: (K, R) bool, whether there is such a hit; those of a ray come first.
+        hit: (K, R) bool, true where hit k exists; the hits of a ray come before its empty layers.
         distance: (K, R) float: the hit is at `origin + distance * direction`; any finite number where there is none.
-        params: (K, R, P) float, what `evaluate` finds in `Samples.params`; finite where there is no hit, too.
+        params: (K, R, P) float, the `Samples.params` of each hit, for `evaluate`; finite where there is no hit, too.
         ids: (K, R, I) int32, or None for I = 0.
     """
 
@@ -82,25 +82,27 @@ class RayHits(NamedTuple):
 
 
 ON_RAYS = "points on rays"
-"""The table (N, 3) float32 of samples that are not centred: the points of cells' rays at their depth, local space."""
+"""Name of a table (N, 3) float32, for samples that are not centred: points of the cells' rays at the samples' depths,
+local space."""
 
 
 @record()
 class Cells:
-    """What the cells of a grid hold: samples, by number, front to back.
+    """The samples in the cells of a grid, by number, front to back.
 
     Attributes:
         row: (K, H, W) int32, the sample in each cell, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1. None where positions tell it.
-        facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on, negative where
-            it is seen from behind; 0 where that is not known or not of interest. Pieces are consistently oriented: what
-            is seen from opposite sides in two neighbouring cells is not one sheet. Numbers are larger by `MORE_BEHIND`
-            in the last layer of cells whose K layers are all covered. None where no sides are told.
-        exit: (H, W) int32, the sample where the ray leaves the closed part behind its front, or −1: a row of its own,
-            which `row` does not name, in cells at outlines and beside them. None where no exits are told.
-        settled: (H, W) integers, the sample whose colour the cell shows, whatever moves; −1 where it may change.
-            Settled cells may have no sample, as cells around them that affect no others. Where they or the eight
-            around them have some, these have that colour. None where no samples were left out for it.
+        facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on. It is negative
+            where the piece is seen from behind, and 0 where the side is unknown or not of interest. Pieces are
+            consistently oriented: a piece seen from opposite sides in two neighbouring cells is not one sheet there.
+            Numbers are larger by `MORE_BEHIND` in the last layer of cells whose K layers are all covered. None where
+            no sides are recorded.
+        exit: (H, W) int32, the sample where the ray leaves the closed part behind its front, or −1. Exits have rows of
+            their own, which `row` does not name, in cells at outlines and beside them. None where none are recorded.
+        settled: (H, W) integers, marks cells whose colour cannot change, however the scene moves: the sample that has
+            this colour, or −1. Such a cell may lack a sample of its own, and so may cells around it that affect no
+            others. Samples in it and in the eight cells around it have its colour. None if no cells are marked.
     """
 
     MORE_BEHIND: ClassVar[int] = 1 << 14
@@ -112,18 +114,18 @@ class Cells:
     settled: Array | None = None
 
     def map(self, f: Callable[[Array], Array]) -> Cells:
-        """The cells with a function applied to each array that is there; `f` sees axes (..., H, W)."""
+        """The cells with `f` applied to each array; `f` sees axes (..., H, W), and None stays None."""
         arrays = (self.row, self.depth, self.facing, self.exit, self.settled)
         return Cells(*(None if x is None else f(x) for x in arrays))  # pyright: ignore[reportArgumentType]
 
     def first(self, layers: int) -> Cells:
-        """The cells with the first layers alone."""
+        """The cells reduced to their first layers."""
         own = (None if x is None else x[:layers, ...] for x in (self.row, self.depth, self.facing))
         return Cells(*own, exit=self.exit, settled=self.settled)  # pyright: ignore[reportArgumentType]
 
 
 class _OnCells:
-    """Records with `cells`, whose arrays can be read and replaced as if they were the record's own."""
+    """Base of records with a field `cells`, whose arrays read and replace as if they were the record's own."""
 
     cells: Cells
 
@@ -134,7 +136,7 @@ class _OnCells:
     settled = property(attrgetter("cells.settled"), doc="See `Cells`.")
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed, those of `cells` among them."""
+        """A copy with some fields changed; fields of `cells` may be named directly."""
         own: dict[str, Any] = {name: changes.pop(name) for name in _OF_CELLS & changes.keys()}
         if own:
             changes["cells"] = replace(changes.get("cells", self.cells), **own)
@@ -144,27 +146,23 @@ class _OnCells:
 _OF_CELLS = {f.name for f in fields(Cells)}
 
 
-ON_RAYS = "points on rays"
-"""The table (N, 3) float32 of samples that are not centred: the points of cells' rays at their depth, local space."""
-
-
 @record(static=("asked", "centered", "by_sample", "followed"))
 class Samples(_OnCells):
-    """Where the rays of one part meet its surface: the paper's U, packed.
+    """The points where rays meet the surface of one part: the paper's U, packed.
 
     Attributes:
         ids: (N, I) int32, such as the vertices of a triangle.
-        params: (N, P) float32, such as barycentrics; in θ's own dtype if they were found on the device.
-        cells: which of the N samples is in each cell.
+        params: (N, P) float32, such as barycentrics; in θ's own dtype if they were computed on the device.
+        cells: the index of the sample in each cell.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
         tables: further arrays of the surface by name, filled by its `refine`.
         gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
-        asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
+        asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
-        by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
-        followed: of the fields "cells" and "hidden" of a `Request` those that were followed.
-        ran_out: () int32, cells where triangles ran out before K samples of a refined surface were found; None where
-            none was refined.
+        by_sample: names of the tables that have a row for each sample; other tables are shared by all.
+        followed: the fields of the `Request`, out of "cells" and "hidden", that the sampler followed.
+        ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
+            None for a surface that is not refined.
     """
 
     ids: Array
@@ -181,12 +179,12 @@ class Samples(_OnCells):
 
 
 class Question(NamedTuple):
-    """Which of these samples can reach the image? Host arrays.
+    """Candidate samples, for a decision on which of them can reach the image. Host arrays.
 
     Attributes:
-        covered: (K, H, W) bool, where there are samples.
-        depth: (K, H, W) float, their depths; anything where nothing is covered.
-        size: the largest coordinate that depths were computed from, which bounds rounding; 0 where that is not known.
+        covered: (K, H, W) bool, true where there is a sample.
+        depth: (K, H, W) float, the depths of the samples; anything where nothing is covered.
+        size: the largest coordinate that depths were computed from, which bounds rounding; 0 if unknown.
     """
 
     covered: np.ndarray
@@ -198,8 +196,8 @@ class Decision(NamedTuple):
     """The samples that can reach the image. Host arrays.
 
     Attributes:
-        kept: (K, H, W) bool, the samples to make: those of `needed` but for what only settled cells need.
-        settled: (H, W) int8, `Cells.settled` of a scene of one part; None where that was not asked.
+        kept: (K, H, W) bool, the samples to compute: `needed` without samples that only settled cells need.
+        settled: (H, W) int8, `Cells.settled` of a scene of one part; None unless the decider `settles`.
         needed: (K, H, W) bool, the samples that the splatter needs.
     """
 
@@ -209,11 +207,11 @@ class Decision(NamedTuple):
 
 
 class Hidden(Protocol):
-    """How hidden samples are decided: by depths alone, and without memory.
+    """The decider on hidden samples. It goes by depths alone, and keeps no state.
 
     Attributes:
-        settles: whether decisions tell which cells are settled.
-        size: the largest number that surfaces read, which bounds rounding; 0 where that is not known.
+        settles: whether decisions have `settled` (see `Cells.settled`).
+        size: the largest number that surfaces read, which bounds rounding; 0 if unknown.
     """
 
     @property
@@ -233,16 +231,16 @@ class Hidden(Protocol):
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a sampler beside the nearest samples. A sampler may follow it or not, and says so in `Samples`.
+    """Options of a call of a sampler. It may ignore most of them; `Samples.followed` names those that it followed.
 
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are. Every sampler follows it.
         cells: (L, C) int32, the only cells of the grid to sample, as flat indices, none twice, or −1 for none; an array
             of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
         hidden: decides which samples to keep, once depths are known; None to keep all.
-        facing: whether to find `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
-        exits: whether to find `Cells.exit` of a part that is culled, at outlines and beside them.
-        entry: what `Sampler.hold` gave for this part; None where nothing was prepared.
+        facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
+        exits: whether to compute `Cells.exit` of a part that is culled, at outlines and beside them.
+        entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
     capacity: int | None = None
@@ -257,24 +255,24 @@ class Request:
 class Fine(_OnCells):
     """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in strips.
 
-    Runs of strips lie side by side in one layout of h × w cells, which splatters take as they take any picture. What
-    lies outside of active pixels there is no part of the image.
+    Strips lie side by side in one layout of h × w cells, which splatters treat as any other picture. Cells of the
+    layout outside of active pixels are no part of the image.
 
     Attributes:
-        samples: one `Samples` for each part; their cells are those of a list.
+        samples: one `Samples` for each part; their cells are a list, not a grid.
         index: (M,) int32, the sample that each splat shows, counted over all parts in order.
         shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
-        cells: which of the M splats is in each place of the layout; without depth.
+        cells: the index of the splat in each cell of the layout; without depth.
         part: (K, h, w) int32, the part seen there, or −1.
         wanted: (h, w) bool, the cells of active pixels.
-        pixel: (H, W) int32, for each pixel of the image which pixel of the layout it is, counted along its lines
-            without the apron; −1 where it is not active.
+        pixel: (H, W) int32, for each pixel of the image the index of its pixel in the layout, counted along lines
+            without the apron; −1 where the pixel is not active.
         coarse: (h', w') bool, the cells of the coarse grid, with its apron, whose pixels are not active.
-        overflow: () int32, pixels that there was no room for, which stay coarse, and samples that were dropped.
+        overflow: () int32, number of pixels that stay coarse for want of room, plus number of samples dropped.
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
-        flat: whether all pixels that are not active show the one colour of all samples where anything is, whatever
-            moves, so that nothing has to be splatted there.
+        flat: whether inactive pixels need no splatting. True if all samples have one colour and each inactive pixel
+            is empty or shows that colour, however the scene moves.
     """
 
     samples: tuple[Samples, ...]
@@ -293,20 +291,20 @@ class Fine(_OnCells):
 
 @record(static=("supersample", "apron"))
 class Sampled(_OnCells):
-    """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
+    """A sampled scene, the result of `rts.sample` and the input of `rts.render_samples`.
 
-    The grid has an apron of cells around the image, so that what lies just outside can splat into it: here H and W are
+    The grid has an apron of cells around the image, so that samples just outside can splat into it. Here H and W are
     the image's, times `supersample`, plus twice the apron.
 
     Attributes:
         samples: one `Samples` for each part.
-        cells: which sample is in each cell, counted over all parts in order. Pieces of different parts have different
-            numbers; exits are of the part that is seen.
-        overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`; with those of
-            `fine`. Should be 0.
+        cells: the index of the sample in each cell, counted over all parts in order. Pieces of different parts have
+            different numbers; exits are of the part that is seen.
+        overflow: () int32, number of samples dropped for want of capacity, or beyond the limit of `layers="auto"`;
+            `fine.overflow` is included. Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        fine: further samples where outlines are (`rts.Adaptive`), or None.
+        fine: further samples at outlines (`rts.Adaptive`), or None.
     """
 
     samples: tuple[Samples, ...]
@@ -318,7 +316,7 @@ class Sampled(_OnCells):
 
     @property
     def one_part(self) -> bool:
-        """Whether it is the scene of one part."""
+        """True for a scene of one part."""
         return len(self.samples) == 1
 
     @property
@@ -335,27 +333,26 @@ class Sampled(_OnCells):
 
 
 def _first_part(row: Array) -> Array:
-    """The part of samples (K, H, W) that are all of the first."""
+    """Part numbers (K, H, W) of the samples of a single part: 0, or −1 where `row` is −1."""
     return namespace(row).clip(row, None, 0)
 
 
 @record(static=("border", "one_part"))
 class Splats(_OnCells):
-    """Shaded samples in their cells: what a splatter takes.
+    """Shaded samples in their cells, the input of a splatter.
 
-    A splatter ignores what it does not read. The optional fields say more about the scene, where whoever made the
-    splats knows it.
+    Optional fields carry more about the scene, where it is known. A splatter may ignore them.
 
     Attributes:
         positions: (N, 3) pixel x, pixel y, linear depth; differentiable.
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
             channels, (N, C + 1): splatters are given three of them at a time, and alpha.
-        cells: which sample is in each cell, without depth; arrays of the positions' engine.
-        part: (K, H, W) int32, the part of each sample, or −1; None if that is not known, or where all samples are of
-            `one_part`. See `parts`.
-        sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
+        cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
+        part: (K, H, W) int32, the part of each sample, or −1; None if unknown, or if all samples are of `one_part`.
+            See `parts`.
+        sentinel: () float, the depth that stands for empty layers, beyond all samples; None for a depth of the scene's
             scale.
-        wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.
+        wanted: (H, W) bool, the targets whose colour is used; others may have any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
         one_part: whether all samples are of one part.
     """
@@ -371,5 +368,5 @@ class Splats(_OnCells):
 
     @property
     def parts(self) -> Array | None:
-        """`part` of any scene: made of `row` where all samples are of one part. None if parts are not known."""
+        """`part`, computed from `row` where all samples are of one part. None if parts are unknown."""
         return _first_part(self.row) if self.part is None and self.one_part else self.part

@@ -1,4 +1,4 @@
-"""The base of residuals, which `rts.fit` makes small."""
+"""The base class of residuals, which `rts.fit` minimises."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rts.plugin_base import Plugin
 
 
 class Residuals(Plugin):
-    """Function of parameters that `rts.fit` makes small. A plain function will do, which has none of the other methods.
+    """Function of parameters that `rts.fit` minimises. A plain function will do; the other methods are optional.
 
     Attributes:
-        loss: what their mean is taken of, an `rts.Loss`; None for the square. What `at_stage` gives has its own, or
-            where that is None this one.
+        loss: an `rts.Loss`, applied to each residual before the mean; None for the square. The result of `at_stage`
+            has a loss of its own, or where that is None this one.
     """
 
     loss: Any = None

@@ -1,4 +1,4 @@
-"""The base of samplers."""
+"""The base class of samplers."""
 
 from __future__ import annotations
 
@@ -25,30 +25,33 @@ class Sampler(Plugin):
         """The `layers` nearest samples of every pixel.
 
         Args:
-            part: the part; its `transform` is already in the camera. A sampler that cannot leave out what is seen from
+            part: the part; its `transform` is already in the camera. A sampler that cannot ignore triangles seen from
                 behind refuses parts with `cull="back"`.
             camera: the camera, in the part's local space.
             size: (height, width) of the grid of cells.
             layers: K.
-            request: the number of rows to allot, and what may be found, or left out, besides.
+            request: the number of rows to allot, and further options.
 
         Returns:
-            Samples, without derivative, in arrays of the engine of the part and the camera. Which of their fields are
-            there depends on the sampler, the part and the request, never on values.
+            Samples, without derivative, in arrays of the engine of the part and the camera. The sampler, the part and
+            the request decide which fields are None; values never do.
 
         Raises:
             InputError: this sampler cannot sample the surface.
         """
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
-        """The sampler that is to sample a part: this one or, if this one only chooses, as "auto" does, another.
+        """The sampler for a part: this one, or another if this one only chooses, as "auto" does.
 
         Args:
             part: the part.
-            camera: the camera; None in `rts.prepare`, which keeps what is built.
+            camera: the camera; None in `rts.prepare`.
         """
         return self
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Any:
-        """What `rts.prepare` is to build once of a part, and hand to `sample` as `Request.entry`; None for nothing."""
+        """A structure that `rts.prepare` builds once for a part, such as a tree; None for nothing.
+
+        `sample` receives it as `Request.entry`.
+        """
         return None

@@ -1,4 +1,4 @@
-"""The base of shaders, and plain functions as shaders."""
+"""The base class of shaders, and plain functions as shaders."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from rts.scene.camera import Camera
 
 
 class Shader(Plugin):
-    """Colours samples. Any function with the signature of `__call__` will do; its attributes are those of a shader.
+    """A function that colours samples. Any function with the signature of `__call__` will do, with these attributes.
 
-    Promises but for `opaque` are of a class and its `__call__`: a subclass with its own has to say so itself.
+    Promises other than `opaque` belong to a class and its `__call__`. A subclass with a `__call__` of its own has to
+    repeat them.
 
     Attributes:
-        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
+        channels: C, the number of channels besides alpha: 3 for colours, any other number for features.
         opaque: a promise that alpha is 1.
-        uniform: a promise that all samples of a part have one colour, through whatever camera. It may depend on θ.
-        takes_views: a promise that a call may be of samples of several views, as `rts.render_views` then makes it:
-            `camera` is a `RowCameras`, whose methods give a row for each sample. A shader that says so also says
-            what it `reads`, without "uv_footprint".
+        uniform: a promise that all samples of a part have one colour, through any camera. It may depend on θ.
+        takes_views: a promise that one call may take samples of several views, as `rts.render_views` then does:
+            `camera` is a `RowCameras`, whose methods give a row for each sample. Such a shader also declares `reads`,
+            without "uv_footprint".
         reads: a promise that it needs no entries but these, of the G-buffer besides position and of θ; None for all.
-            Samples then carry no others. `rts.explain` lists entries of θ that nobody reads, and what is almost one of
-            these is warned of.
+            Samples then carry no others. `rts.explain` lists entries of θ that nobody reads, and warns of names that
+            almost match one of these.
     """
 
     channels: int = 3
@@ -45,8 +46,8 @@ class Shader(Plugin):
             camera: the camera of the whole image; for a shader that `takes_views` it may be a `RowCameras`.
 
         Returns:
-            (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
-            of them multiplied by alpha and otherwise of any value.
+            (N, 4) premultiplied linear RGBA, in [0, 1]. With other `channels`, (N, C + 1), alpha last; every channel
+            is multiplied by alpha, and otherwise of any value.
 
         Raises:
             InputError: an entry that the shader needs is missing.

@@ -1,4 +1,4 @@
-"""The bases of splatters."""
+"""The base classes of splatters."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Splatter(Plugin):
     """Turns shaded samples into an image that has derivatives at occlusion boundaries.
 
     Attributes:
-        layers: how many layers it looks at, from the front; None for all that there are.
-        reach: how many cells away from its own, along either axis, a sample may have an effect; at least 1.
-        reads: which of "facing" and "exit" of `Cells` it reads; these are found only then.
-        fills_interiors: a promise on samples of one opaque colour, on cells' centres. A cell shows this colour where
-            all nine samples around it are fronts and no hidden one beside them is `needed`, and nothing where none of
-            the nine is there, whatever moves by little. A cell that is `settled` shows the colour of that sample,
-            whatever samples there are; so those farther than `reach` from all other cells need not be there, or where
-            `Splats.wanted` is told, those farther than one cell more from the others of them.
+        layers: the number of layers it reads, from the front; None for all.
+        reach: the largest distance, in cells along either axis, at which a sample has an effect; at least 1.
+        reads: the fields of `Cells` that it reads, out of "facing" and "exit"; samplers compute no others.
+        fills_interiors: a promise on samples of one opaque colour, on cells' centres, that move by little. A cell shows
+            this colour if the nine cells in and around it have samples in front and no hidden sample beside these is
+            `needed`. It shows nothing if all nine are empty. A cell that is `settled` shows the colour of its sample,
+            whichever samples are given. Samples farther than `reach` from all cells that are not settled may therefore
+            be missing; with `Splats.wanted`, those farther than `reach` + 1 from wanted ones that are not settled.
     """
 
     layers: int | None = None
@@ -77,7 +77,7 @@ class Splatter(Plugin):
 
 
 class SummingSplatter(Splatter):
-    """A splatter that can sum up the normal equations of an image without the Jacobian of it."""
+    """A splatter that sums up the normal equations of an image without its Jacobian."""
 
     @abc.abstractmethod
     def normal_equations(
@@ -93,25 +93,25 @@ class SummingSplatter(Splatter):
         """Normal equations of the n residuals weight · (image − target), without their Jacobian.
 
         Args:
-            splats: the samples; without their border there are s h × s w cells, and a pixel is the mean of s × s.
+            splats: the samples; without the border there are s h × s w cells, and a pixel is the mean of s × s.
             t_positions: (T, N, 3), tangents of positions along T directions.
             t_rgba: (T, N, 4), tangents of colours; None for zeros.
             target: (h, w, C): alpha (C = 1), colours (3) or both (4).
             weights: (h, w, 1) or (h, w, C); None for ones.
-            background: (h, w, 4), what the image is composited onto, or None.
+            background: (h, w, 4), composited under the image, or None.
             loss: of the residuals, an `rts.Loss`; None for the square.
 
         Returns:
             Mean loss (), JᵀSJ / n (T, T) and JᵀWr / n (T,), where W and S are diagonals of `loss.weights(r)`, ones for
-            the square; None where it cannot work on these arrays.
+            the square; None where this splatter cannot work on these arrays.
         """
 
 
 def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
     """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
-    given = from_numbers(positions, "positions"), from_numbers(rgba, "rgba")
+    floats = from_numbers(positions, "positions"), from_numbers(rgba, "rgba")
     row = np.asarray(from_numbers(row, "row"), np.int32) if isinstance(row, (list, tuple)) else from_numbers(row, "row")
-    shapes = [shape_of(x) for x in (*given, row)]
+    shapes = [shape_of(x) for x in (*floats, row)]
     ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
     if not ok or shapes[2][0] < 1:
         raise InputError(
@@ -120,5 +120,5 @@ def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Spl
         )
     if not namespace(row).isdtype(row.dtype, "signed integer"):
         raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
-    positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
+    positions, rgba, row = constants((*floats, row), engine_of(floats, row), exemplar(floats))
     return Splats(positions, rgba, Cells(row), border=border)

@@ -1,4 +1,4 @@
-"""The bases of surfaces.
+"""The base classes of surfaces.
 
 Letters of shapes are in `rts.contracts.records`, conventions of space in `rts.scene.camera`.
 """
@@ -28,10 +28,10 @@ class Rate(NamedTuple):
     """Another form of a surface, coarser or finer.
 
     Attributes:
-        setting: what differs, as the keyword argument that a user would give: "tolerance=0.4".
-        work: how much work it is, relative to the surface as it is; roughly, to order them.
+        setting: the difference, as the keyword argument that a user would give: "tolerance=0.4".
+        work: estimated cost relative to the present surface, for ordering.
         surface: the surface.
-        theta: θ → θ for it, differentiable; None where θ stays.
+        theta: function θ → θ for this form, differentiable; None where θ stays.
     """
 
     setting: str
@@ -46,10 +46,10 @@ class Surface(Plugin):
     Subclass `TriangleSurface`, `RaySurface`, or both. Several threads may call its methods at once.
 
     Attributes:
-        sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
-        centered: whether samples lie on the rays through cells' centres. If not, splatters are given them there.
-        param_step: by how much the two `params` of a sample are changed to tell how position and uv change with them,
-            which mipmaps go by; larger where both are linear in them.
+        sample_widths: (I, P), the number of integers and reals of a sample, after `refine`. Every surface sets it.
+        centered: whether samples lie on the rays through cells' centres. If not, splatters receive points of the rays.
+        param_step: step in the two `params` of a sample for finite differences of position and uv, which choose the
+            level of mipmaps. Larger where both are linear in `params`.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
@@ -64,7 +64,7 @@ class Surface(Plugin):
 
         Args:
             theta: the entries that `Surface.reads` names.
-            samples: where to evaluate; constants. Rows that no cell refers to are all zero, and must give finite
+            samples: points to evaluate; constants. Rows that no cell refers to are all zero, and must give finite
                 values.
 
         Returns:
@@ -79,7 +79,7 @@ class Surface(Plugin):
         return tuple(theta)
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Coarser and finer forms of the surface, for whoever looks for the cheapest that will do; none by default.
+        """Coarser and finer forms of the surface; none by default.
 
         `rts_compare.compare` and `rts.tune` try them. The surface as it is need not be among them.
 
@@ -89,9 +89,9 @@ class Surface(Plugin):
         return ()
 
     def unbounded(self) -> Surface | None:
-        """This surface without bounds on its derivatives; None where it has none, which is the default.
+        """This surface without bounds on its derivatives; None, the default, for a surface without such bounds.
 
-        `rts.check_gradient` looks at it, to tell whether such a bound is why a gradient is off.
+        `rts.check_gradient` compares with it, to tell if such a bound explains a wrong gradient.
         """
         return None
 
@@ -99,33 +99,32 @@ class Surface(Plugin):
     def example(cls) -> Part | None:
         """A small part to try the surface with, or None.
 
-        It has a shader and NumPy θ, and lies about the origin, within two units of it. `rts plugins --matrix` and tests
+        The part has a shader and NumPy θ, and lies within two units of the origin. `rts plugins --matrix` and tests
         draw it.
         """
         return None
 
     @classmethod
     def load(cls, path: Path) -> Sequence[Part]:
-        """The parts of a file of a format that is this kind of surface's own; `rts.load(path, surface=…)` calls it.
+        """The parts in a file of this surface's own format, for `rts.load(path, surface=…)`.
 
         Args:
             path: a file that exists.
 
         Raises:
-            InputError: there is no such format, or the file is damaged; one line that names it.
+            InputError: this surface reads no files, or the file is damaged; one line that names the file.
         """
         raise InputError(f"{cls.__name__} reads no files; expected a surface that does, such as 'mesh' or 'bezier'")
 
 
 class TriangleSurface(Surface):
-    """A surface that gives triangles to be sampled in its place.
+    """A surface that is sampled by means of triangles.
 
     Attributes:
-        proxy_is_cheap: whether making the triangles costs no more than looking whether their inputs have changed.
-        refine_moves: whether `refine` moves samples or drops them. Where it only adds to what they carry, hidden ones
-            are left out before.
-        face_count: how many triangles there are, or None if that is not known beforehand; the sampler "auto" goes by
-            it.
+        proxy_is_cheap: whether making the triangles costs no more than comparing their inputs with the last ones.
+        refine_moves: whether `refine` moves samples or drops them. If it only adds tables or params, hidden samples are
+            left out before.
+        face_count: the number of triangles, or None if unknown beforehand; the sampler "auto" decides by it.
     """
 
     proxy_is_cheap: bool = False
@@ -135,13 +134,13 @@ class TriangleSurface(Surface):
     @property
     @final
     def refines(self) -> bool:
-        """Whether samples on the triangles go through `refine`: it is overridden."""
+        """True if `refine` is overridden, so that samples on the triangles pass through it."""
         return overrides(self, "refine", TriangleSurface)
 
     @property
     @final
     def depends_on_view(self) -> bool:
-        """Whether the triangles depend on camera and size: `proxy_key` is overridden."""
+        """True if `proxy_key` is overridden: the triangles depend on camera and size."""
         return overrides(self, "proxy_key", TriangleSurface)
 
     @abc.abstractmethod
@@ -160,7 +159,7 @@ class TriangleSurface(Surface):
         """Triangles that stand for the surface while it is sampled, counter-clockwise seen from outside.
 
         Args:
-            inputs: what `proxy_inputs` gave, on the host.
+            inputs: the result of `proxy_inputs`, on the host.
             camera: NumPy float64 matrices; world is the surface's local space.
             size: (height, width) of the grid of cells.
         """
@@ -168,21 +167,21 @@ class TriangleSurface(Surface):
     def proxy_key(self, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Hashable:
         """A value that changes when triangles must be rebuilt for another reason than their inputs, e.g. the camera.
 
-        Override it only where triangles depend on the view. This one gives the view itself: they are rebuilt for each.
+        Override it only where triangles depend on the view. The default is the view: triangles are rebuilt for each.
         """
         return size, *(m.tobytes() for m in camera)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """Which triangles are wound alike, so that what shows its front does not go on in what shows its back.
+        """Numbers of consistently oriented pieces, so that a front side is not continued by a back side.
 
-        Not asked where `refine` moves samples. `rts.plugin_api.checks.pieces` finds them by the edges
+        Not called where `refine` moves samples. `rts.plugin_api.checks.pieces` computes them from the edges
         that triangles share.
 
         Args:
-            proxy: what `proxy` gave.
+            proxy: the result of `proxy`.
 
         Returns:
-            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 where it may be wound in any way; or
+            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 where its winding means nothing; or
             (1,), the number of all.
         """
         return np.zeros(1, np.int16)
@@ -194,10 +193,10 @@ class TriangleSurface(Surface):
         have met at one root: the core sorts and merges them, and closes gaps.
 
         Args:
-            inputs: what `proxy_inputs` gave, on the host.
+            inputs: the result of `proxy_inputs`, on the host.
             samples: samples on the triangles: ids (N, I) and params (N, P), a row for each covered cell, and `row` and
-                depth (K, H, W) of the cells. The tables are those of `table_specs`, as zeros of the largest shape: fill
-                them, or replace them by shorter ones. Tables `by_sample` have N rows.
+                depth (K, H, W) of the cells. The tables of `table_specs` come as zeros of the largest shape: fill them,
+                or replace them by shorter ones. Tables `by_sample` have N rows.
             rays: the ray of each row: origins and directions (N, 3), local space.
 
         Returns:
@@ -207,10 +206,10 @@ class TriangleSurface(Surface):
         return samples
 
     def why_no_triangles(self, inputs: Tree) -> str:
-        """What a warning says of the part where `proxy` has no triangles, beginning with a verb.
+        """The predicate of a warning on a part whose `proxy` has no triangles, beginning with a verb.
 
         Args:
-            inputs: what `proxy_inputs` gave, on the host.
+            inputs: the result of `proxy_inputs`, on the host.
         """
         return "has no triangles"
 
@@ -218,16 +217,16 @@ class TriangleSurface(Surface):
         """A mesh whose vertices lie on the surface.
 
         Args:
-            theta: θ, with values that are known.
-            rate: a whole number, of cuts along each side of a patch; or a float, the distance in the units of θ that
-                triangles may be off the surface. A surface that is made of triangles ignores it.
+            theta: θ; not traced.
+            rate: an integer is the number of cuts along each side of a patch. A float is the largest distance of
+                triangles from the surface, in the units of θ. A surface that is made of triangles ignores it.
 
         Returns:
             Vertices (V, 3) float32 and faces (T, 3) int32.
 
         Raises:
-            InputError: the surface cannot be made a mesh without a view of it, which is the default where triangles
-                depend on the view; else the default is what `proxy` gives.
+            InputError: the surface cannot become a mesh without a view. This is the default where triangles depend
+                on the view; otherwise the default is the result of `proxy`.
         """
         if self.depends_on_view:
             raise InputError(
@@ -235,7 +234,7 @@ class TriangleSurface(Surface):
             )
         inputs = self.proxy_inputs(stopped(from_numbers(theta, "theta")))
         inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
-        proxy = self.proxy(inputs, None, (1, 1))  # pyright: ignore[reportArgumentType]  # It does not look at it.
+        proxy = self.proxy(inputs, None, (1, 1))  # pyright: ignore[reportArgumentType]  # `proxy` reads no camera.
         return np.asarray(proxy.vertices, np.float32), np.asarray(proxy.faces, np.int32)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
@@ -243,8 +242,8 @@ class TriangleSurface(Surface):
 
         Args:
             rows: the largest number of samples that `refine` may be given: every cell of every layer.
-            capacity: the number of rows that is allotted for samples where shapes have to be known, as in `jax.jit`;
-                None if tables may have any length up to that of their specs, which then say `packed=True`.
+            capacity: the number of rows allotted for samples where shapes must be known, as in `jax.jit`. None if
+                tables may have any length up to that of their specs, which then set `packed=True`.
 
         Returns:
             Name → spec; none by default. The core sets the number of rows of tables `by_sample`.
@@ -256,8 +255,8 @@ class RaySurface(Surface):
     """A surface that intersects rays itself, for the sampler `rays`.
 
     Attributes:
-        hit_widths: (I, P) of the samples that `intersect` gives; None for `sample_widths`. A surface that has triangles
-            too may tell the two kinds of samples apart by their widths.
+        hit_widths: (I, P) of the samples that `intersect` returns; None for `sample_widths`. A surface that has
+            triangles too may tell the two kinds of samples apart by their widths.
     """
 
     hit_widths: tuple[int, int] | None = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import inspect
 import math
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -19,9 +18,10 @@ from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import check_size, is_count, is_real
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
 from rts.diagnostics.explanation.selection import explained
-from rts.diagnostics.explanation.slopes import Number, Slope, chosen, measured, unit
+from rts.diagnostics.explanation.shared_budget import Clock, looked_at
+from rts.diagnostics.explanation.slopes import Slope
 from rts.diagnostics.explanation.subject import Scene, Subject
-from rts.diagnostics.progress import Phase, phases
+from rts.diagnostics.progress import phases
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable
@@ -31,8 +31,6 @@ from rts.rendering.image import render
 
 NEGLIGIBLE = 0.01
 """What does not matter, as a share of the largest effect of a step."""
-FOR_SLOPES = 0.6
-"""The share of the budget after which no further number is begun, so that reasons can be found."""
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
 
@@ -172,14 +170,15 @@ def check_gradient(
         samples: the square root of the number of samples a pixel.
         tolerance: how far a derivative may be off, relative to itself.
         budget_s: seconds after which nothing more is begun; what was looked at until then is returned. At least one
-            number is looked at.
+            number is looked at. Where they do not suffice, all numbers are looked at with few samples before any is
+            with more.
         progress: a bar on standard error; None for where that is a terminal.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
     Raises:
         InputError: parameters that have no derivative, or arguments that `rts.render` refuses.
     """
-    clock = _Clock(budget_s)
+    clock = Clock(budget_s)
     _check_function("scene", scene, "a function: parameters → (parts, camera)")
     if loss is not None:
         _check_function("loss", loss, "a function: image (H, W, 4) → scalar, or None")
@@ -203,54 +202,18 @@ def check_gradient(
         warnings.simplefilter("ignore", EmptyImageWarning)
         warnings.simplefilter("ignore", LayersWarning)
         subject.require_dependence()
-        numbers, count = _looked_at(subject, entries, samples, clock, phase)
+        numbers, count, rough = looked_at(subject, entries, samples, clock, phase)
         check = GradientCheck([n.slope for n in numbers], tolerance)
         plain = [n for n in numbers if n.forward]
-        found, left = explained(subject, plain, check.agrees, own, clock.going, phase)
+        found, left = explained(subject, plain, check.agrees, own, clock.turn, phase)
         picture = marked(subject.seen, found)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
+    notes += [f"the differences of {rough} are of fewer samples than asked for"] if rough else []
     notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
-    told = [f"After {clock.spent:.0f} s the budget was spent: {', and '.join(notes)}."] if notes else []
+    told = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
     if len(plain) < len(numbers):
         told.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
     return check._replace(reasons=found, picture=picture, note=" ".join(told))
-
-
-class _Clock:
-    """Seconds since it was made, and whether some are left."""
-
-    def __init__(self, budget: float):
-        if not (is_real(budget) and 0 < budget):
-            raise InputError(f"budget_s is {quoted(budget)}; expected a positive number of seconds")
-        self.budget, self.start = float(budget), time.perf_counter()
-
-    @property
-    def spent(self) -> float:
-        return time.perf_counter() - self.start
-
-    def going(self, share: float = 1.0) -> bool:
-        """Whether that share of the budget is not spent yet."""
-        return self.spent < share * self.budget
-
-
-def _looked_at(subject: Subject, entries: int, samples: int, clock: _Clock, phase: Phase) -> tuple[list[Number], int]:
-    """Some numbers of each array, the first of all arrays first; and how many there were to look at."""
-    engine, parameters = subject.engine, subject.parameters
-    gradient = engine.value_and_grad(lambda p: subject.loss(subject.image(p)))(parameters)[1]
-    planned = []
-    for number, ((name, value), slope) in enumerate(zip(named_leaves(parameters), leaves(gradient), strict=True)):
-        flat = engine.to_numpy(slope).reshape(-1)
-        for rank, index in enumerate(chosen(flat, entries)):
-            place = ", ".join(map(str, np.unravel_index(index, value.shape)))
-            label = f"{name}[{place}]" if value.shape else name
-            planned.append((rank, number, index, label, float(flat[index])))
-    found, done = {}, phase("derivatives", len(planned))
-    for rank, number, index, label, slope in sorted(planned):
-        if found and not clock.going(FOR_SLOPES):
-            break
-        found[number, rank] = measured(subject, label, unit(engine, parameters, number, index), slope, samples)
-        done()
-    return [found[key] for key in sorted(found)], len(planned)
 
 
 # --------------------------------------------------------------------------------------------------- parameters

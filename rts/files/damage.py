@@ -1,4 +1,4 @@
-"""What is said of files that are damaged, and warnings of a file gathered while it is read."""
+"""Errors for damaged files, and the warnings gathered while a file is read."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ONE_AT_A_TIME = threading.RLock()  # Filters of warnings belong to the whole pr
 
 
 def unreadable(path: Path, kind: str, what: str) -> InputError:
-    """The error of a file that is not what its name says, or is damaged."""
+    """The error of a file that is damaged, or of another format than its name says."""
     return InputError(
         f"{path} cannot be read as {kind} ({what}); the file may be cut short or of another format: export it again"
     )
@@ -54,7 +54,7 @@ def is_plain(text: str) -> bool:
 
 @contextlib.contextmanager
 def gathered(path: Path) -> Iterator[list[str]]:
-    """A list that has, once the block is left, one line for each thing that was warned of in it.
+    """A list that holds one line for each warning of a file in the block, once it is left.
 
     Other libraries warn in their own ways, and some only log: what they say is caught, and led back to the file.
     Threads take turns.
@@ -87,7 +87,7 @@ def gathered(path: Path) -> Iterator[list[str]]:
 
 
 class _Lines(logging.Handler):
-    """Notes what is logged as a warning, or worse, with the error that led to it."""
+    """Notes records logged as warnings or worse, with the errors that led to them."""
 
     def __init__(self, path: Path, lines: list[str]):
         super().__init__(logging.WARNING)
@@ -102,5 +102,5 @@ class _Lines(logging.Handler):
 
 
 def warn(text: str) -> None:
-    """Warn of a file; inside `gathered`, from which the warning comes to the user."""
+    """Warn of a file; call it inside `gathered`, which passes the warning on to the user."""
     errors.warn(text, FileWarning)

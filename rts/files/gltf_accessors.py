@@ -1,4 +1,4 @@
-"""Accessors of GLB and glTF files: what they promise is there, in a layout and of types that the format allows."""
+"""Checks of accessors of GLB and glTF files: their data are present, in layouts and types that the format allows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMPONENTS = {
     "COLOR_0": ("f4", "u1", "u2", "u1 fraction", "u2 fraction"),
     "indices": ("u1", "u2", "u4"),
 }
-"""Types of components; those of integers that stand for fractions of their largest are `normalized`."""
+"""Types of components; integers that stand for fractions of their largest value are `normalized`."""
 _INTEGERS = tuple(kind + more for kind in ("i1", "u1", "i2", "u2") for more in ("", " fraction"))
 QUANTIZED = COMPONENTS | {
     "POSITION": ("f4", *_INTEGERS),
@@ -35,18 +35,18 @@ QUANTIZED = COMPONENTS | {
 MOST = 2**24
 """Rows of an accessor without data, all zero, which a damaged file could otherwise have any number of."""
 BOUNDS_TOLERANCE = 1e-3
-"""By how much `min` and `max` may be off, of the size of what they bound; some writers round them."""
+"""Tolerance of `min` and `max`, as a share of the range that they bound; some writers round them."""
 
 
 def count_of(value: Any) -> int:
-    """A whole number that is not negative; a ValueError where it is none."""
+    """A whole number of at least zero; a ValueError for anything else."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{value!r} is no count")
     return value
 
 
 def _layout(accessor: dict[str, Any], descriptions: list[dict[str, Any]]) -> tuple[int, int, int]:
-    """Where the rows of an accessor begin in its view, from one to the next, and the bytes of one."""
+    """Bytes of an accessor in its view: where its rows begin, from one row to the next, and in one row."""
     row = np.dtype(TYPES[accessor["componentType"]]).itemsize * WIDTHS[accessor["type"]]
     stride = descriptions[accessor["bufferView"]].get("byteStride", row)
     return count_of(accessor.get("byteOffset", 0)), count_of(stride), row
@@ -89,29 +89,29 @@ def rows_of(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views:
 def check_attributes(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[str, int]:
-    """Refuse attributes and indices that do not fit. Returns the accessors by what they are for, if they have data."""
+    """Refuse attributes and indices that do not fit. Returns the accessors that have data, by attribute."""
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
-    found = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}
-    sparse = [kind for kind, accessor in found.items() if "sparse" in accessor]
+    accessors = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}
+    sparse = [kind for kind, accessor in accessors.items() if "sparse" in accessor]
     if sparse:
         raise fail(f"{sparse[0]} of {name} is sparse, which is not read")
     quantized = QUANTIZATION in (*tree.get("extensionsUsed", []), *tree.get("extensionsRequired", []))
-    for kind, accessor in found.items():
+    for kind, accessor in accessors.items():
         if accessor["type"] not in ATTRIBUTES.get(kind, WIDTHS):
             raise fail(f"{kind} of {name} is of {accessor['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
         _check_components(f"{kind} of {name}, accessor {used[kind]},", kind, accessor, quantized, fail)
-    count = found["POSITION"]["count"]
-    different = [kind for kind in attributes if found[kind]["count"] != count]
+    count = accessors["POSITION"]["count"]
+    different = [kind for kind in attributes if accessors[kind]["count"] != count]
     if different:
-        raise fail(f"{different[0]} of {name} has {found[different[0]]['count']} rows, and POSITION {count}")
-    if "bufferView" not in found["POSITION"] and not importlib.util.find_spec("DracoPy"):
+        raise fail(f"{different[0]} of {name} has {accessors[different[0]]['count']} rows, and POSITION {count}")
+    if "bufferView" not in accessors["POSITION"] and not importlib.util.find_spec("DracoPy"):
         extensions = ", ".join(primitive.get("extensions", {})) or "none is named"
         raise fail(f"{name} has no data of its own, and the extension that has them is not read: {extensions}")
-    read = {kind: used[kind] for kind, a in found.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
+    read = {kind: used[kind] for kind, a in accessors.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
     _check_overlap(name, {kind: index for kind, index in read.items() if kind != "indices"}, tree, fail)
     _check_bounds(path, name, read, tree, views)
-    if "bufferView" in found["POSITION"]:
+    if "bufferView" in accessors["POSITION"]:
         _check_corners(name, primitive, count, used.get("indices"), tree, views, fail)
     return read
 
@@ -154,16 +154,16 @@ def _check_bounds(path: Path, name: str, read: dict[str, int], tree: dict[str, A
         if "min" not in accessor or "max" not in accessor or not accessor["count"]:
             continue
         rows = rows_of(accessor, tree["bufferViews"], views).astype(np.float64)
-        found = np.stack([rows.min(axis=0), rows.max(axis=0)])
+        bounds = np.stack([rows.min(axis=0), rows.max(axis=0)])
         try:
-            told = np.array([accessor["min"], accessor["max"]], np.float64)
-            slack = BOUNDS_TOLERANCE * np.ptp(found, axis=0) + 1e-5 * np.abs(found).max()
-            wrong = told.shape != found.shape or not (np.abs(found - told) <= slack).all()
+            declared = np.array([accessor["min"], accessor["max"]], np.float64)
+            slack = BOUNDS_TOLERANCE * np.ptp(bounds, axis=0) + 1e-5 * np.abs(bounds).max()
+            wrong = declared.shape != bounds.shape or not (np.abs(bounds - declared) <= slack).all()
         except (TypeError, ValueError):
             wrong = True
         if wrong:
             warn(
-                f"{path}: {kind} of {name} go from {found[0].tolist()} to {found[1].tolist()}, but min and max of "
+                f"{path}: {kind} of {name} go from {bounds[0].tolist()} to {bounds[1].tolist()}, but min and max of "
                 f"accessor {read[kind]} are {accessor['min']} and {accessor['max']}; the file may be damaged"
             )
 

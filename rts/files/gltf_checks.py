@@ -1,4 +1,4 @@
-"""GLB and glTF files checked before trimesh reads them: that what they promise is there, and colours are colours."""
+"""Checks of GLB and glTF files before trimesh reads them: promised data are present, and colours are colours."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rts.files.gltf_scenes import check_scenes
 from rts.files.images import is_image
 
 APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
-"""How names of extensions begin that say nothing of shapes."""
+"""Names of extensions that do not concern shapes begin like this."""
 PROPERTIES = {
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse",
     "bufferViews": "buffer byteOffset byteLength byteStride target",
@@ -36,7 +36,7 @@ MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
-    """The GLB, without what may follow its end; or one of the same, with numbers that trimesh reads rightly.
+    """The GLB, without bytes after its end; or an equal one with numbers that trimesh reads rightly.
 
     Args:
         path: its path.
@@ -74,17 +74,17 @@ def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
 
 
 def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[str, bytes]:
-    """The glTF itself, or a GLB of the same; arguments and errors are those of `sound_glb`."""
+    """The glTF itself, or an equal GLB; arguments and errors as for `sound_glb`."""
 
     def fail(what: str) -> InputError:
         return unreadable(path, "GLTF", what)
 
-    found = _checked(path, data, None, file, fail)
-    return ("gltf", data) if found is None else ("glb", found)
+    rewritten = _checked(path, data, None, file, fail)
+    return ("gltf", data) if rewritten is None else ("glb", rewritten)
 
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
-    """Refuse what is not sound. A GLB of the same, if there are numbers that trimesh would misread."""
+    """Refuse a damaged file. Return it as a GLB if it holds numbers that trimesh would misread, else None."""
     place = "its tree"
     try:
         tree = json.loads(text, parse_constant=_no_number, object_pairs_hook=_unique)
@@ -124,10 +124,10 @@ def _no_number(name: str) -> float:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError(f"one of {', '.join(found)[:60]} is there twice")
-    return found
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        raise ValueError(f"one of {', '.join(members)[:60]} is there twice")
+    return members
 
 
 def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) -> bytes:
@@ -193,7 +193,7 @@ def _view(index: int, view: dict[str, Any], buffers: list[bytes], fail: Any) -> 
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[int, str]:
-    """Refuse attributes that do not fit; which accessors trimesh would misread, and as what it would not."""
+    """Refuse attributes that do not fit. Return the accessors that trimesh would misread, with the type to take."""
     mode = count_of(primitive.get("mode", 4))
     if mode > 5:
         raise fail(f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)")
@@ -202,12 +202,12 @@ def _check_primitive(
     if "material" in primitive and count_of(primitive["material"]) >= len(tree.get("materials", [])):
         raise fail(f"{name} has material {primitive['material']}, which is not there")
     read = check_attributes(path, name, primitive, tree, views, fail)
-    found = {kind: tree["accessors"][index] for kind, index in read.items()}
-    colors = found.get("COLOR_0")
+    accessors = {kind: tree["accessors"][index] for kind, index in read.items()}
+    colors = accessors.get("COLOR_0")
     if colors is not None and colors["componentType"] == 5126:
         _check_colors(path, f"COLOR_0 of {name}", rows_of(colors, tree["bufferViews"], views), fail)
     changes = {}
-    for kind, accessor in found.items():
+    for kind, accessor in accessors.items():
         if kind == "COLOR_0":
             if accessor["componentType"] != 5121:
                 changes[read[kind]] = "u1"
@@ -232,14 +232,14 @@ def _check_names(path: Path, tree: dict[str, Any]) -> None:
     """Warn of properties that the format does not know, which may be others misspelt."""
     lists = {kind: tree.get(kind, []) for kind in PROPERTIES}
     lists["primitives"] = [p for mesh in lists["meshes"] for p in mesh["primitives"]]
-    found = []
+    unknown = []
     for kind, objects in lists.items():
         known = {*PROPERTIES[kind].split(), "name", "extensions", "extras"}
-        found += [f"{name!r} of {kind} {i}" for i, entry in enumerate(objects) for name in entry if name not in known]
+        unknown += [f"{name!r} of {kind} {i}" for i, entry in enumerate(objects) for name in entry if name not in known]
     for i, primitive in enumerate(lists["primitives"]):
-        found += [f"{name!r} of primitives {i}" for name in primitive["attributes"] if not ATTRIBUTE.fullmatch(name)]
-    if found:
-        warn(f"{path} has properties that glTF does not know, and that are left out: {', '.join(found[:5])}")
+        unknown += [f"{name!r} of primitives {i}" for name in primitive["attributes"] if not ATTRIBUTE.fullmatch(name)]
+    if unknown:
+        warn(f"{path} has properties that glTF does not know, and that are left out: {', '.join(unknown[:5])}")
 
 
 def _check_material(
@@ -251,7 +251,7 @@ def _check_material(
     file: Callable[[str], bytes],
     fail: Any,
 ) -> None:
-    """Refuse a colour or a texture that is none; trimesh leaves out what it cannot read."""
+    """Refuse an invalid colour or texture, which trimesh would leave out."""
     look = material.get("pbrMetallicRoughness", {})
     factor = np.array(look.get("baseColorFactor", [1.0] * 4), np.float64)
     if factor.shape != (4,):
@@ -275,7 +275,7 @@ def _check_material(
 
 
 def _check_colors(path: Path, name: str, colors: np.ndarray, fail: Any) -> None:
-    """Refuse colours (N, C) that are none; warn of those that trimesh brings into range."""
+    """Refuse invalid colours (N, C); warn of colours that trimesh brings into range."""
     wrong = ~(np.abs(colors) <= 255).all(axis=1)
     if wrong.any():
         at = int(np.argmax(wrong))

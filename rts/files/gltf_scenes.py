@@ -52,7 +52,7 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
 
 
 def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
-    """The parents of nodes. Whoever walked among nodes that are no forest would never end."""
+    """The parents of nodes, refused if nodes form no forest: a walk among these would never end."""
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for child in map(count_of, node.get("children", [])):
@@ -73,22 +73,22 @@ def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
 
 
 def _matrix(name: str, node: dict[str, Any], fail: Any) -> np.ndarray:
-    """The transform (4, 4) of a node, but for its rotation, which changes no volume. Its numbers are checked."""
-    given = {key: node[key] for key in _WIDTHS if key in node}
-    for key, values in given.items():
+    """The transform (4, 4) of a node without its rotation, which changes no volume. Its numbers are checked."""
+    entries = {key: node[key] for key in _WIDTHS if key in node}
+    for key, values in entries.items():
         numbers = isinstance(values, list) and all(isinstance(x, (int, float)) and x is not True for x in values)
         if not numbers or len(values) != _WIDTHS[key]:
             raise fail(f"{key} of {name} is {str(values)[:80]}; expected {_WIDTHS[key]} numbers")
-    if "matrix" in given and len(given) > 1:
+    if "matrix" in entries and len(entries) > 1:
         raise fail(
-            f"{name} has both matrix and {', '.join(key for key in given if key != 'matrix')}; expected one of them"
+            f"{name} has both matrix and {', '.join(key for key in entries if key != 'matrix')}; expected one of them"
         )
     matrix = np.eye(4)
-    if "matrix" in given:
-        matrix = np.array(given["matrix"], np.float64).reshape(4, 4).T
-    matrix[:3, 3] += given.get("translation", 0)
-    matrix[:3, :3] *= given.get("scale", 1)
-    length = np.linalg.norm(np.array(given.get("rotation", [0, 0, 0, 1]), np.float64))
+    if "matrix" in entries:
+        matrix = np.array(entries["matrix"], np.float64).reshape(4, 4).T
+    matrix[:3, 3] += entries.get("translation", 0)
+    matrix[:3, :3] *= entries.get("scale", 1)
+    length = np.linalg.norm(np.array(entries.get("rotation", [0, 0, 0, 1]), np.float64))
     if not abs(length - 1) <= 0.01:
-        raise fail(f"rotation of {name} is {given['rotation']}; expected a quaternion of length 1")
+        raise fail(f"rotation of {name} is {entries['rotation']}; expected a quaternion of length 1")
     return matrix

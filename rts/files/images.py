@@ -124,12 +124,12 @@ def _duration(kind: str, fps: float) -> int:
 
 
 def _each(frames: Any) -> Iterable[Any]:
-    """The frames; refused where they are none, or one image."""
+    """The frames of an animation, refused if there are none, or only one image."""
     shape = tuple(getattr(frames, "shape", ()))
     one = len(shape) in (1, 2) or (len(shape) == 3 and shape[2] in (1, 3, 4))
     if one or isinstance(frames, (str, bytes, dict)) or not isinstance(frames, Iterable):
-        given = f"one image, {shape}" if one else f"a {type(frames).__name__}"
-        raise InputError(f"frames is {given}; expected several images, such as a list of arrays (H, W, 4)")
+        description = f"one image, {shape}" if one else f"a {type(frames).__name__}"
+        raise InputError(f"frames is {description}; expected several images, such as a list of arrays (H, W, 4)")
     return frames
 
 
@@ -151,24 +151,24 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
 def _host(image: Any, name: str) -> np.ndarray:
     """A checked image as NumPy floats, (H, W, 3 or 4) or (H, W)."""
     shapes = "(H, W, 4), (H, W, 3), (H, W, 1) or (H, W)"
-    given: Any = image
+    pixels: Any = image
     if isinstance(image, (list, tuple)):
         with contextlib.suppress(ValueError, TypeError, RuntimeError):  # Of rows of different lengths, for example.
-            given = np.asarray(image)
-    if not hasattr(given, "shape"):
+            pixels = np.asarray(image)
+    if not hasattr(pixels, "shape"):
         raise InputError(f"{name} is {quoted(image)}, a {type(image).__name__}; expected an array {shapes}")
     try:
-        engine = engine_of(given)
+        engine = engine_of(pixels)
     except EngineError as error:
         raise InputError(
             f"{name} is a {type(image).__name__}; expected an array {shapes} of NumPy, torch or jax"
         ) from error
-    shape = tuple(given.shape)
+    shape = tuple(pixels.shape)
     if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] not in (1, 3, 4)):
         raise InputError(f"{name} has shape {shape}; expected {shapes}")
     if 100 * math.prod(shape) > MEMORY:  # A few copies in float64.
         raise InputError(f"{name} has shape {shape}, which does not fit into memory; write it in pieces")
-    array = np.asarray(engine.to_numpy(given))
+    array = np.asarray(engine.to_numpy(pixels))
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     if not np.issubdtype(array.dtype, np.floating):
@@ -223,7 +223,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def is_image(content: bytes) -> bool:
-    """Whether bytes begin like an image that Pillow reads."""
+    """True where bytes begin like an image that Pillow reads."""
     from PIL import Image
 
     try:

@@ -131,7 +131,7 @@ def _part(path: Path, piece: Piece, weld: bool) -> Part:
 
 
 def _used(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows without those that the table does not refer to, and the table into them."""
+    """Rows that a table refers to, and the table with the indices of these."""
     used, inverse = np.unique(table, return_inverse=True)
     return rows[used], inverse.reshape(table.shape)
 
@@ -205,7 +205,7 @@ def _in_scene(piece: Piece) -> Piece:
 
 
 def check_exists(path: Path) -> None:
-    """Refuse what is no regular file."""
+    """Refuse paths other than regular files."""
     if not path.exists():
         raise InputError(f"no file {path}; check the path (relative paths start at {Path.cwd()})")
     if path.is_dir():

@@ -16,7 +16,7 @@ from rts.files.paths import inside
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
 _MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
 _MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
-"""A comment by which MeshLab signs; its Tr is 1 for what is opaque."""
+"""A comment by which MeshLab signs; its Tr is 1 for opaque materials."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
 
 
@@ -39,7 +39,7 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     Raises:
         InputError: it cannot be read, a number is not finite, or it refers to a file outside the folder.
     """
-    found: dict[str, dict[str, Any]] = {}
+    materials: dict[str, dict[str, Any]] = {}
     current: dict[str, Any] = {}
     lines = lines_of(contents(library))
     of_meshlab = any(_MESHLAB.match(line) for line in lines)
@@ -48,7 +48,7 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
         key, rest = key.lower(), rest.strip()
         values = _numbers(library, number, rest) if key in ("kd", "d", "tr") else []
         if key == "newmtl":
-            current = found.setdefault(rest, {})
+            current = materials.setdefault(rest, {})
         elif key == "kd" and len(values) in (1, 3):
             current["color"] = np.resize(values, 3)
         elif key == "d" and len(values) == 1:
@@ -59,7 +59,7 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
             file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
             if key == "map_kd":
                 current["texture"] = file
-    return {name: _material(values) for name, values in found.items()}
+    return {name: _material(values) for name, values in materials.items()}
 
 
 def _numbers(library: Path, number: int, text: str) -> list[float]:

@@ -19,9 +19,9 @@ from rts.files.pieces import Piece
 from rts.files.srgb import decode_srgb
 
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
-"""How many numbers rows may have: a position may have a weight, or a colour, and that an alpha."""
+"""Counts of numbers in a row: a position may have a weight, or a colour, which may have an alpha."""
 FACES = ("f", "fo")
-"""Statements of faces; "fo" is what "f" was called once."""
+"""Statements of faces; "fo" is the older name of "f"."""
 LEFT_OUT = frozenset(
     "vp deg bmat step cstype p l curv curv2 surf parm trim hole scrv sp end con g s mg o bevel c_interp d_interp lod "
     "shadow_obj trace_obj ctech stech call csh maplib usemap bzp bsp cdc cdp res".split()
@@ -142,7 +142,7 @@ class _Lines:
             raise
 
     def polygons(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Zero-based indices of position, uv and normal (H, 3) of all corners, and how many each face has (F,).
+        """Zero-based indices of position, uv and normal (H, 3) of all corners, and the corner count of each face (F,).
 
         An index that is not given is −1.
         """
@@ -189,7 +189,7 @@ class _Lines:
 
 
 class Polygons(NamedTuple):
-    """The faces of an OBJ file as they are, all materials in one.
+    """The faces of an OBJ file as polygons, all materials in one.
 
     Attributes:
         vertices: (V, 3) float64.
@@ -198,7 +198,7 @@ class Polygons(NamedTuple):
         sizes: (F,) int64, how many corners each face has.
         corners: (H, 3) int64, position, uv and normal of the corners of all faces; −1 where one is not given.
         tags: the statements "t", as OpenSubdiv's files have them, each with the number of its line.
-        materials: how many materials faces have.
+        materials: the number of materials of faces.
         color: (3,) or (4,) in [0, 1], linear, of the only material; None of none, or of several.
         texture: (h, w, 3 or 4) float32 in [0, 1], linear, of that material; or None.
     """
@@ -223,8 +223,8 @@ def read_polygons(path: Path) -> Polygons:
     lines = _Lines(path).read()
     v, vt, vn = _rows(lines)
     used = {material for _, _, material in lines.faces}
-    found = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
-    material = found[0] if len(used) == len(found) == 1 else Material()
+    materials = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
+    material = materials[0] if len(used) == len(materials) == 1 else Material()
     corners, sizes = lines.polygons((len(v), len(vt), len(vn)))
     texture = None if material.texture is None else read_texture(material.texture, path)
     linear = (None if x is None else decode_srgb(x) for x in (_colors(v), material.color, texture))
@@ -280,12 +280,12 @@ def read_obj(path: Path) -> list[Piece]:
 
 def _materials(lines: _Lines) -> dict[str | None, Material]:
     """The materials of all libraries by name."""
-    found: dict[str | None, Material] = {}
+    materials: dict[str | None, Material] = {}
     complete = True
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)
         if library.is_file():
-            found.update(read_mtl(library, lines.path.parent))
+            materials.update(read_mtl(library, lines.path.parent))
         else:
             warn(
                 f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "
@@ -293,15 +293,15 @@ def _materials(lines: _Lines) -> dict[str | None, Material]:
             )
             complete = False
     used = {index for _, _, index in lines.faces}
-    missing = [name for name, index in lines.materials.items() if name and index in used and name not in found]
+    missing = [name for name, index in lines.materials.items() if name and index in used and name not in materials]
     if missing and complete and lines.libraries:
         names = ", ".join(map(repr, missing[:5]))
         warn(f"{lines.path} uses materials that its libraries lack: {names}; they are loaded as plain ones")
-    return found
+    return materials
 
 
 def _statements(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, those that end in a backslash joined with the next.
+    """Lines with their numbers; a line that ends in a backslash is joined with the next.
 
     A comment ends with its line: a backslash there is the end of a folder's name.
     """

@@ -1,4 +1,4 @@
-"""OFF and STL files checked before trimesh reads them, which takes what is there for what is promised."""
+"""Checks of OFF and STL files before trimesh reads them, which does not compare data with the header."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TRIANGLE = _RECORD.itemsize
 
 
 def text_of(path: Path, kind: str, data: bytes) -> str:
-    """A file's text; an InputError where the bytes are none."""
+    """A file's text; an InputError if the bytes are no text."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -40,7 +40,7 @@ def text_of(path: Path, kind: str, data: bytes) -> str:
 
 
 def plain_off(path: Path, data: bytes) -> bytes:
-    """A binary PLY of triangles with what an OFF holds: vertices, their colours, and polygons.
+    """A binary PLY of triangles with the content of an OFF: vertices, their colours, and polygons.
 
     Raises:
         InputError: rows are not as many as promised, or not as long; something is no number; a face has less than 3
@@ -86,23 +86,23 @@ def plain_off(path: Path, data: bytes) -> bytes:
 def _vertices(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray:
     if not rows:
         raise fail("it promises no vertices")
-    found = numbers_of(rows, fail)
-    if isinstance(found, np.ndarray) and found.shape[1] >= 3:
-        return found
-    usual = max(len(row) for row in found)
-    number = next((n for (n, _), row in zip(rows, found, strict=True) if len(row) < max(usual, 3)), 0)
+    numbers = numbers_of(rows, fail)
+    if isinstance(numbers, np.ndarray) and numbers.shape[1] >= 3:
+        return numbers
+    usual = max(len(row) for row in numbers)
+    number = next((n for (n, _), row in zip(rows, numbers, strict=True) if len(row) < max(usual, 3)), 0)
     raise fail(f"line {number} ought to be a vertex, and has not as many numbers as others, or less than 3")
 
 
 def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.ndarray, np.ndarray]:
-    """How many corners each face has, and all corners, one face after the other."""
-    found = numbers_of(rows, fail) if rows else []
-    if isinstance(found, np.ndarray) and (found[:, 0] == found.shape[1] - 1).all() and found.shape[1] > 3:
-        faces = found[:, 1:]
+    """The number of corners of each face, and all corners, face after face."""
+    numbers = numbers_of(rows, fail) if rows else []
+    if isinstance(numbers, np.ndarray) and (numbers[:, 0] == numbers.shape[1] - 1).all() and numbers.shape[1] > 3:
+        faces = numbers[:, 1:]
         if ((faces >= 0) & (faces < 2**31) & (faces == np.floor(faces))).all():
             return np.full(len(faces), faces.shape[1]), faces.astype(np.int64).ravel()
     sizes, corners, colored = [], [], 0
-    for (number, line), row in zip(rows, found, strict=True):
+    for (number, line), row in zip(rows, numbers, strict=True):
         size = int(row[0]) if 3 <= row[0] < len(row) else 0
         face = row[: size + 1]
         if size == 0 or not all(0 <= x < 2**31 and x == int(x) for x in face):
@@ -122,7 +122,7 @@ def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.n
 
 
 def sound_stl(path: Path, data: bytes) -> bytes:
-    """The STL itself where it is binary and as long as it promises; one in text as nothing but solids and vertices.
+    """A binary STL as it is, if its length is right; an STL in text rewritten as solids and vertices only.
 
     Raises:
         InputError: it is longer or shorter, or the text departs from the format.
@@ -140,8 +140,8 @@ def sound_stl(path: Path, data: bytes) -> bytes:
     text_of(path, "STL", data)
     text = "\n".join([*lines_of(data), ""])
     solids, at = [], 0
-    while found := _SOLID.match(text, at):
-        at = begin = found.end()
+    while opening := _SOLID.match(text, at):
+        at = begin = opening.end()
         while facet := _FACET.match(text, at):
             at = facet.end()
         end = _END.match(text, at)
@@ -152,13 +152,13 @@ def sound_stl(path: Path, data: bytes) -> bytes:
         at = end.end()
     if at < len(text.rstrip()) or not text.strip():
         line = text.count("\n", 0, at) + 1
-        there = " ".join(text[at : at + 200].split())[:40]
-        raise unreadable(path, "STL", f"line {line}, {there!r}, is no solid, facet of three vertices, or endsolid")
+        excerpt = " ".join(text[at : at + 200].split())[:40]
+        raise unreadable(path, "STL", f"line {line}, {excerpt!r}, is no solid, facet of three vertices, or endsolid")
     return "".join(solids).encode()
 
 
 def _check_records(path: Path, records: np.ndarray) -> None:
-    """Refuse triangles whose bytes are not where they ought to be.
+    """Refuse triangles whose bytes are misplaced.
 
     Their numbers are of any size, then: coordinates are too small or too large to be any, and normals have no length
     of 1, nor of 0.

@@ -23,18 +23,18 @@ from rts.errors import InputError
 def as_path(path: Any) -> Path:
     """A path from a string or path object; an InputError where no file can have that name."""
     try:
-        found = Path(os.fspath(path))
+        result = Path(os.fspath(path))
     except TypeError:
         raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path") from None
     try:
-        found.lstat()
+        result.lstat()
     except ValueError:
         raise InputError(f"the path is {str(path)[:60]!r}, which no file can be called; choose another name") from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL):
             shown = str(path) if len(str(path)) <= 60 else f"{str(path)[:57]}..."
             raise InputError(f"the path {shown!r} is no good ({error.strerror}); choose another name") from None
-    return found
+    return result
 
 
 def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:
@@ -75,7 +75,7 @@ def output_folder(path: Any) -> Path:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turns what goes wrong while a file is written, or the folders above it, into an InputError of one line."""
+    """Turns errors while a file, or the folders above it, are written into an InputError of one line."""
     try:
         yield
     except (OSError, MemoryError, struct.error, OverflowError) as error:
@@ -110,7 +110,7 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
 
 
 def cache_folder() -> Path:
-    """Where what is costly to make is kept from one process to the next, such as compiled libraries."""
+    """The folder of files that are costly to make, such as compiled libraries; later processes read them."""
     try:
         if sys.platform == "darwin":
             return Path.home() / "Library" / "Caches" / "rts"

@@ -10,7 +10,7 @@ import numpy as np
 from rts.errors import InputError
 
 WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "colors": (3, 4)}
-"""How many numbers the rows of each table have."""
+"""Numbers in a row of each table."""
 LARGEST = float(np.finfo(np.float32).max)
 SINGULAR = 1e-9
 """The least volume of a parallelepiped for the product of its edges."""
@@ -26,7 +26,7 @@ class Piece(NamedTuple):
             it. Colours are in [0, 1], as encoded in the file.
         texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, alpha straight; or None.
         color: (3,) or (4,) factor of the material, as encoded in the file; or None.
-        linear: whether `color` and the attribute "colors" are linear rather than sRGB.
+        linear: True if `color` and the attribute "colors" are linear rather than sRGB.
         transform: (4, 4) scene-from-local, or None.
     """
 

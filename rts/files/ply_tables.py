@@ -50,7 +50,7 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
-    """A table that the header promises: its name, how many rows, and its columns."""
+    """A table that the header promises: its name, number of rows, and columns."""
 
     name: str
     rows: int
@@ -58,7 +58,7 @@ class Element(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """What a file of polygons holds.
+    """The tables of a file of polygons.
 
     Attributes:
         vertices: columns (V,) by name, "x", "y" and "z" among them.
@@ -160,7 +160,7 @@ def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> di
     if not {"red", "green", "blue"} <= set(columns):
         return columns
     names = [name for name in COLORS if name in columns]
-    found = dict(columns)
+    converted = dict(columns)
     for name in names:
         values, kind = np.asarray(columns[name], np.float64), columns[name].dtype.kind
         # Alpha may be of another kind than the others.
@@ -173,8 +173,8 @@ def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> di
                 f"row {row} of {element} has {name} = {values[row]:g}; expected colours from 0 to 1, or from 0 to 255"
             )
         scale = 255.0 if kind == "f" and top <= 1 else 255 / limit
-        found[name] = np.round(values * scale).astype(np.uint8)
-    return found
+        converted[name] = np.round(values * scale).astype(np.uint8)
+    return converted
 
 
 # ------------------------------------------------------------------------------------------------ reading
@@ -210,7 +210,7 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
 
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
-    """What is promised: elements, layout, the name of a texture; and where the data begin."""
+    """The header's elements, layout and name of a texture; and the place where the data begin."""
     # Lines of a Macintosh end in CR alone.
     newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", data) else b"\n"
     end = data.find(newline + b"end_header") + 1
@@ -279,15 +279,15 @@ def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray | list[lis
             return np.loadtxt(lines, comments=None, ndmin=2)
     except ValueError:
         pass
-    found = []
+    numbers = []
     for number, line in rows:
         try:
             if "_" in line or not is_plain(line):  # Python takes 1_0 for 10.
                 raise ValueError
-            found.append([float(word) for word in line.split()])
+            numbers.append([float(word) for word in line.split()])
         except ValueError:
             raise fail(f"line {number}, {' '.join(line.split())[:60]!r}, is not of numbers") from None
-    return found
+    return numbers
 
 
 def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> dict[str, Any]:
@@ -296,7 +296,7 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> di
         return {p.name: np.zeros(0, p.type) if p.length_type is None else _joined([], [], p.type) for p in properties}
     values = numbers_of(rows, fail)
     numbers = np.array([number for number, _ in rows])
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     # The places of columns in the rows, where those are all alike.
     places = _places(properties, values[0])
     table = values if isinstance(values, np.ndarray) else np.zeros((0, 0))
@@ -304,8 +304,8 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> di
         for p, begin, end in places:
             block = _typed(element, p, table[:, begin:end], numbers, fail)
             lengths = [end - begin] * len(rows)
-            found[p.name] = block[:, 0] if p.length_type is None else _joined(lengths, [block.ravel()], p.type)
-        return found
+            columns[p.name] = block[:, 0] if p.length_type is None else _joined(lengths, [block.ravel()], p.type)
+        return columns
     parts: dict[str, list[Any]] = {p.name: [] for p in properties}
     for number, row in zip(numbers, values, strict=True):
         places = _places(properties, row)
@@ -317,12 +317,12 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> di
         sizes = np.array([len(part) for part in parts[p.name]])
         flat = np.array([x for part in parts[p.name] for x in part])
         block = _typed(element, p, flat[:, None], np.repeat(numbers, sizes), fail)[:, 0]
-        found[p.name] = block if p.length_type is None else _joined(sizes, [block], p.type)
-    return found
+        columns[p.name] = block if p.length_type is None else _joined(sizes, [block], p.type)
+    return columns
 
 
 def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, int]] | None:
-    """Where each property begins and ends in a row of numbers; None where the row is too long or too short."""
+    """First and last place of each property in a row of numbers; None if the row is too long or too short."""
     places, at = [], 0
     for p in properties:
         length = 1
@@ -339,13 +339,13 @@ def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, i
 def _typed(element: Element, p: Property, values: np.ndarray, numbers: Any, fail: Fail) -> np.ndarray:
     """Numbers (R, C) as the type that the header promises."""
     with np.errstate(over="ignore", invalid="ignore"):
-        found = values.astype(p.type)
-    wrong = (found != values).any(axis=1) if p.type[0] != "f" else np.zeros(len(values), bool)
+        typed = values.astype(p.type)
+    wrong = (typed != values).any(axis=1) if p.type[0] != "f" else np.zeros(len(values), bool)
     if wrong.any():
         at = int(np.argmax(wrong))
-        value = values[at][found[at] != values[at]][0]
+        value = values[at][typed[at] != values[at]][0]
         raise fail(f"line {numbers[at]} has {value:g} for {p.name} of {element.name}, which is no {NAMES[p.type]}")
-    return found
+    return typed
 
 
 # ------------------------------------------------------------------------------------------------ binary
@@ -390,7 +390,7 @@ def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str
     if element.rows * row.itemsize > len(data) - at:
         return None
     table = np.frombuffer(data, row, element.rows, at)
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     for p in element.properties:
         column = table[p.name].astype(p.type)
         if p.length_type is not None:
@@ -398,8 +398,8 @@ def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str
             if not (lengths == column.shape[1]).all():
                 return None
             column = _joined(lengths, [column.ravel()], p.type)
-        found[p.name] = column
-    return found, at + element.rows * row.itemsize
+        columns[p.name] = column
+    return columns, at + element.rows * row.itemsize
 
 
 def _different(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int]:
@@ -420,9 +420,9 @@ def _different(element: Element, data: bytes, at: int, order: str) -> tuple[dict
                     raise struct.error
             entries.append(struct.unpack_from(f"{order}{length}{code}", data, at))
             at += length * size
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     for p in element.properties:
         flat = np.array([x for part in parts[p.name] for x in part], p.type)
         lengths = [len(part) for part in parts[p.name]]
-        found[p.name] = flat if p.length_type is None else _joined(lengths, [flat], p.type)
-    return found, at
+        columns[p.name] = flat if p.length_type is None else _joined(lengths, [flat], p.type)
+    return columns, at

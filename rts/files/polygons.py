@@ -35,18 +35,18 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
     turned = _turned(points, corners[triangles], owner, sizes)
     # A quad has only one other diagonal; there may be many of them.
     quads = turned[sizes[turned] == 4]
-    others = (ends - 4)[quads, None, None] + np.array([[1, 2, 3], [1, 3, 0]])
+    other_fans = (ends - 4)[quads, None, None] + np.array([[1, 2, 3], [1, 3, 0]])
     places = np.repeat(np.arange(len(quads)), 2)
-    worse = _turned(points, corners[others.reshape(-1, 3)], places, sizes[quads])
+    worse = _turned(points, corners[other_fans.reshape(-1, 3)], places, sizes[quads])
     right = np.setdiff1d(np.arange(len(quads)), worse)
-    triangles[first[quads[right]][:, None] + np.arange(2)] = others[right]
+    triangles[first[quads[right]][:, None] + np.arange(2)] = other_fans[right]
     for polygon in np.setdiff1d(turned, quads[right]):
         begin, count = ends[polygon] - sizes[polygon], sizes[polygon]
-        found = _ears(points[corners[begin : begin + count]])
-        if found is None:
+        ears = _ears(points[corners[begin : begin + count]])
+        if ears is None:
             forced += 1
         else:
-            triangles[first[polygon] : first[polygon] + count - 2] = begin + found
+            triangles[first[polygon] : first[polygon] + count - 2] = begin + ears
     return triangles, owner, forced
 
 
@@ -66,7 +66,7 @@ def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes:
 
 
 def _ears(ring: np.ndarray) -> np.ndarray | None:
-    """(n − 2, 3) int triangles of one polygon of corners (n, 3), or None where there are none that fit."""
+    """Triangles (n − 2, 3) int of one polygon of corners (n, 3), or None if no triangles fit."""
     import mapbox_earcut
 
     size = np.abs(ring).max()
@@ -75,13 +75,13 @@ def _ears(ring: np.ndarray) -> np.ndarray | None:
     # Across the axis that the normal is nearest to, so that areas keep their signs.
     axis = int(np.argmax(np.abs(normal)))
     flat = np.ascontiguousarray(ring[:, [(axis + 1) % 3, (axis + 2) % 3]] * [np.sign(normal[axis]), 1])
-    found = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32)).reshape(-1, 3).astype(np.int64)
-    if _areas(flat[found]).sum() < 0:
-        found = found[:, ::-1]
-    found = _with_slivers(found, len(flat))
+    ears = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32)).reshape(-1, 3).astype(np.int64)
+    if _areas(flat[ears]).sum() < 0:
+        ears = ears[:, ::-1]
+    ears = _with_slivers(ears, len(flat))
     # Where a polygon crosses itself, triangles overlap, or are too few.
-    excess = np.abs(_areas(flat[found])).sum() - abs(normal[axis]) / 2
-    return found if len(found) == len(flat) - 2 and abs(excess) <= TOLERANCE * abs(normal[axis]) else None
+    excess = np.abs(_areas(flat[ears])).sum() - abs(normal[axis]) / 2
+    return ears if len(ears) == len(flat) - 2 and abs(excess) <= TOLERANCE * abs(normal[axis]) else None
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:

@@ -27,11 +27,11 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 PLANES = (0.01, 1000.0)
 """Near and far planes of cameras whose file tells no bounds."""
 MARGIN = 100.0
-"""How much nearer, and farther, than what a file tells of its scene the planes of its cameras are."""
+"""Factor by which a camera's planes lie nearer, and farther, than the bounds of the scene in its file."""
 SCALE_OF_NEAREST = 0.75
 """In NeRF's frame of LLFF scenes the nearest bound is 1 / 0.75."""
 OFF_CENTRE = 1e-3
-"""How far, in widths of the image, what a file tells of a lens twice may differ."""
+"""Largest difference, in widths of the image, of two statements of a file about one lens."""
 HEADER, ROW = 5, 17
 """Columns of the matrix (3, 5) of an LLFF pose, and numbers in a row of poses_bounds.npy."""
 
@@ -43,7 +43,7 @@ class View:
         camera: the camera, float64 NumPy.
         size: (height, width).
         image: (H, W, 3 or 4) float32, or a function that gives it whenever it is asked for.
-        name: what the picture is called in its file.
+        name: the picture's name in its file.
         near: the depth at which the scene begins, in the units of the camera; None where that is not known.
         far: the depth at which it ends, or None.
     """
@@ -96,9 +96,9 @@ def load_views(
     Args:
         path: one of these files, or its folder.
         split: which transforms_….json of a folder: "train", "val" or "test".
-        downscale: n, to give images of 1/n of the size: means of n × n pixels of what `linear` says, premultiplied. In
-            LLFF the folder `images_n` is used instead, where there is one.
-        linear: whether images are to be linear, as `rts.load_image` gives them; False for the numbers of the file, sRGB
+        downscale: n, for images of 1/n of the size: means of n × n premultiplied pixels, encoded as `linear` says. In
+            LLFF the folder `images_n` is used instead, if it exists.
+        linear: True if images are to be linear, as `rts.load_image` gives them; False for the numbers of the file, sRGB
             as a rule. NeRF is trained on these, composited and averaged as they are.
         background: "white", "black" or a colour (3,), encoded like the images, to put them on: (H, W, 3); None for
             (H, W, 4) premultiplied.
@@ -110,7 +110,7 @@ def load_views(
             same in both.
         near: near plane of the cameras; default 0.01, or a hundredth of the nearest bound.
         far: far plane; default 1000, or a hundred times the farthest bound.
-        cache: whether to keep each image once it is read.
+        cache: True to keep each image once it is read.
 
     Returns:
         A list of views: `camera` (float64 NumPy), `size`, `image` (float32), `name`, and `near` and `far` of the scene
@@ -143,17 +143,17 @@ def colour_named(colour: Any) -> np.ndarray:
     Raises:
         InputError: it is something else.
     """
-    found = COLOURS.get(colour) if isinstance(colour, str) else colour
-    if isinstance(colour, str) and found is None:
+    value = COLOURS.get(colour) if isinstance(colour, str) else colour
+    if isinstance(colour, str) and value is None:
         raise InputError(f"background is {quoted(colour)}; expected 'white', 'black' or a colour (3,)")
-    known = check_numbers("background", found, (3,))
+    known = check_numbers("background", value, (3,))
     if known is None or known.min() < 0 or known.max() > 1:
         raise InputError(f"background is {quoted(colour)}; expected a colour (3,) of numbers from 0 to 1")
     return known.astype(np.float32)
 
 
 class _Pose(NamedTuple):
-    """What a file says of one picture: how small it is to be made yet, its focal length over its width, its bounds."""
+    """A picture's entry in a file: the reduction still to be made, focal length over width, bounds."""
 
     path: Path
     size: tuple[int, int]
@@ -176,13 +176,13 @@ def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: A
         raise InputError(f"split is {quoted(split)}; expected a name such as 'train'")
     if path.is_dir():
         candidates = [path / "poses_bounds.npy", as_path(path / f"transforms_{split}.json"), path / "transforms.json"]
-        found = [p for p in candidates if p.is_file()]
-        if not found:
+        existing = [p for p in candidates if p.is_file()]
+        if not existing:
             names = ", ".join(p.name for p in candidates)
             raise InputError(f"the folder {path} has none of {names}; expected a data set of Blender's or LLFF's form")
-        if len(found) > 1:
-            raise InputError(f"the folder {path} has {' and '.join(p.name for p in found)}; give the path of one")
-        return found[0]
+        if len(existing) > 1:
+            raise InputError(f"the folder {path} has {' and '.join(p.name for p in existing)}; give the path of one")
+        return existing[0]
     if not path.is_file():
         raise InputError(f"there is no file {path}; check the path (relative paths start at {Path.cwd()})")
     if path.suffix.lower() not in (".json", ".npy"):
@@ -248,14 +248,14 @@ def _picture_size(path: Path) -> tuple[int, int]:
 
 def _blender(path: Path, downscale: int) -> list[_Pose]:
     try:
-        found = json.loads(contents(path))
+        tree = json.loads(contents(path))
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError.
         said = " ".join(str(error).split())[:80]
         raise InputError(f"{path} is no JSON ({said}); the file may be cut short: export it again") from error
-    if not isinstance(found, Mapping):
-        raise InputError(f"{path} holds a {type(found).__name__}; expected an object with camera_angle_x and frames")
-    angle: Any = found.get("camera_angle_x")
-    frames = found.get("frames")
+    if not isinstance(tree, Mapping):
+        raise InputError(f"{path} holds a {type(tree).__name__}; expected an object with camera_angle_x and frames")
+    angle: Any = tree.get("camera_angle_x")
+    frames = tree.get("frames")
     if not is_real(angle) or not 0 < angle < math.pi:
         what = "lacks camera_angle_x" if angle is None else f"has a camera_angle_x of {quoted(angle)}"
         raise InputError(f"{path} {what}; expected the horizontal field of view in radians, between 0 and π")
@@ -273,23 +273,23 @@ def _blender(path: Path, downscale: int) -> list[_Pose]:
         matrix = _rigid(place, frame["transform_matrix"], (4, 4), (3, 4))
         picture = _named(path, place, frame["file_path"])
         size = _picture_size(picture)
-        _check_lens(place, {**found, **frame}, focal, size)
+        _check_lens(place, {**tree, **frame}, focal, size)
         poses.append(_Pose(picture, size, downscale, matrix, focal))
     return poses
 
 
-def _check_lens(place: str, found: Mapping[str, Any], focal: float, size: tuple[int, int]) -> None:
-    """Refuse what other tools write into such files that is not followed: distortion, and axes off the centre."""
-    bent = [k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if found.get(k)]
+def _check_lens(place: str, lens: Mapping[str, Any], focal: float, size: tuple[int, int]) -> None:
+    """Refuse lenses that other tools write and that are not supported: distortion, and axes off the centre."""
+    bent = [k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if lens.get(k)]
     if bent:
         raise InputError(f"{place} has a lens that distorts ({', '.join(bent)}), which is not followed; undistort it")
-    width = found["w"] if is_real(found.get("w")) and found["w"] > 0 else size[1]
+    width = lens["w"] if is_real(lens.get("w")) and lens["w"] > 0 else size[1]
     height = width * size[0] / size[1]
     for key, expected in (("fl_x", focal * width), ("fl_y", focal * width), ("cx", width / 2), ("cy", height / 2)):
-        given = found.get(key, expected)
-        if not is_real(given) or not abs(given - expected) <= OFF_CENTRE * width:
+        value = lens.get(key, expected)
+        if not is_real(value) or not abs(value - expected) <= OFF_CENTRE * width:
             raise InputError(
-                f"{place} has {key} = {quoted(given)}, where camera_angle_x makes it {expected:.6g}; expected a camera "
+                f"{place} has {key} = {quoted(value)}, where camera_angle_x makes it {expected:.6g}; expected a camera "
                 "of square pixels that looks through the middle of its image"
             )
 
@@ -383,8 +383,8 @@ def _nerf_frame(poses: list[_Pose]) -> list[_Pose]:
     mean = np.eye(4)
     mean[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in axes], axis=1)
     mean[:3, 3] = position
-    found = np.linalg.inv(mean) @ matrices
+    recentred = np.linalg.inv(mean) @ matrices
     return [
         pose._replace(camera_to_world=m, near=(pose.near or 0) * scale, far=(pose.far or 0) * scale)
-        for pose, m in zip(poses, found, strict=True)
+        for pose, m in zip(poses, recentred, strict=True)
     ]

@@ -23,7 +23,7 @@ LINEAR_COLORS = {"glb", "gltf"}
 
 
 class _Folder:
-    """Resolves names for trimesh in the model's folder; keeps what went wrong, which trimesh only logs."""
+    """Resolves names for trimesh in the model's folder; keeps the errors, which trimesh only logs."""
 
     def __init__(self, path: Path):
         self.path, self.problem = path, None
@@ -50,10 +50,10 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     from trimesh.exchange.load import mesh_formats
 
     if extension not in mesh_formats():
-        others = ", ".join(sorted(mesh_formats() - {"obj", "ply", "stl", "glb", "gltf", "off"}))
+        formats = ", ".join(sorted(mesh_formats() - {"obj", "ply", "stl", "glb", "gltf", "off"}))
         raise InputError(
             f"{path} has the extension {path.suffix!r}, which is not known; expected obj, ply, stl, glb, "
-            f"gltf, off or another of trimesh's: {others}"
+            f"gltf, off or another of trimesh's: {formats}"
         )
     folder: Any = _Folder(path)
     kind = extension.upper()
@@ -82,7 +82,7 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
 
 
 def _checked(path: Path, extension: str, data: bytes, folder: _Folder) -> tuple[str, bytes]:
-    """The format and the bytes that trimesh is to read, once what the file promises has been found to be there."""
+    """The format and the bytes for trimesh to read, after the checks of the file."""
     match extension:
         case "ply":
             return "ply", plain_ply(path, data, folder.get)

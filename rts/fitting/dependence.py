@@ -1,4 +1,4 @@
-"""Whether a function depends on the parameters at all, and which directions of them it does not determine."""
+"""Functions that do not depend on their parameters, and directions that they do not determine."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rts.errors import EngineError, InputError
 from rts.fitting.parameter_names import listed
 
 UNSEEN = 0.02
-"""Numbers below this share of a direction's largest are left out where it is told."""
+"""Numbers below this share of a direction's largest are left out of its description."""
 SHORT = 4
-"""Arrays of at most so many numbers are told as a vector."""
+"""Arrays of at most so many numbers are described as a vector."""
 
 NO_WAY = "no derivative leads from the one to the other"
 
@@ -25,35 +25,35 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
     """The engine of parameters that have derivatives.
 
     Args:
-        parameters: what a user gave.
-        purpose: what an error adds to what it expects.
+        parameters: a user's parameters.
+        purpose: text for the end of an error.
 
     Raises:
         InputError: no arrays that have derivatives.
         EngineError: arrays of two engines.
     """
     try:
-        found = list(leaves(parameters))
+        arrays = list(leaves(parameters))
     except TypeError:  # Keys of several kinds have no order.
         raise InputError("parameters has keys that cannot be sorted; expected names") from None
-    for x in found:
+    for x in arrays:
         try:
             engine_of(x)
         except EngineError:
             raise InputError(f"parameters holds {kind_of(x)}; expected torch or jax arrays{purpose}") from None
-    if not found or any(is_constant(x) for x in found):
+    if not arrays or any(is_constant(x) for x in arrays):
         raise InputError(f"parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays{purpose}")
     engine = engine_of(parameters)
-    for x in found:
+    for x in arrays:
         if not engine.namespace.isdtype(x.dtype, "real floating"):
             raise InputError(f"parameters holds an array of dtype {x.dtype}; expected a floating one{purpose}")
-    if all(0 in x.shape for x in found):
+    if all(0 in x.shape for x in arrays):
         raise InputError(f"parameters holds no number, only empty arrays; expected at least one{purpose}")
     return engine
 
 
 def refuse_independent(residuals: Callable, loss: Callable | None, parameters: Tree, engine: Engine) -> None:
-    """Refuse functions whose results no derivative connects to the parameters; for those whose gradient is zero.
+    """Refuse a function whose results no derivative connects to the parameters. Called where a gradient is zero.
 
     A result is connected where the engine marks it as it marks the parameters: in torch by the graph, in jax by being
     traced. A gradient may be zero though all is connected, such as where nothing is in view.
@@ -64,12 +64,12 @@ def refuse_independent(residuals: Callable, loss: Callable | None, parameters: T
     marks: dict[str, bool] = {}
 
     def probe(p: Tree) -> Array:
-        given = next(x for x in leaves(p) if 0 not in x.shape)
-        marks["parameters"] = _marked(given, engine)
-        found = residuals(p)
-        marks["residuals"] = _marked(found, engine)
-        marks["loss"] = loss is None or _marked(loss(found), engine)
-        return engine.namespace.sum(given)
+        parameter = next(x for x in leaves(p) if 0 not in x.shape)
+        marks["parameters"] = _marked(parameter, engine)
+        values = residuals(p)
+        marks["residuals"] = _marked(values, engine)
+        marks["loss"] = loss is None or _marked(loss(values), engine)
+        return engine.namespace.sum(parameter)
 
     engine.value_and_grad(probe)(parameters)
     if not marks["parameters"]:
@@ -87,7 +87,7 @@ def _marked(x: Array, engine: Engine) -> bool:
 
 
 def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[str], shapes: Sequence[tuple]) -> str:
-    """Directions of the parameters, told by names and numbers.
+    """Directions of the parameters, described by names and numbers.
 
     Args:
         basis: (U, k), linearly independent columns that span the directions, in numbers of the parameters.
@@ -109,21 +109,23 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
     columns = columns / units[:, None]
     columns /= np.linalg.norm(columns, axis=0)
     starts = np.cumsum([0, *(int(np.prod(s)) for s in shapes)])
-    whole, found = [], []
+    whole, entries = [], []
     single = (columns != 0).sum(axis=0) == 1
     alone = (columns[:, single] != 0).any(axis=1)
     for name, first, stop in zip(names, starts, starts[1:], strict=False):
         if alone[first:stop].all() and stop > first:
             whole.append((first, name))
             alone[first:stop] = False
-    found += whole
+    entries += whole
     for column in columns.T[[not s or bool(alone[c != 0].any()) for s, c in zip(single, columns.T, strict=True)]]:
         column = column * np.sign(column[np.argmax(np.abs(column))])
         terms = []
         for name, shape, first, stop in zip(names, shapes, starts, starts[1:], strict=False):
             terms += _terms(name, shape, column[first:stop])
-        found.append((int(np.flatnonzero(column)[0]), " with ".join([*terms[:3], *(["others"] if terms[3:] else [])])))
-    return listed([text for _, text in sorted(found)])
+        entries.append(
+            (int(np.flatnonzero(column)[0]), " with ".join([*terms[:3], *(["others"] if terms[3:] else [])]))
+        )
+    return listed([text for _, text in sorted(entries)])
 
 
 def _terms(name: str, shape: tuple, part: np.ndarray) -> list[str]:

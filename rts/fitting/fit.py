@@ -39,11 +39,11 @@ class Fit(NamedTuple):
         history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
             With a schedule those of all stages, one after the other.
         steps: number of losses computed, the one at the start included.
-        reason: why it stopped, in one line; and what the residuals leave open: arrays whose gradient was zero
-            throughout and, for Levenberg–Marquardt, combinations of parameters that change nothing, such as
-            "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
+        reason: why it stopped, in one line; and the parameters that the residuals do not determine: arrays whose
+            gradient was zero throughout and, for Levenberg–Marquardt, combinations of parameters that change nothing,
+            such as "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
         seconds: wall time, compilation included.
-        stages: how many of the steps were made at each stage of the schedule; one number without a schedule.
+        stages: the number of steps at each stage of the schedule; one number without a schedule.
 
     With a schedule, parameters, loss and reason are those of the last stage.
 
@@ -181,8 +181,8 @@ def _descend(
 
     def evaluate(p: Tree) -> tuple[Array, Tree, list[Array], list[Array]]:
         value, gradient = value_and_grad(p)
-        found = list(leaves(gradient))
-        return value, gradient, [xp.all(xp.isfinite(g)) for g in found], [xp.any(g != 0) for g in found]
+        gradients = list(leaves(gradient))
+        return value, gradient, [xp.all(xp.isfinite(g)) for g in gradients], [xp.any(g != 0) for g in gradients]
 
     evaluate = engine.jit(evaluate) if jit else evaluate
     step = engine.optimizer(method, rate, parameters)
@@ -203,7 +203,7 @@ def _descend(
 
 
 def _flat(loss: float) -> str:
-    """What to say of a gradient that was zero throughout."""
+    """The reason, in words, of a gradient that was zero throughout."""
     return "the loss is zero" if loss == 0 else NO_GRADIENT
 
 
@@ -211,7 +211,7 @@ def _flat(loss: float) -> str:
 
 
 def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
-    """The residuals as those of their base."""
+    """The residuals as `rts.Residuals`; loss and callback are checked, too."""
     known = _residuals(residuals, "residuals")
     if loss is not None and not callable(loss):
         raise InputError(
@@ -237,7 +237,7 @@ def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
 
 
 class _Function(Residuals):
-    """A function of parameters as residuals, of which nothing else is known."""
+    """Residuals that are a plain function of the parameters."""
 
     def __init__(self, function: Callable[[Tree], Array]):
         self._function = function
@@ -250,24 +250,24 @@ class _Function(Residuals):
         return quoted(self._function)
 
 
-def _residuals(given: Any, what: str) -> Residuals:
-    """Residuals, of a function if they are one; `what` names them."""
-    function = callable(given) and not isinstance(given, (Residuals, type))
-    found = _Function(given) if function else given
-    return checked_plugin(found, what, Residuals, "a function of the parameters, ")
+def _residuals(value: Any, what: str) -> Residuals:
+    """An object as `rts.Residuals`; functions are wrapped. `what` names it in errors."""
+    function = callable(value) and not isinstance(value, (Residuals, type))
+    residuals = _Function(value) if function else value
+    return checked_plugin(residuals, what, Residuals, "a function of the parameters, ")
 
 
-def _taken(stage: Residuals, whole: Residuals, given: Callable | None) -> tuple[Callable[[Array], Array], bool]:
-    """The loss at a stage of the residuals `whole`, and whether the stage's own sums are for it."""
-    if given is not None and not overrides(stage, "normal_equations", Residuals):
-        return given, False
+def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[Callable[[Array], Array], bool]:
+    """The loss at a stage of the residuals `whole`, and True if the stage's own sums are for this loss."""
+    if loss is not None and not overrides(stage, "normal_equations", Residuals):
+        return loss, False
     own = _own_loss(stage)
-    taken = (own or _own_loss(whole) or SQUARE) if given is None else given
+    taken = (own or _own_loss(whole) or SQUARE) if loss is None else loss
     return taken, (own or SQUARE) == taken
 
 
 def _own_loss(residuals: Residuals) -> Loss | None:
-    """The loss that residuals say they are for."""
+    """The loss that residuals declare as theirs."""
     loss = residuals.loss
     if loss is None or isinstance(loss, Loss):
         return loss

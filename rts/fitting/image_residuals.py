@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
-from rts import companion
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
 from rts.arrays.engines import Engine, constants, context_of, engine_of, exemplar, namespace
@@ -59,18 +58,18 @@ class ImageResiduals(Residuals):
     Usable wherever a function of parameters is, such as with `rts.fit`. Levenberg–Marquardt takes less time and memory
     for it than for a function: derivatives along all unknowns are multiplied together as the image is swept.
 
-    With a target of B views it is that of all of them, as `rts.render_views` renders them.
+    A target of B views is compared with B renders, as `rts.render_views` makes them.
 
     Args:
-        scene: parameters → part or parts, or what `prepare` made of them; or a tuple of these and a camera, or cameras.
-        camera: the camera, where `scene` gives none; of several views a list, or what `Camera.stack` made of it.
+        scene: parameters → part, parts or the result of `prepare`; or a tuple of these and a camera, or cameras.
+        camera: the camera, if `scene` gives none; of several views a list, or the result of `Camera.stack`.
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
             or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
             Of several views (B, H, W, ·), or a list.
         weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
             bool; constants. Of several views (B, H, W, ·), or a list.
-        background: as in `render`; a constant. It is that of every view.
+        background: as in `render`; a constant, the same for every view.
         sampler: as in `render`.
         splatter: as in `render`.
         layers: as in `render`.
@@ -78,7 +77,7 @@ class ImageResiduals(Residuals):
         capacity: as in `render`.
         channels: C of the image, as the scene's shaders say it. Where it is not 3, Levenberg–Marquardt takes the
             Jacobian.
-        loss: what becomes of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
+        loss: the function of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
             "soft_l1", "huber" or "cauchy", to which large residuals count less: where part of the target is wrong, such
             as a mask with something in front. Or an `rts.Loss`, which has its own `f_scale`.
         f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1,
@@ -154,7 +153,7 @@ class ImageResiduals(Residuals):
 
     @property
     def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None, nor set.
-        """What the mean is taken of; that of all stages and views."""
+        """The loss whose mean is minimised, the same for all stages and views."""
         return self._loss
 
     def _take(self, target: Any, weights: Any) -> None:
@@ -165,10 +164,10 @@ class ImageResiduals(Residuals):
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape, whatever the loss."""
         parts, camera = self.scene(parameters)
-        given = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
+        options = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
         if not self._views:
-            return self._difference(render(parts, camera, self.size, **given), parameters)
-        images = render_views(parts, camera, self.size, **given)
+            return self._difference(render(parts, camera, self.size, **options), parameters)
+        images = render_views(parts, camera, self.size, **options)
         return namespace(images).stack(
             [view._difference(images[b, ...], parameters) for b, view in enumerate(self._views)]
         )
@@ -206,18 +205,18 @@ class ImageResiduals(Residuals):
         Args:
             stage: the resolution.
         """
-        made = copy(self)
-        made._views = [view.at_stage(stage) for view in self._views]
-        made._sigma = float(stage.sigma)
+        other = copy(self)
+        other._views = [view.at_stage(stage) for view in self._views]
+        other._sigma = float(stage.sigma)
         if stage.supersample is not None:
-            made._settings = replace(self._settings, supersample=stage.supersample)
-        made.size = stage.size(self.size)
-        if made.size != self.size:
+            other._settings = replace(self._settings, supersample=stage.supersample)
+        other.size = stage.size(self.size)
+        if other.size != self.size:
             if not self._views:
-                made._target, made._weights = _shrunk(self._target, self._weights, made.size)
+                other._target, other._weights = _shrunk(self._target, self._weights, other.size)
             if self._background is not None and len(self._background.shape) == 3:
-                made._background = box_filtered(self._background, made.size)
-        return made
+                other._background = box_filtered(self._background, other.size)
+        return other
 
     def scene(self, parameters: Tree) -> tuple[Any, Any]:
         """Parts and camera for these parameters; of several views a list of cameras."""
@@ -237,12 +236,12 @@ class ImageResiduals(Residuals):
         return parts, cameras if self._views else cameras[0]
 
     def _scene_as_given(self, parameters: Tree) -> tuple[Any, Cameras]:
-        found = self._scene(parameters)
-        if isinstance(found, tuple) and len(found) == 2 and _are_cameras(given := found[1]):
-            return found[0], given
-        given = found if isinstance(found, (list, tuple)) else [found]
-        if not given or not all(isinstance(part, (Part, Prepared)) for part in given):
-            kinds = ", ".join(map(kind_of, given)) or "nothing"
+        scene = self._scene(parameters)
+        if isinstance(scene, tuple) and len(scene) == 2 and _are_cameras(parts := scene[1]):
+            return scene[0], parts
+        parts = scene if isinstance(scene, (list, tuple)) else [scene]
+        if not parts or not all(isinstance(part, (Part, Prepared)) for part in parts):
+            kinds = ", ".join(map(kind_of, parts)) or "nothing"
             raise InputError(
                 f"scene gave {one_line(kinds)}; expected an rts.Part or several, or a tuple (parts, camera)"
             )
@@ -250,7 +249,7 @@ class ImageResiduals(Residuals):
             raise InputError(
                 "camera is None, and scene gives none; expected an rts.Camera, or (parts, camera) of scene"
             )
-        return found, self._camera
+        return scene, self._camera
 
     @property
     def supersample(self) -> int | Adaptive:
@@ -259,7 +258,7 @@ class ImageResiduals(Residuals):
 
     @property
     def _ordinary(self) -> bool:
-        """Whether residuals are those of this class: a subclass may make others of them."""
+        """True unless a subclass computes other residuals."""
         return not overrides(self, "__call__", ImageResiduals)
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
@@ -269,11 +268,11 @@ class ImageResiduals(Residuals):
         """
         if self._views and self._ordinary:
             self.scene(parameters)  # Refused where there are not as many cameras.
-            found = [view.normal_equations(parameters) for view in self._views]
-            value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*found, strict=True))
+            equations = [view.normal_equations(parameters) for view in self._views]
+            value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*equations, strict=True))
             return value, matrix, gradient
         engine = engine_of(parameters)
-        splatter, found = self._settings.reader, None
+        splatter, equations = self._settings.reader, None
         if (
             self._ordinary
             and not self._sigma
@@ -282,20 +281,18 @@ class ImageResiduals(Residuals):
             and self._image_channels == 3
             and self._settings.contrast is None
         ):
-            mask = self._channels == 1
-            companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
-            found = self._swept(splatter, parameters, engine)
-        return normal_equations(self, parameters, engine, self.loss) if found is None else found
+            equations = self._swept(splatter, parameters, engine)
+        return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 
     def _swept(self, splatter: SummingSplatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
+        """`normal_equations` by the splatter's sums, in the bands of `render`; None where the splatter has no sums."""
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
-            found = self._swept_band(splatter, parameters, engine, top, rows)
-            if found is None:
+            equations = self._swept_band(splatter, parameters, engine, top, rows)
+            if equations is None:
                 return None
             # Means over a band, made its part in means over the image.
-            shares = [x * (rows / self.size[0]) for x in found]
+            shares = [x * (rows / self.size[0]) for x in equations]
             total = shares if not total else [a + b for a, b in zip(total, shares, strict=True)]
         value, matrix, gradient = total
         return value, matrix, gradient
@@ -321,14 +318,14 @@ class ImageResiduals(Residuals):
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
         def swept(shown: Callable[..., Splats], fields: _Fields, known: Splats) -> tuple[Array, Array, Array] | None:
-            """The normal equations of what `shown` makes of parts, cameras and a context; of it `known` is constant."""
+            """Normal equations of the splats that `shown` makes of parts, camera and context; `known` is constant."""
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))
                 seen = camera.for_size(self.size), window(camera)
                 moved = shown(parts, *seen, context_of(parts, camera, sampled, v))
                 positions, rgba = constants((moved.positions, moved.rgba), engine, v)
-                # What is opaque has an alpha of one, whatever its colours.
+                # Opaque samples have an alpha of one, whatever their colours.
                 return positions, rgba if colored else engine.stop_gradient(rgba)
 
             (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
@@ -349,18 +346,18 @@ class ImageResiduals(Residuals):
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
         outside = replace(known, wanted=fine.coarse, border=sampled.apron)
         placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron)
-        found = (
+        grids = (
             swept(partial(to_splats, sampled), coarse, outside),
             swept(lambda parts, camera, _, own: to_fine_splats(fine, parts, camera, own), finer, placed),
         )
-        if found[0] is None or found[1] is None:
+        if grids[0] is None or grids[1] is None:
             return None
         share = finer.target.shape[0] * finer.target.shape[1] / (rows * self.size[1])
-        value, matrix, gradient = (a + share * b for a, b in zip(found[0], found[1], strict=True))
+        value, matrix, gradient = (a + share * b for a, b in zip(grids[0], grids[1], strict=True))
         return value, matrix, gradient
 
     def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
-        """A tree in the engine of the parameters and of the target: each may be NumPy's, and the other not."""
+        """A tree in the engine of the parameters and of the target, of which either may be NumPy's."""
         own, like = (self._target, self._weights, self._background), exemplar(parameters)
         return constants(tree, engine_of(tree, parameters, own), exemplar(own) if like is None else like)
 
@@ -382,7 +379,7 @@ class ImageResiduals(Residuals):
 
 
 class _Fields(NamedTuple):
-    """What an image of h × w pixels is compared with: target (h, w, C), weights and background, arrays or None."""
+    """Target (h, w, C), weights and background of an image of h × w pixels; arrays or None."""
 
     target: Array
     weights: Array | None
@@ -390,15 +387,15 @@ class _Fields(NamedTuple):
 
 
 def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
-    """The fields with weights of zero at active pixels, and those for the layout of `fine`, zero at all others."""
+    """Fields for the coarse grid, with zero weights at active pixels, and for the layout of `fine`, zero elsewhere."""
     xp, engine = namespace(pixel), engine_of(pixel)
     height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
 
     def host(pixel: np.ndarray) -> tuple[np.ndarray]:
-        found = np.full(height * width, -1, np.int32)
+        origin = np.full(height * width, -1, np.int32)
         active = np.flatnonzero(pixel >= 0)
-        found[pixel.reshape(-1)[active]] = active
-        return (found,)
+        origin[pixel.reshape(-1)[active]] = active
+        return (origin,)
 
     (origin,) = engine.call_host(host, (ArraySpec((height * width,), np.int32),), pixel)
     there = (origin >= 0)[:, None]
@@ -437,14 +434,14 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
     return xp.reshape(small, (*size, *kind[2:])), xp.reshape(xp.sqrt(total), (*size, *shape[2:]))
 
 
-def _are_cameras(given: Any) -> TypeGuard[Cameras]:
-    """Whether it is a camera, or a list of some."""
-    listed: list[Any] = list(given) if isinstance(given, (list, tuple)) else [given]
+def _are_cameras(value: Any) -> TypeGuard[Cameras]:
+    """True for a camera or a list of cameras."""
+    listed: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
     return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
 
 
 def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
-    """How many views a target is of; None for one, without an axis of its own. There may be `several` cameras."""
+    """The number of views of a target; None if it is one view without an axis. There may be `several` cameras."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape: Any = shape_of(target)
@@ -455,9 +452,9 @@ def _of_views(weights: Any, count: int) -> Sequence[Any]:
     """The weights of each view."""
     if weights is None:
         return [None] * count
-    given = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
-    if given != count:
-        raise InputError(f"weights are of {given} views; expected {count}, as many as targets")
+    weight_count = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
+    if weight_count != count:
+        raise InputError(f"weights are of {weight_count} views; expected {count}, as many as targets")
     return weights
 
 

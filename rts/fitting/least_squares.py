@@ -20,11 +20,11 @@ FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12
 TINY = 1e-300
 RESOLVED = 10.0
-"""As many roundings of the loss as a gain must be, at least, to be told from none."""
+"""Least gain that counts as one, in roundings of the loss."""
 
 
 class _Linear(NamedTuple):
-    """What is known of the residuals around a point: their loss, and the normal equations JᵀSJ and JᵀWr over n."""
+    """Residuals linearised at a point: their loss, and the normal equations JᵀSJ and JᵀWr over n."""
 
     value: float
     matrix: np.ndarray
@@ -50,7 +50,7 @@ class _Model:
 
     Args:
         linear: the normal equations.
-        sizes: how many numbers each array of the parameters has.
+        sizes: the number of entries of each array of the parameters.
     """
 
     def __init__(self, linear: _Linear, sizes: Sequence[int]):
@@ -69,7 +69,7 @@ class _Model:
         self._open = np.linalg.qr(self.open * self.units[:, None])[0] if self.open.shape[1] else None
 
     def step(self, damping: float) -> tuple[np.ndarray, float]:
-        """The step, and the gain that the model predicts of it."""
+        """The step, and the gain that the model predicts for it."""
         along = self._downhill / (self._values + damping)
         step = self._directions @ along
         if self._open is not None:
@@ -106,10 +106,10 @@ def levenberg_marquardt(
         parameters: where to start; a private copy.
         engine: the engine of the parameters.
         run: takes note of each step, and says when to stop.
-        jit: whether to compile.
+        jit: True to compile.
         loss: of the residuals.
         own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
-        supersample: of residuals that are of an image, how many samples a pixel has along each axis.
+        supersample: samples a pixel along each axis, for residuals of an image.
     """
     vector, unflatten = flatten(parameters)
     sizes = [math.prod(x.shape) for x in leaves(parameters)]
@@ -120,46 +120,50 @@ def levenberg_marquardt(
         run.note_gradient([bool(d.any()) for d in _split(np.diag(linear.matrix), sizes)])
         return linear, _Model(linear, sizes)
 
-    here, model = taken(linearize(vector), start=run.fresh)
-    going = run.record(unflatten(vector), here.value)
+    current, model = taken(linearize(vector), start=run.fresh)
+    going = run.record(unflatten(vector), current.value)
     damping, growth = FIRST_DAMPING, 2.0
     promising, jumps = True, False
     while going:
-        if not here.matrix.any() and len(run.history) == 1:
+        if not current.matrix.any() and len(run.history) == 1:
             refuse_independent(residuals, None, parameters, engine)
-        if not here.value or not here.gradient.any():
+        if not current.value or not current.gradient.any():
             run.stop(
-                "the loss is zero" if not here.value else "the gradient is zero" if here.matrix.any() else NO_GRADIENT
+                "the loss is zero"
+                if not current.value
+                else "the gradient is zero"
+                if current.matrix.any()
+                else NO_GRADIENT
             )
             break
         damping = max(damping, model.least)
         delta, predicted = model.step(damping)
         trial = vector + engine.constant(delta, vector)
         # A trial after one that was accepted probably is, too: its normal equations come with its loss.
-        there = linearize(trial) if promising and run.left > 1 else None
-        trial_value = loss_at(trial) if there is None else there.value
+        at_trial = linearize(trial) if promising and run.left > 1 else None
+        trial_value = loss_at(trial) if at_trial is None else at_trial.value
         going = run.record(unflatten(trial), trial_value)
         if not going:
             break
-        gain = here.value - trial_value
+        gain = current.value - trial_value
         promising = gain > 0  # False for a trial that is not finite, too.
         if not promising:
-            if damping >= 1 and predicted > RESOLVED * _loss_rounding(here, run.residuals):
+            if damping >= 1 and predicted > RESOLVED * _loss_rounding(current, run.residuals):
                 jumps = math.isfinite(trial_value)
             damping, growth = damping * growth, growth * 2
             going = damping <= LARGEST_DAMPING or run.stop(_no_step(jumps, supersample))
-        elif gain <= run.tolerance * here.value:
+        elif gain <= run.tolerance * current.value:
             going = run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
         else:
             ratio = gain / max(predicted, gain)
             damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
             vector, jumps = trial, False
-            here, model = taken(there or linearize(vector), start=False)
+            current, model = taken(at_trial or linearize(vector), start=False)
     _note_open(model, parameters, sizes, run)
 
 
 def _loss_rounding(linear: _Linear, count: int) -> float:
-    """How far a mean loss of `count` residuals may be off, whose terms are of the size of one."""
+    """Rounding error of a mean loss of `count` residuals, whose terms are of the size of one."""
     return linear.rounding * (linear.value + 2 * math.sqrt(linear.value / max(count, 1)))
 
 
@@ -236,21 +240,21 @@ def _least_squares(
     return linearize, lambda v: float(run.attempt(engine, value_at, v))
 
 
-def _checked_equations(found: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
-    """The result of a user's `normal_equations`, refused where its form is another."""
+def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
+    """The result of a user's `normal_equations`, refused if its shapes are wrong."""
     expected = (), (count, count), (count,)
-    given: Any = tuple(found) if isinstance(found, (tuple, list)) else (found,)
-    if not all(engine.owns(x) for x in given) or tuple(tuple(x.shape) for x in given) != expected:
-        shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in given)
+    equations: Any = tuple(result) if isinstance(result, (tuple, list)) else (result,)
+    if not all(engine.owns(x) for x in equations) or tuple(tuple(x.shape) for x in equations) != expected:
+        shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in equations)
         raise InputError(
             f"normal_equations gave {shapes}; expected {engine.name} arrays of shapes {', '.join(map(str, expected))}: "
             f"mean loss, JᵀSJ / n, JᵀWr / n"
         )
-    return given
+    return equations
 
 
 def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
-    """All leaves as one vector, and the way back."""
+    """All leaves as one vector, and the function that makes a tree of such a vector again."""
     arrays = list(leaves(parameters))
     xp = namespace(*arrays)
 

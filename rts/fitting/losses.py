@@ -36,7 +36,7 @@ They differ from them by less than the rounding of float64.
 
 
 def _split(xp: Any, r: Array, f_scale: float) -> tuple[Array, Array, Array]:
-    """Which residuals are far, |r| / s of these, and r / s of the others; 1 and 0 elsewhere."""
+    """Marks of far residuals, |r| / s of these (1 elsewhere), and r / s of the near ones (0 elsewhere)."""
     ratio = r / f_scale
     far = abs(ratio) > FAR
     return far, xp.where(far, abs(ratio), 1.0), xp.where(far, 0.0, ratio)
@@ -81,7 +81,7 @@ FORMS = {
 """Name → form. Compiled loops know them by their places in this order."""
 
 LEAST_SHARE = 0.1
-"""What residuals beyond the scale keep of the curvature that their weight gives them."""
+"""Share of their weight's curvature that residuals beyond the scale keep."""
 
 SCALES = 1e-10, 1e10
 """Least and largest scale: with these float32 holds losses of residuals up to 1e20, and their derivatives."""
@@ -89,7 +89,7 @@ SCALES = 1e-10, 1e10
 
 @dataclass(frozen=True)
 class Loss:
-    """The mean of s² ρ((r / s)²) over residuals r, with s for `f_scale`: what a fit makes small.
+    """A loss for fits: the mean of s² ρ((r / s)²) over residuals r, with s for `f_scale`.
 
     The losses are those of `scipy.optimize.least_squares`, whose cost is half the sum where this is the mean:
 
@@ -146,7 +146,7 @@ class Loss:
 
     @property
     def robust(self) -> bool:
-        """Whether it is another than the square."""
+        """True for every loss but the square."""
         return self.name != "linear"
 
     @property
@@ -155,19 +155,19 @@ class Loss:
         return list(FORMS).index(self.name)
 
 
-def _checked_scale(given: Any) -> float:
+def _checked_scale(value: Any) -> float:
     try:
-        scale = float(given) if is_real(given) else 0.0
+        scale = float(value) if is_real(value) else 0.0
     except OverflowError:
         scale = 0.0
     least, largest = SCALES
     if not least <= scale <= largest:
-        raise InputError(f"f_scale is {quoted(given)}; expected a positive number from {least:g} to {largest:g}")
+        raise InputError(f"f_scale is {quoted(value)}; expected a positive number from {least:g} to {largest:g}")
     return scale
 
 
-def _checked_residuals(given: Any) -> Array:
-    residuals = from_numbers(given, "residuals")
+def _checked_residuals(value: Any) -> Array:
+    residuals = from_numbers(value, "residuals")
     if not hasattr(residuals, "dtype") or 0 in shape_of(residuals):
         raise InputError(f"residuals {described(residuals)}; expected an array of floats, of at least one")
     check_floating("residuals", residuals)

@@ -1,4 +1,4 @@
-"""What errors and reports call things: leaves of parameters by name, and long texts in one line."""
+"""Names for errors and reports: leaves of parameters, and long texts in one line."""
 
 from __future__ import annotations
 

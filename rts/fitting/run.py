@@ -1,4 +1,4 @@
-"""One run of a fit: what it keeps, when it stops, and its progress bar."""
+"""One run of a fit: its record, the rule by which it stops, and its progress bar."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Astray(Exception):
 
 
 class Run:
-    """What a fit keeps as it goes: history, best parameters, and why it stopped.
+    """The record of a running fit: history, best parameters, and why it stopped.
 
     Attributes:
-        mattered: of each array of the parameters, whether its gradient was ever other than zero.
-        remarks: what else is to be told of the outcome, beside why it stopped.
-        residuals: how many numbers the residuals are, once that is known.
-        asked: whether the callback has asked to stop.
+        mattered: for each array of the parameters, True once its gradient was other than zero.
+        remarks: further remarks on the outcome, beside the reason.
+        residuals: the number of residuals, once it is known.
+        asked: True if the callback has asked to stop.
     """
 
     def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int, before: int = 0):
@@ -67,7 +67,7 @@ class Run:
 
     @property
     def fresh(self) -> bool:
-        """Whether no loss is known yet, of earlier stages neither: what goes wrong is the caller's to put right."""
+        """True before the first loss of the first stage. An error then is the caller's, since nothing can be saved."""
         return not self.history and not self.before
 
     def note_gradient(self, mattered: Sequence[bool]) -> None:
@@ -75,7 +75,7 @@ class Run:
         self.mattered = [a or b for a, b in zip(mattered, self.mattered or [False] * len(mattered), strict=True)]
 
     def told(self, names: Sequence[str]) -> str:
-        """Why the fit stopped, and what is to be told beside, in one line; with the names of the arrays."""
+        """The reason why the fit stopped, and further remarks, in one line; arrays go by their names."""
         lost = [name for name, mattered in zip(names, self.mattered, strict=False) if not mattered]
         remarks = self.remarks
         if lost and len(lost) < len(names):
@@ -86,7 +86,7 @@ class Run:
 
     @property
     def left(self) -> int:
-        """How many more steps there may be."""
+        """Steps that are left."""
         return self.steps - len(self.history)
 
     def stop(self, reason: str) -> bool:
@@ -95,7 +95,7 @@ class Run:
         return False
 
     def stalled(self) -> bool:
-        """Whether the loss has not fallen enough in the last `patience` steps."""
+        """True if the loss has not fallen enough in the last `patience` steps."""
         return len(self.history) - self._last_gain >= self.patience
 
     def attempt(self, engine: Engine, call: Callable, *args: Any) -> Any:
@@ -125,11 +125,11 @@ TRACING = ("JAXTypeError", "JAXIndexError")
 
 
 ENGINE_MARKS = {"torch": ("Tensor", "__dlpack"), "jax": ("ArrayImpl", "Tracer", "jit-wrapped")}
-"""What the frameworks call their arrays when they complain of those of another."""
+"""Names of arrays in errors of the frameworks about arrays of another one."""
 
 
 def untraceable(error: Exception, engine: Engine) -> RtsError | None:
-    """What to say of an error of a framework that could not trace a function, or met arrays of another framework.
+    """A clearer error for a function that a framework could not trace, or that met arrays of another framework.
 
     None for any other error.
     """
@@ -156,7 +156,7 @@ def untraceable(error: Exception, engine: Engine) -> RtsError | None:
 
 
 def require(finite: bool, what: str, start: bool) -> None:
-    """Refuse what is not finite: at the start that is an error of the caller."""
+    """Refuse numbers that are not finite: at the start these are an error of the caller."""
     if not finite and start:
         raise InputError(f"{what} at the start; check the parameters and the target for NaN")
     if not finite:

@@ -24,11 +24,11 @@ SAMPLES, FEWER_SAMPLES = 4, 2
 
 @dataclass(frozen=True)
 class Stage:
-    """At what resolution images are compared for a while; see `fit`.
+    """A stage of a fit, with the resolution at which images are compared; see `fit`.
 
     Attributes:
         scale: the share of the residuals' own resolution along each axis, in (0, 1].
-        supersample: samples a pixel along each axis, or an `rts.Adaptive`; None for what the residuals have.
+        supersample: samples a pixel along each axis, or an `rts.Adaptive`; None for the residuals' own.
         sigma: standard deviation of the Gaussian that blurs the differences, pixels of this stage; 0 for none.
 
     Raises:
@@ -129,7 +129,7 @@ def _box(few: int, many: int) -> np.ndarray:
 
 
 def _gaussian(count: int, sigma: float) -> np.ndarray:
-    """(count, count) weights of the pixels of a row in each, those beyond its ends left out."""
+    """Weights (count, count) of a row's pixels in each of its blurred pixels, without pixels beyond its ends."""
     reach = math.ceil(4 * sigma)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     taps /= taps.sum()

@@ -39,9 +39,9 @@ def largest(values: Array) -> float:
     return 0.0 if known is None else float(known.max())
 
 
-def warn_of_gradients(given: Mapping[str, Any]) -> None:
+def warn_of_gradients(images: Mapping[str, Any]) -> None:
     """Warn of arrays of torch that are taken for constants, and of which it would have a derivative."""
-    for name, value in given.items():
+    for name, value in images.items():
         if any(getattr(x, "requires_grad", False) for x in (value if isinstance(value, (list, tuple)) else [value])):
             warn(f"{name} requires a gradient, and is taken as a constant; give {name}.detach()", InputWarning)
 

@@ -1,1 +1,1 @@
-"""Functions of arrays that have a specification in array code and compiled code for the host, side by side."""
+"""Functions of arrays, each with a specification in array code and compiled loops for the host."""

@@ -1,4 +1,4 @@
-"""Sums of rows with weights: what every surface does that is linear in its control points."""
+"""Weighted sums of rows, as for points of every surface that is linear in its control points."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 
     Args:
         rows: (V, C) float, such as control points.
-        ids: (N, I) integers, rows by number. For a sum of fewer, name any row and give it a weight of zero.
+        ids: (N, I) integers, numbers of rows. A sum of fewer rows names any row with a weight of zero.
         weights: (N, I) float.
 
     Raises:
-        InputError: shapes that do not fit, or ids of no row.
+        InputError: shapes do not fit, or an id names no row.
     """
     rows, weights = from_numbers(rows, "rows"), from_numbers(weights, "weights")
     ids = np.asarray(from_numbers(ids, "ids"), np.int32) if isinstance(ids, (list, tuple)) else from_numbers(ids, "ids")
@@ -49,10 +49,10 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
         rows: (V, C) float.
         ids: (N, I) integers.
         column: the first of the three columns.
-        weights: (N, W) float, the first two of which count.
+        weights: (N, W) float, of which the first two are used.
 
     Raises:
-        InputError: these are no samples of the surface that the rows belong to.
+        InputError: ids and weights do not fit the rows: they are samples of another surface.
     """
     given, wanted = shape_of(ids), shape_of(weights)
     plain = len(given) == len(wanted) == 2
@@ -93,7 +93,7 @@ def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...]
 
 
 def _columns(operands: Arrays, column: int, count: int, affine: bool) -> Arrays:
-    """The operands, if ids and weights have the columns that are used."""
+    """The operands, after a check that ids and weights have the columns used."""
     _, weights, ids = operands
     if len(ids) != len(weights) or not 0 <= column <= ids.shape[1] - count or weights.shape[1] < count - affine:
         raise InputError(
@@ -138,5 +138,7 @@ COMBINE = Operation(
     packed=(1, 2),
     packed_result=True,
 )
-"""The operation of `combine` and `interpolate`, on rows, weights and ids. Its parameters: the first of the columns of
-ids that are used, how many are, and whether there is one weight less, the last being one minus the others."""
+"""The operation of `combine` and `interpolate`, on rows, weights and ids.
+
+Parameters: `column` is the first of the `count` columns of ids that are used. If `affine`, the last weight is one minus
+the others."""

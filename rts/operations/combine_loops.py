@@ -1,7 +1,7 @@
-"""Sums of rows with weights and their derivatives, compiled for arrays on the host. It imports numba.
+"""Weighted sums of rows and their derivatives, as compiled loops for arrays on the host.
 
-Columns of `ids` (N, I), `count` from `column` on, name rows of (V, C); of weights (N, W) the first columns belong to
-them. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last). Triangles
+`count` columns of `ids` (N, I), from `column` on, name rows of (V, C). The first columns of weights (N, W) belong to
+these rows. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last). Triangles
 have loops of their own. Gradients are added up in the order of the samples.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel, read_only
 from rts.errors import InputError
-from rts.threads import parallel, read_only
 
 
 def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
@@ -50,7 +50,7 @@ def push(
     count: int,
     affine: bool,
 ) -> None:
-    """Fill `out` (N, C) with the tangent along those of rows (V, C) and weights (N, W), or None for zeros."""
+    """Fill `out` (N, C) with the tangent along `t_rows` (V, C) and `t_weights` (N, W), or None for zeros."""
     if t_rows is None:
         out[...] = 0
     else:
@@ -75,7 +75,7 @@ def pull(
     count: int,
     affine: bool,
 ) -> None:
-    """Pull back the gradient `g` (N, C) of the result: add to that of rows (V, C), and fill that of weights (N, W)."""
+    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), and fill `g_weights` (N, W)."""
     g = read_only(g)
     if g_rows is not None:
         if affine and count == 3:

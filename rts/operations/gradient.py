@@ -17,17 +17,17 @@ STEP = 6e-6
 
 
 def gradient(f: Callable[[Array], Array], points: Array) -> Array:
-    """The gradient (N, 3) of a function of points, each value of which depends on its own point alone.
+    """The gradient (N, 3) of a function of points whose values depend on their own points alone.
 
-    It is differentiable in turn in the points and in what `f` closes over. NumPy arrays have no derivatives: for them
-    it takes central differences in float64.
+    The gradient is differentiable in the points and in arrays that `f` closes over. For NumPy arrays, which have no
+    derivatives, it is a central difference in float64.
 
     Args:
         f: points (N, 3) → (N,), in array code.
         points: (N, 3) float.
 
     Raises:
-        InputError: `f` gives another shape.
+        InputError: `f` returns another shape.
     """
     if not callable(f) or isinstance(f, type):
         raise InputError(f"f is {quoted(f)}; expected a function of points (N, 3)")

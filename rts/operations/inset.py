@@ -1,4 +1,4 @@
-"""An image of which some pixels are means of a finer one, and the others given, or of one colour."""
+"""Images in which some pixels are means of a finer image; the others are given, or have one colour."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ import numpy as np
 
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import parallel, read_only
 
 
 def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:
-    """(H, W, C): where `pixel` is not negative, the mean of `side`² cells of a finer image.
+    """(H, W, C): the image, with means of `side`² cells of a finer image where `pixel` is not negative.
 
     Args:
         image: (H, W, C).
         fine: (h · side, w · side, C), of the dtype of the image.
-        pixel: (H, W) integers, which of the h × w pixels of the finer image to take, counted along its lines; negative
-            for none. No two are the same.
+        pixel: (H, W) integers, the index of a pixel among the h × w of the finer image, counted along its lines;
+            negative for none. No two are the same.
         side: cells along each side of a pixel.
     """
     return INSET(image, fine, pixel, side=side)
 
 
 def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, side: int) -> Array:
-    """(H, W, C): as `with_inset`, of an image that shows a colour where anything is.
+    """(H, W, C): as `with_inset`, with an image of one colour on covered pixels and zeros elsewhere.
 
     Args:
         color: (C,).
         fine: as in `with_inset`.
         pixel: as in `with_inset`.
-        row: (H', W') integers, the image's pixels and as many more on each side; not negative where anything is.
-        settled: (H', W') integers, not negative where anything is as well.
+        row: (H', W') integers, for pixels of the image and of a border around it; covered where not negative.
+        settled: (H', W') integers; pixels where it is not negative are covered, too.
         side: as in `with_inset`.
     """
     return PAINTED(color, fine, pixel, row, settled, side=side)
@@ -59,7 +59,7 @@ def _painted(color: Array, fine: Array, pixel: Array, row: Array, settled: Array
 
 
 def _inside(size: int, wide: int) -> tuple[int, int]:
-    """First and end of the pixels of an image, of those that are more on each side."""
+    """Start and end of an image of `size` pixels in one of `wide` pixels, with the same border on both sides."""
     return (wide - size) // 2, (wide + size) // 2
 
 
@@ -74,7 +74,7 @@ def _painted_shape(
 
 
 def _no_colors(like: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What stands for no colour, and for where it is."""
+    """Empty arrays in place of color, row and settled."""
     return (
         read_only(np.empty(0, like.dtype)),
         read_only(np.empty((0, 0), np.int32)),

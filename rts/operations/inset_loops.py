@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 
 
 @loop
 def put(start, stop, image, color, row, settled, fine, pixel, side, out):
     """Fill rows [start, stop) of out (H, W, C); see `rts.operations.inset`.
 
-    Where there is no `image`, there is a `color`, `row` and `settled`.
+    If `image` is empty, `color`, `row` and `settled` replace it.
     """
     _, width, channels = out.shape
     across, share = fine.shape[1] // side, out.dtype.type(1) / out.dtype.type(side)
@@ -40,14 +40,14 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
 
 @compiled
 def _look(there, row, settled):
-    """Where anything is seen in a row of cells."""
+    """Mark the covered cells in a row of cells."""
     for x in range(len(there)):
         there[x] = np.uint8(row[x] >= 0) | np.uint8(settled[x] >= 0)
 
 
 @compiled
 def _paint(out, c, value, there):
-    """Fill a channel of a row of an image."""
+    """Fill channel c of a row of an image."""
     nothing = out.dtype.type(0)
     for x in range(len(there)):
         out[x, c] = value if there[x] else nothing
@@ -55,9 +55,9 @@ def _paint(out, c, value, there):
 
 @loop
 def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
-    """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; none without rows.
+    """Fill the gradients `image` and `fine`, given as zeros, from rows [start, stop) of the result's gradient `g`.
 
-    Of the colour they are sums (H, C), of each row.
+    Gradients without rows are skipped. `sums` (H, C) receives the colour's gradient, summed over each row.
     """
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)

@@ -1,6 +1,6 @@
 """Affine maps of points, and products of small matrices, in full precision.
 
-Matrix units of some devices round float32 products to fewer bits: there all is elementwise.
+Matrix units of some devices round float32 products to fewer bits. There, products are computed elementwise.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def affine_map(rows: Array, points: Array) -> Array:
 
 
 def is_plain_product(*arrays: Array) -> bool:
-    """Whether a product of whole matrices is all it takes: it is exact, and nobody differentiates it."""
+    """True if a matrix product suffices: it is exact, and the engine has no derivatives."""
     engine = engine_of(*arrays)
     return not engine.differentiates and engine.exact_products(*arrays)
 
@@ -99,7 +99,7 @@ def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
     """Points (N, 3) of several views under the affine map of each: (N, R).
 
     Args:
-        rows: (B, R, 4), those of each view.
+        rows: (B, R, 4), the affine map of each view.
         points: (N, 3), views one after the other.
         view: (N,) int32, the view of each point; see `rts.operations.by_view`.
     """
@@ -125,7 +125,7 @@ def _shape_of_views(rows: tuple[int, ...], points: tuple[int, ...], view: tuple[
 
 
 def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
-    """The number of each view, where its points are, and the operands of its map."""
+    """Index, range of points, and operands of each view."""
     rows, points, view = operands
     if rows.shape[2] != 4 or points.shape != (len(view), 3):
         shapes = ", ".join(str(x.shape) for x in operands)
@@ -164,4 +164,4 @@ VIEWS = Operation(
     packed_result=True,
     used=lambda operands: rows_in_views(operands[2]),
 )
-"""See `affine_map_of_views`."""
+"""The operation of `affine_map_of_views`."""

@@ -1,12 +1,12 @@
-"""Affine maps of points (N, 3) by rows (R, 4) and their derivatives: NumPy in and out, one compiled pass each."""
+"""Affine maps of points (N, 3) by rows (R, 4), and their derivatives: one compiled loop each, on NumPy arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 from rts.operations.projection_loops import CHUNK
-from rts.threads import parallel, read_only
 
 
 def affine(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
@@ -17,7 +17,7 @@ def affine(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
 def affine_push(
     rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, R) with the tangent along those of rows and points, or None for zeros."""
+    """Fill `out` (N, R) with the tangent along `t_rows` and `t_points`, or None for zeros."""
     if t_rows is None:
         out[...] = 0
     else:
@@ -29,7 +29,7 @@ def affine_push(
 def affine_pull(
     rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
 ) -> None:
-    """Pull back the gradient `g` (N, R) of the result: fill those of rows and points that are wanted."""
+    """Pull back the gradient `g` (N, R) of the result: fill `g_rows` and `g_points` unless they are None."""
     g = read_only(g)
     if g_rows is not None:
         sums = np.zeros((-(-len(points) // CHUNK), *rows.shape))

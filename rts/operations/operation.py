@@ -17,17 +17,17 @@ from rts.arrays.trees import Array
 from rts.errors import InputError, RtsError
 
 _SHAPED = ("shape",)
-"""Stands among what was looked at for the first shape of a result."""
+"""Entry of `Operation._seen` that says that the first shape of a result has been checked."""
 
 _SHAPE = attrgetter("shape")
 
 
 SMALL = 4096
-"""Numbers of operands and result, up to which the shape of a result is compared with that of the specification."""
+"""Largest count of numbers, in operands and result, for which the result's shape is checked by the specification."""
 
 
 class _Specifying(threading.local):
-    """Whether a specification is being looked at: operations in it are array code, too, and compile nothing."""
+    """`on` while a specification is checked. Operations inside it then run as array code, and compile nothing."""
 
     on = False
 
@@ -40,7 +40,7 @@ def _listed(shapes: Iterable[tuple[int, ...]]) -> str:
 
 
 def known_value(x: Array) -> np.ndarray | None:
-    """The value of an array in the memory of the host; None where it is elsewhere, or not known while Python runs."""
+    """The value of an array in host memory; None if it is on another device, or traced."""
     if type(x) is np.ndarray:
         return x
     return value_of(x) if engine_of(x).on_host(x) else None
@@ -50,42 +50,42 @@ Arrays = Sequence[np.ndarray]
 """Operands on the host, C-contiguous and read-only."""
 
 Some = Sequence[np.ndarray | None]
-"""An array for each operand that has a derivative, or None where it is zero or not wanted."""
+"""An array for each differentiable operand, or None where it is zero or not wanted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Operation:
     """A function of arrays that every engine can differentiate, in forward and reverse mode, and to second order.
 
-    Where arrays are on the host, and their floats all of one dtype, float32 or float64, its value and first derivatives
-    are computed by `forward`, `push` and `pull`. Everywhere else, and for second derivatives, `specification` is what
-    runs. Under `vmap` items are computed one after another. An operation is called with its operands, and parameters by
-    name: hashable values that are no arrays and are handed on to all of its functions.
+    `forward`, `push` and `pull` compute value and first derivatives where arrays are on the host, and their floats all
+    of one dtype, float32 or float64. Elsewhere, and for second derivatives, `specification` runs. Under `vmap` items
+    are computed one after another. An operation is called with its operands, and with parameters by name. Parameters
+    are hashable values, no arrays, and are handed on to all of its functions.
 
     `forward`, `push` and `pull` run on the host. Their `operands` are NumPy arrays, C-contiguous and read-only; they
     fill `out` and `results` in place.
 
     Attributes:
-        name: unique, such as "my_package.warp"; programs that jax keeps on disk find it by this name.
+        name: unique, such as "my_package.warp"; programs that jax keeps on disk look the operation up by this name.
         specification: (*operands, **params) → the result, in array code.
         ranks: the number of axes of each operand.
         shape: (*shapes of the operands, **params) → the shape of the result, whose dtype is that of the floats.
         forward: (operands, out, **params), writes the value to `out`. See `keeps`.
         push: (operands, tangents, out, **params), writes to `out` the derivative along tangents of the differentiable
             operands (JVP); a tangent of zeros is None, but not all are. See `sweeps`.
-        pull: (operands, gradient, results, **params), turns the gradient of the result into those of the
+        pull: (operands, gradient, results, **params), turns the gradient of the result into gradients of the
             differentiable operands (VJP). It writes them to `results`, which are zeros, or None where not wanted.
-        differentiable: how many operands, from the first on, have derivatives; these are floats.
+        differentiable: the number of operands, from the first on, that have derivatives; these are floats.
         packed: the indices of operands that have a row for each sample. Engines may have allotted more rows than are
-            used. The functions get the rows in use, as far as the engine knows them: it does for arrays that come
+            used. The functions receive only the rows in use, where the engine knows them: for arrays that come
             straight from sampling or from another operation. Other rows are zero in the result, and so are their
             gradients.
         packed_result: whether the result has a row for each sample, too.
-        used: (operands) → how many rows of the packed operands are used; None for as many as the engine knows of.
-        even: the indices of packed operands whose rows are often all alike, which a compiling engine may make use of.
+        used: (operands) → number of rows of the packed operands in use; None to rely on the engine.
+        even: the indices of packed operands whose rows are often all equal, which a compiling engine may exploit.
         keeps: whether `forward` returns an object that helps the derivatives at the same operands. `push` and `pull`
-            then take a keyword `kept`: that object, or None if it is no longer known.
-        sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). If not, it is called
+            then take a keyword `kept`: that object, or None if it is lost.
+        sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). Otherwise it is called
             for each direction.
     """
 
@@ -105,7 +105,7 @@ class Operation:
     sweeps: bool = False
 
     _seen: set[tuple] = field(default_factory=set, init=False, repr=False)
-    """The dtype and the parameters' names of calls whose first value has been looked at."""
+    """Dtype and names of parameters of the calls whose first value has been checked."""
 
     def __post_init__(self):
         if not (isinstance(self.name, str) and self.name):
@@ -123,13 +123,13 @@ class Operation:
         self._check_indices()
 
     def _integers(self, name: str) -> tuple[int, ...]:
-        """The field of this name as a tuple of integers."""
-        given = getattr(self, name)
-        if isinstance(given, (tuple, list)) and all(type(n) is int and n >= 0 for n in given):
-            return tuple(given)
+        """The field `name` as a tuple of integers."""
+        indices = getattr(self, name)
+        if isinstance(indices, (tuple, list)) and all(type(n) is int and n >= 0 for n in indices):
+            return tuple(indices)
         raise InputError(
-            f"{name} of the operation {self.name} is {quoted(given)}; expected a tuple of integers of at least 0, one "
-            f"for each operand{'' if name == 'ranks' else ' that is meant'}"
+            f"{name} of the operation {self.name} is {quoted(indices)}; expected a tuple of integers of at least 0, "
+            f"one for each operand{'' if name == 'ranks' else ' that is meant'}"
         )
 
     def _check_indices(self) -> None:
@@ -146,10 +146,10 @@ class Operation:
                 )
 
     def __call__(self, *operands: Array, **params: Any) -> Array:
-        """The result, in the engine of the operands; NumPy arrays beside those of another are constants.
+        """The result, in the engine of the operands. NumPy arrays beside arrays of another engine are constants.
 
         Raises:
-            InputError: operands of another number, or with another number of axes.
+            InputError: the number of operands, or of the axes of one, is wrong.
         """
         if len(operands) != len(self.ranks):
             raise InputError(
@@ -173,14 +173,14 @@ class Operation:
         return engine.apply(self, operands, params)
 
     def check_ranks(self, operands: Sequence[Array]) -> None:
-        """Raise an InputError if an operand has another number of axes than `ranks` says."""
+        """Raise an InputError if the number of axes of an operand is not its rank."""
         for x, rank in zip(operands, self.ranks, strict=True):
             if x.ndim != rank:
                 shapes = _listed(map(_SHAPE, operands))
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
-        """Whether operands of these NumPy dtypes are for the functions on the host; none are within a specification."""
+        """True if functions on the host take operands of these NumPy dtypes; never while a specification is checked."""
         first = dtypes[0]
         if _specifying.on or (first != np.float32 and first != np.float64):
             return False
@@ -189,41 +189,41 @@ class Operation:
                 return False
         return True
 
-    # The methods below are what engines' binders call, with operands in NumPy.
+    # Engines' binders call the methods below, with operands in NumPy.
 
     def result_shape(self, *shapes: tuple[int, ...], **params: Any) -> tuple[int, ...]:
-        """The shape of the result, of operands of these shapes.
+        """The shape of the result for operands of these shapes.
 
         Raises:
-            InputError: `shape` fails, or gives something else.
+            InputError: `shape` fails, or returns no shape.
         """
         try:
-            found = self.shape(*shapes, **params)
+            result = self.shape(*shapes, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("shape", shapes, error) from error
-        # Its first shape tells what kind of entries a function of shapes gives.
-        if found.__class__ is tuple and _SHAPED in self._seen:
-            return found
-        if type(found) is not tuple or not all(isinstance(n, (int, np.integer)) and n >= 0 for n in found):
+        # Entries are checked once: the first shape shows their type.
+        if result.__class__ is tuple and _SHAPED in self._seen:
+            return result
+        if type(result) is not tuple or not all(isinstance(n, (int, np.integer)) and n >= 0 for n in result):
             raise InputError(
-                f"shape of the operation {self.name} gives {quoted(found)} for operands of shapes {_listed(shapes)}; "
+                f"shape of the operation {self.name} gives {quoted(result)} for operands of shapes {_listed(shapes)}; "
                 f"expected a tuple of integers of at least 0"
             )
         self._seen.add(_SHAPED)
-        return found
+        return result
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
-        """The result, and what `forward` keeps for the derivatives."""
+        """The result, and the object that `forward` keeps for the derivatives."""
         out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         return out, self.forward_on_host(operands, out, params)
 
     def forward_on_host(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> Any:
-        """Fill `out` with the value, and return what `forward` keeps for the derivatives.
+        """Fill `out` with the value, and return the object that `forward` keeps for the derivatives.
 
-        The first value of each dtype is looked at: whether all of it was written, and has the specification's shape.
+        The first value of each dtype is checked: all of it must be written, and its shape be the specification's.
 
         Raises:
-            InputError: `forward` cannot take the operands; or its first value is not what it must be.
+            InputError: `forward` cannot take the operands, or its first value fails the check.
         """
         seen = (out.dtype.char, *params)
         first = seen not in self._seen and out.size > 0
@@ -249,7 +249,7 @@ class Operation:
         try:
             with np.errstate(all="ignore"):
                 expected = np.asarray(self.specification(*operands, **params))
-        except Exception:  # It may be for other engines' arrays alone, and is refused where it is asked for.
+        except Exception:  # The specification may take arrays of other engines alone; its errors show where it is used.
             return
         finally:
             _specifying.on = False
@@ -284,5 +284,5 @@ class Operation:
             self.push(operands, [None if t is None else t[i] for t in tangents], result, **options)
 
     def pull_on_host(self, operands: Arrays, g: np.ndarray, results: Some, kept: Any, params: dict) -> None:
-        """Fill `results`, given as zeros, with the gradients of the operands; `g` is that of the result."""
+        """Fill `results`, given as zeros, with the gradients of the operands; `g` is the gradient of the result."""
         self.pull(operands, g, results, **({**params, "kept": kept} if self.keeps else params))

@@ -17,7 +17,7 @@ from rts.operations.operation import Arrays, Operation, Some
 def projective_map(rows: Array, points: Array) -> Array:
     """Four affine maps (4, 4) of points (N, 3), as (N, 3): the first two over the third, and the fourth.
 
-    Where the third is zero there is no image; the result is finite.
+    A point where the third is zero has no image; its result is finite.
     """
     if is_plain_product(rows, points):
         PROJECTION.check_ranks((rows, points))
@@ -26,13 +26,13 @@ def projective_map(rows: Array, points: Array) -> Array:
 
 
 def projective_map_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
-    """As `projective_map`, of points (N, 3) of several views, put where each view has its place in a picture.
+    """As `projective_map`, for points (N, 3) of several views that are placed in one picture.
 
     Args:
-        rows: (B, 4, 4), those of each view.
+        rows: (B, 4, 4), the affine maps of each view.
         points: (N, 3), views one after the other.
         view: (N,) int32, the view of each point; see `rts.operations.by_view`.
-        places: (B, 3) of each view what is added to the first and to the second, and by what depth is multiplied.
+        places: (B, 3), for each view the offsets of x and y, and a factor on depth.
     """
     if not is_plain_product(rows[0, ...], points):
         return VIEWS(rows, points, view, places)
@@ -111,7 +111,7 @@ def _shape_of_views(rows: tuple, points: tuple[int, ...], view: tuple, places: t
 
 
 def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays, np.ndarray]]:
-    """The number of each view, where its points are, the operands of its projection, and its place."""
+    """Index, range of points, operands and place of each view."""
     rows, points, view, places = operands
     if rows.shape[1:] != (4, 4) or points.shape != (len(view), 3) or places.shape != (len(rows), 3):
         shapes = ", ".join(str(x.shape) for x in operands)
@@ -157,4 +157,4 @@ VIEWS = Operation(
     packed_result=True,
     used=lambda operands: rows_in_views(operands[2]),
 )
-"""See `projective_map_of_views`."""
+"""The operation of `projective_map_of_views`."""

@@ -1,18 +1,18 @@
-"""Perspective projection of points and its derivatives: NumPy in and out, one compiled pass each.
+"""Perspective projection of points, and its derivatives: one compiled loop each, on NumPy arrays.
 
-Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two over the third, and the fourth. Where the third is
-zero there is no image; the result is finite. All floats are of one dtype.
+Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two over the third, and the fourth. A point where the
+third is zero has no image; its result is finite. All floats are of one dtype.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 
 CHUNK = 4096
-"""Points whose sums are taken together; fixed, so that results do not depend on the number of threads."""
+"""Number of points that are summed together. Fixed, so that results do not depend on the number of threads."""
 
 
 def project(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
@@ -23,7 +23,7 @@ def project(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
 def push(
     rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, 3) with the tangent along those of rows (4, 4) and points (N, 3), or None for zeros."""
+    """Fill `out` (N, 3) with the tangent along `t_rows` (4, 4) and `t_points` (N, 3), or None for zeros."""
     turn = np.zeros_like(rows) if t_rows is None else t_rows
     move = np.empty((0, 3), points.dtype) if t_points is None else t_points
     parallel(_push, len(out), rows, points, read_only(turn), read_only(move), out, work=8 * len(out))
@@ -32,7 +32,7 @@ def push(
 def pull(
     rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
 ) -> None:
-    """Pull back the gradient `g` (N, 3) of the result: fill those of rows (4, 4) and points (N, 3) that are wanted."""
+    """Pull back the gradient `g` (N, 3) of the result: fill `g_rows` (4, 4) and `g_points` (N, 3) unless None."""
     sums = np.empty((-(-len(points) // CHUNK), 4, 4))
     g_points = np.empty((0, 3), points.dtype) if g_points is None else g_points
     parallel(_pull, len(sums), rows, points, read_only(g), sums, g_points, work=5 * len(points))

@@ -9,18 +9,18 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some, known_value
-from rts.threads import parallel, read_only
 
 
 def take(rows: Array, index: Array) -> Array:
-    """(M, C): the rows of (V, C) that (M,) integers name. Gradients are added up in the order of the index."""
+    """(M, C): rows of (V, C) by an index (M,). Gradients are added up in the order of the index."""
     return TAKE(rows, index)
 
 
 def take_shifted(rows: Array, index: Array, shift: Array) -> Array:
-    """(M, C): the rows of (V, C) that (M,) integers name, plus a constant shift (M, C), which has no derivative."""
+    """(M, C): rows of (V, C) by an index (M,), plus a constant shift (M, C), which has no derivative."""
     return SHIFTED(rows, index, shift)
 
 
@@ -46,10 +46,10 @@ def _forward(operands: Arrays, out: np.ndarray) -> None:
 
 
 def _put(rows: np.ndarray, index: np.ndarray, shift: np.ndarray, out: np.ndarray) -> None:
-    """Fill in the rows that are named, plus a shift (M, C), or no rows of it.
+    """Fill `out` (M, C) with the indexed rows plus a shift (M, C), or (0, C) for none.
 
     Raises:
-        InputError: there is no such row.
+        InputError: an index names no row.
     """
     from rts.operations import take_loops
 

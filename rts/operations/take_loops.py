@@ -1,15 +1,15 @@
-"""Rows by index, and sums of rows that share one, compiled."""
+"""Rows by index, and sums of rows that share an index, as compiled loops."""
 
 from __future__ import annotations
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 
 
 @loop
 def put(start, stop, rows, index, shift, out, bad):
-    """Fill rows [start, stop) of out (M, C) with those of (V, C) that (M,) integers name, plus a shift if it has rows.
+    """Fill rows [start, stop) of out (M, C) with rows of (V, C) by an index (M,), plus the shift if it has rows.
 
-    `bad` (1,) is marked where there is no such row.
+    `bad` (1,) is set if an index names no row.
     """
     count, channels = rows.shape
     for m in range(start, stop):
@@ -23,7 +23,7 @@ def put(start, stop, rows, index, shift, out, bad):
 
 @loop
 def add(values, index, total):
-    """Add the rows of (M, C) to those of (V, C) that (M,) integers name, in their order; indices of no row are left."""
+    """Add rows of (M, C) to rows of (V, C) by an index (M,), in its order. Indices of no row are skipped."""
     for m in range(len(index)):
         if 0 <= index[m] < len(total):
             for c in range(values.shape[1]):

@@ -1,4 +1,4 @@
-"""The toolkit of plugins: all that a plugin may import beside the names of `rts`, in submodules loaded one by one.
+"""The toolkit of plugins: submodules that a plugin may import beside `rts`, each loaded when imported.
 
 `from rts.plugin_api.arrays import unit`, for example. `docs/plugins.md` has a line for each name.
 """

@@ -1,4 +1,4 @@
-"""Checks of what users give, each refused in one line, and facts of tables of triangles."""
+"""Checks of arguments that users give, with one-line errors, and of tables of triangles."""
 
 from rts.arrays.argument_checks import check_numbers, check_positive, quoted
 from rts.contracts.checks import check_scene, is_count

@@ -1,4 +1,4 @@
-"""Files of polygons, and the folder of what is costly to make."""
+"""Files of polygons, and the cache folder for results that are costly to compute."""
 
 from rts.files.obj_reader import read_polygons
 from rts.files.paths import cache_folder, output_folder, writing

@@ -1,4 +1,4 @@
-"""Functions of arrays with compiled values and derivatives, and the record that makes more of them."""
+"""Functions of arrays with compiled values and derivatives, and the record for defining more."""
 
 from rts.operations.combine import combine, interpolate
 from rts.operations.gradient import gradient

@@ -1,4 +1,4 @@
-"""The splatters in array code, which compiled ones extend, with the numbers of their Gaussian."""
+"""The splatters in array code, which compiled ones extend."""
 
 from rts.splatting.single_and_multi import Multi, Single
 from rts.splatting.visible import Visible

@@ -1,5 +1,5 @@
-"""Compiled loops on all cores, and arrays as they take them."""
+"""Compiled loops on all cores, and arrays in the form that loops take."""
 
-from rts.threads import parallel, read_only
+from rts.compiling.threads import parallel, read_only
 
 __all__ = ["parallel", "read_only"]

@@ -1,7 +1,7 @@
-"""Energies of deformed meshes, to be added to a loss: what is smooth, evenly spaced, or bent but not stretched.
+"""Energies of deformed meshes, to be added to a loss; small for smooth, evenly spaced or unstretched meshes.
 
-Each is made once for a mesh and is then a function of its vertices: `energy(vertices)`, a scalar, and
-`energy.residuals(vertices)`, whose sum of squares it is.
+An energy is made once for a mesh and is then a function of its vertices. `energy(vertices)` is a scalar, the sum of
+squares of `energy.residuals(vertices)`.
 """
 
 from rts.regularizers.arap import ARAP

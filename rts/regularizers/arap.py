@@ -1,4 +1,4 @@
-"""As rigid as possible: bending a mesh costs nothing, stretching it does."""
+"""The energy `ARAP`, as rigid as possible: bending a mesh costs nothing, stretching it does."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ class ARAP(OfRestShape):
     """The energy of as-rigid-as-possible deformation (Sorkine and Alexa 2007, eq. 3), in squared units of the vertices.
 
     E = Σᵢ Σⱼ wᵢⱼ |(vᵢ − vⱼ) − Rᵢ (pᵢ − pⱼ)|² over the vertices i and their neighbours j, so that each edge counts from
-    both of its ends. p are the vertices at rest, and Rᵢ is the rotation that makes its own sum least: of the edges at
-    vertex i, the one that brings them nearest to where they are. It is what libigl calls *spokes*.
+    both of its ends. p are the vertices at rest. Rᵢ is the rotation that minimises the sum of vertex i: it brings
+    the edges at rest nearest to the present edges. libigl calls this variant *spokes*.
 
-    Rotations are found anew at each call, and no derivative passes through them. The gradient is the true one all the
-    same: at the best rotation that of the sum in R is zero (the envelope theorem). It stays finite where rotations are
-    not unique, at vertices with one neighbour or whose edges are in a line: there one of the best is taken. The
-    Jacobian of `residuals` and second derivatives are those with rotations held, so that a step of Gauss and Newton is
-    the *global step* of the paper, of which the energy never rises.
+    Rotations are computed anew at each call, and no derivative passes through them. The gradient is nevertheless exact:
+    at the best rotation the derivative of the sum in R is zero (the envelope theorem). Rotations are not unique at
+    vertices with one neighbour, or with edges in a line; one of the best is taken there, and the gradient stays finite.
+    The Jacobian of `residuals` and second derivatives hold rotations fixed. A Gauss–Newton step is then the *global
+    step* of the paper, which never raises the energy.
 
-    Weights are ½ (cot α + cot β) of the two angles opposite the edge at rest, or 0 where that is negative (between
-    obtuse angles), so that the energy is; or 1. Where more than two faces share an edge all of their angles count, at a
-    border the only one. Cotangents are bounded: angles below a twentieth of a degree, and triangles without area, count
-    as of that angle.
+    Cotangent weights are ½ (cot α + cot β) of the two angles opposite the edge at rest. Negative ones, between obtuse
+    angles, are set to 0, so that the energy is not negative. Where more than two faces share an edge, all of their
+    angles count; at a border the only one. Cotangents are bounded: angles below a twentieth of a degree count as such,
+    and so do triangles without area. Uniform weights are 1.
 
     `residuals` is (2E, 3): √wᵢⱼ ((vᵢ − vⱼ) − Rᵢ (pᵢ − pⱼ)), ordered by i. There are 2E terms.
 
@@ -43,13 +43,13 @@ class ARAP(OfRestShape):
         weights: (E,) float64, wᵢⱼ, at least 0.
 
     Raises:
-        InputError: one of these is something else.
+        InputError: an argument is of another kind or shape.
     """
 
     def __init__(self, vertices: Any, faces: Any, weights: str = "cotangent"):
         super().__init__(vertices, faces)
-        self.edges, found = edge_weights(weights, self._rest, self.faces)
-        self.weights = np.maximum(found, 0.0)
+        self.edges, edge_values = edge_weights(weights, self._rest, self.faces)
+        self.weights = np.maximum(edge_values, 0.0)
         self._ids, number = both_ways(self.edges)
         self.terms = len(self._ids)
         root = np.sqrt(self.weights[number])
@@ -67,14 +67,14 @@ class ARAP(OfRestShape):
         return spokes - engine.by_host(self._turned_by_host, self._turned, still)[0]
 
     def _turned_by_host(self, spokes: Array) -> tuple[Array, ...]:
-        """The edges at rest (2E, 3), times the roots of their weights, turned to fit those there are: compiled."""
+        """The edges at rest (2E, 3), times the roots of their weights, rotated to fit `spokes`; by a compiled loop."""
         engine = engine_of(spokes)
         dtype = np.float64 if engine.namespace.finfo(spokes.dtype).bits == 64 else np.float32
 
-        def host(found: np.ndarray) -> tuple[np.ndarray]:
+        def host(array: np.ndarray) -> tuple[np.ndarray]:
             from rts.regularizers import arap_loops
 
-            return (arap_loops.turned(found, self._at_rest, self._starts),)
+            return (arap_loops.turned(array, self._at_rest, self._starts),)
 
         return engine.call_host(host, [ArraySpec((self.terms, 3), dtype)], spokes)
 
@@ -85,7 +85,7 @@ class ARAP(OfRestShape):
         products = xp.reshape(spokes[:, :, None] * rest[:, None, :], (-1, 9))
         sums = xp.reshape(engine.segment_sum(products, self._ids[:, 0].copy(), count), (-1, 3, 3))
         u, _, v = xp.linalg.svd(sums, full_matrices=False)
-        sign = (xp.linalg.det(u) * xp.linalg.det(v))[:, None, None]  # Of reflections the least costly axis turns back.
+        sign = (xp.linalg.det(u) * xp.linalg.det(v))[:, None, None]  # −1 for reflections.
         u = xp.concat([u[:, :, :2], u[:, :, 2:] * sign], axis=2)
         rotations = xp.sum(u[:, :, :, None] * v[:, None, :, :], axis=2)
         own = xp.take(rotations, engine.constant(self._ids[:, 0], spokes), axis=0)

@@ -1,4 +1,4 @@
-"""Rotations of the edges around each vertex, compiled: LAPACK takes many times as long for such small matrices."""
+"""Rotations of the edges around each vertex, as compiled loops; LAPACK is far slower for such small matrices."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import math
 import numba
 import numpy as np
 
-from rts.compiling import loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 
 SWEEPS = 12
-"""More than it takes: each squares what is left to do."""
+"""Largest number of sweeps. Convergence is quadratic and takes fewer."""
 
 
 def turned(spokes: np.ndarray, rest: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """The edges at rest, those of each vertex under the rotation that brings them nearest to where they are.
+    """The edges at rest, rotated around each vertex to come nearest to the present edges.
 
     Args:
-        spokes: (M, 3) float32 or float64, edges as they are, ordered by vertex.
-        rest: (M, 3) float64, at rest.
-        starts: (V + 1,) the first edge of each vertex, and M.
+        spokes: (M, 3) float32 or float64, the present edges, ordered by vertex.
+        rest: (M, 3) float64, the edges at rest.
+        starts: (V + 1,) the index of the first edge of each vertex, then M.
 
     Returns:
         (M, 3), of the dtype of spokes.
@@ -30,7 +30,7 @@ def turned(spokes: np.ndarray, rest: np.ndarray, starts: np.ndarray) -> np.ndarr
     return out
 
 
-@loop(error_model="numpy")
+@loop
 def _turn(start, stop, spokes, rest, starts, out):
     columns, axes, rotation = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(start, stop):
@@ -50,10 +50,10 @@ def _turn(start, stop, spokes, rest, starts, out):
 
 @numba.njit(error_model="numpy")
 def _nearest_rotation(columns, axes, rotation):
-    """Fill `rotation` with the R of largest tr(Rᵀ M), for M of these columns (rows here), which are overwritten.
+    """Fill `rotation` with the R of largest tr(Rᵀ M). `columns` holds the columns of M as rows, and is overwritten.
 
-    Columns are turned in pairs until all are orthogonal (Hestenes 1958): M V = U Σ. The axis of the least singular
-    value follows from the others, so that U Vᵀ is a rotation; where that one alone is zero, R is still unique.
+    Columns are rotated in pairs until all are orthogonal (Hestenes 1958): M V = U Σ. The axis of the least singular
+    value follows from the other two, so that U Vᵀ is a rotation. R is unique even if the least singular value is zero.
     """
     largest = 0.0
     for c in range(3):
@@ -98,7 +98,7 @@ def _length(x):
 
 @numba.njit(error_model="numpy")
 def _orthogonalise(columns, axes, p, q):
-    """Turn two columns, and axes with them, until they are orthogonal; whether that was needed."""
+    """Rotate two columns, and their axes, until they are orthogonal. Returns False if they were already."""
     first, second, both = 0.0, 0.0, 0.0
     for r in range(3):
         first += columns[p, r] * columns[p, r]

@@ -1,4 +1,4 @@
-"""What is computed of a mesh's faces once: edges, pairs of faces, cotangents. NumPy."""
+"""Connectivity of a mesh, computed once: edges, pairs of faces, cotangents. NumPy."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rts.arrays.argument_checks import quoted
 from rts.errors import InputError
 
 LARGEST_COTANGENT = 1e3
-"""That of a twentieth of a degree: narrower angles, and those of triangles without area, count as if they were so."""
+"""The cotangent of a twentieth of a degree; bounds those of narrower angles and of triangles without area."""
 
 WEIGHTS = ("cotangent", "uniform")
 
 
 def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges of a mesh, each once however many faces share it, and which are those of each face.
+    """The edges of a mesh, each once even if several faces share it, and the edges of each face.
 
     Args:
         faces: (T, 3) integers.
@@ -26,7 +26,7 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ends are one vertex.
 
     Raises:
-        InputError: there is no edge: the corners of each face are one vertex.
+        InputError: there is no edge, since the corners of every face are one vertex.
     """
     ends = np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=-1).astype(np.int64)
     low, high = ends.min(axis=-1), ends.max(axis=-1)
@@ -46,20 +46,20 @@ def pairs_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         faces: (T, 3) integers.
 
     Returns:
-        Pairs (P, 2) int32; and (P,) float64, 1 where the faces are oriented alike, which is to say that they pass
-        their edge in opposite directions, and −1 where not.
+        Pairs (P, 2) int32; and (P,) float64, 1 where the faces are oriented alike, so that they pass their edge in
+        opposite directions, and −1 elsewhere.
     """
     sides = edges_of(faces)[1].reshape(-1)
     forward = (np.roll(faces, -1, axis=1) < np.roll(faces, -2, axis=1)).reshape(-1)
     order = np.argsort(sides, kind="stable")
     order = order[np.searchsorted(sides[order], 0) :]
-    first, found = np.arange(len(order)), [np.zeros((0, 2), np.int64)]
-    while len(first):  # The faces of an edge are neighbours in this order: those one apart, two apart, …
-        apart = len(found)
+    first, pairs = np.arange(len(order)), [np.zeros((0, 2), np.int64)]
+    while len(first):  # Faces of an edge are neighbours in this order: pairs one apart, two apart, …
+        apart = len(pairs)
         first = first[first + apart < len(order)]
         first = first[sides[order[first]] == sides[order[first + apart]]]
-        found.append(order[np.stack([first, first + apart], axis=-1)])
-    halves = np.concatenate(found)
+        pairs.append(order[np.stack([first, first + apart], axis=-1)])
+    halves = np.concatenate(pairs)
     # A face whose corners are two vertices passes its edge twice.
     halves = halves[halves[:, 0] // 3 != halves[:, 1] // 3]
     alike = np.where(forward[halves[:, 0]] != forward[halves[:, 1]], 1.0, -1.0)
@@ -67,7 +67,7 @@ def pairs_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cotangents(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(T, 3) the cotangent of the angle at each corner, bounded; 0 where a side there has no length."""
+    """(T, 3) the bounded cotangent of the angle at each corner; 0 where a side of the angle has no length."""
     corners = vertices[faces]
     a, b = np.roll(corners, -1, axis=1) - corners, np.roll(corners, -2, axis=1) - corners
     along = (a * b).sum(axis=-1)
@@ -77,7 +77,7 @@ def cotangents(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def edge_weights(kind: Any, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (E, 2), and the weight (E,) of each: half the sum of the cotangents opposite of it, or 1.
+    """Edges (E, 2), and the weight (E,) of each: half the sum of the cotangents opposite to it, or 1.
 
     Args:
         kind: "cotangent" or "uniform".
@@ -97,7 +97,7 @@ def edge_weights(kind: Any, vertices: np.ndarray, faces: np.ndarray) -> tuple[np
 
 
 def both_ways(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each edge from both of its ends, ordered by where it starts: (2E, 2) vertices, and (2E,) which edge it is."""
+    """Each edge from both of its ends, ordered by first vertex: (2E, 2) vertices, and (2E,) the number of the edge."""
     directed, number = np.concatenate([edges, edges[:, ::-1]]), np.tile(np.arange(len(edges)), 2)
     order = np.argsort(directed[:, 0], kind="stable")
     return np.ascontiguousarray(directed[order]), number[order]

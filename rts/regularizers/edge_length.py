@@ -1,4 +1,4 @@
-"""Edges of a mesh held to a length."""
+"""The energy `EdgeLength`, which holds the edges of a mesh to a length."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ NAMED = ("rest", "mean")
 class EdgeLength(OfRestShape):
     """Lengths of edges: E = Σ (|eᵢⱼ| − lᵢⱼ)² over the edges, in squared units of the vertices.
 
-    With a number for l it is the loss of meshes in Pixel2Mesh (Wang et al. 2018, §3.4, with l = 0) and in PyTorch3D
-    (`mesh_edge_loss`, their mean). An edge counts once, however many faces share it. One of length zero has the
-    derivative zero.
+    With a number for l it is the edge loss of Pixel2Mesh (Wang et al. 2018, §3.4, with l = 0) and of PyTorch3D
+    (`mesh_edge_loss`, a mean). An edge counts once, even if several faces share it. The derivative of an edge of length
+    zero is zero.
 
     `residuals` is (E,): |eᵢⱼ| − lᵢⱼ. There are E terms.
 
     Args:
         vertices: (V, 3) finite numbers, the mesh at rest; copied.
         faces: (T, 3) integers into vertices; copied.
-        target: what l is: "rest", the length of each edge at rest; "mean", the mean length of all edges as they are
-            now, which asks for even ones of any length; or a length.
+        target: the lengths l: "rest", the length of each edge at rest; "mean", the present mean length of all edges,
+            for even edges of any length; or a number.
 
     Attributes:
         edges: (E, 2) int32, the lower vertex first.
 
     Raises:
-        InputError: one of these is something else.
+        InputError: an argument is of another kind or shape.
     """
 
     def __init__(self, vertices: Any, faces: Any, target: str | float = "rest"):
         super().__init__(vertices, faces)
-        known = target in NAMED if isinstance(target, str) else is_real(target) and 0 <= target < math.inf
-        if not known:
+        valid = target in NAMED if isinstance(target, str) else is_real(target) and 0 <= target < math.inf
+        if not valid:
             raise InputError(f"target is {quoted(target)}; expected 'rest', 'mean' or a length, at least 0")
         self.edges, _ = edges_of(self.faces)
         self.terms = len(self.edges)
@@ -67,5 +67,5 @@ def norms(vectors: Array) -> Array:
     """(N,) lengths of vectors (N, 3); the derivative of a length of zero is zero."""
     xp = namespace(vectors)
     square = xp.sum(vectors * vectors, axis=-1)
-    some = square != 0  # True of NaN, which is to stay.
+    some = square != 0  # True for NaN, so that it stays.
     return xp.where(some, xp.sqrt(xp.where(some, square, xp.ones_like(square))), xp.zeros_like(square))

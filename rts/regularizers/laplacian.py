@@ -1,4 +1,4 @@
-"""Laplacian coordinates: how far vertices are from the mean of their neighbours."""
+"""Laplacian coordinates: the offset of each vertex from the mean of its neighbours."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from rts.regularizers.connectivity import both_ways, edge_weights
 from rts.regularizers.regularizer import OfRestShape, combined
 
 WIDTH = 8
-"""Neighbours in a row of a table of vertices; most have no more."""
+"""Number of neighbours in a row of a table of vertices; most vertices have no more."""
 
 
 class Laplacian(OfRestShape):
     """Smoothness by Laplacian coordinates: E = Σᵢ |δᵢ|², in squared units of the vertices.
 
-    δᵢ = Σⱼ wᵢⱼ (vⱼ − vᵢ) / Σⱼ |wᵢⱼ| over the neighbours j of vertex i: how far it is from their mean (Sorkine et al.
-    2004, *Laplacian Surface Editing*). The weights are 1, or ½ (cot α + cot β) of the two angles opposite the edge at
-    rest (Pinkall and Polthier 1993); then δ has the direction of the normal, and that of any linear function on a flat
-    sheet is zero inside of it, however uneven the triangles are. At obtuse angles such weights may be negative, hence
-    the absolute values. Where more than two faces share an edge all of their angles count, at a border the only one.
-    Cotangents are bounded: angles below a twentieth of a degree, and triangles without area, count as of that angle.
+    δᵢ = Σⱼ wᵢⱼ (vⱼ − vᵢ) / Σⱼ |wᵢⱼ| over the neighbours j of vertex i is the offset from their mean (Sorkine et al.
+    2004, *Laplacian Surface Editing*). Uniform weights are 1. Cotangent weights are ½ (cot α + cot β) of the two angles
+    opposite the edge at rest (Pinkall and Polthier 1993). With these δ points along the normal; inside a flat sheet it
+    is zero for any linear function, on uneven triangles, too. Cotangent weights may be negative at obtuse angles, hence
+    the absolute values. Where more than two faces share an edge, all of their angles count; at a border the only one.
+    Cotangents are bounded: angles below a twentieth of a degree count as such, and so do triangles without area.
 
-    Without `relative` it shrinks and flattens; borders are drawn inwards, too. With it, shifts cost nothing, but
-    rotations do: for large ones take `ARAP`.
+    Without `relative` the energy shrinks and flattens the mesh, and draws borders inwards. With `relative`, shifts cost
+    nothing, but rotations do: for large ones take `ARAP`.
 
-    `residuals` is (V, 3): δᵢ, or δᵢ − δᵢ at rest. There are V terms; those of vertices without edges are zero.
+    `residuals` is (V, 3): δᵢ, or δᵢ − δᵢ at rest. There are V terms; terms of vertices without edges are zero.
 
     Args:
         vertices: (V, 3) finite numbers, the mesh at rest; copied.
         faces: (T, 3) integers into vertices; copied.
         weights: "uniform" or "cotangent".
-        relative: whether to compare with the coordinates at rest, which keeps details as they are.
+        relative: whether to compare with the coordinates at rest, which keeps details.
 
     Attributes:
         edges: (E, 2) int32, the lower vertex first.
         weights: (E,) float64, wᵢⱼ.
 
     Raises:
-        InputError: one of these is something else.
+        InputError: an argument is of another kind or shape.
     """
 
     def __init__(self, vertices: Any, faces: Any, weights: str = "uniform", relative: bool = False):
@@ -66,31 +66,31 @@ class Laplacian(OfRestShape):
     def _coordinates(self, vertices: Array) -> Array:
         # Differences of neighbours first: sums of whole positions would lose most digits of float32.
         steps = combined(vertices, self.edges, self._steps)
-        found = combined(steps, self._ids, self._shares)
+        sums = combined(steps, self._ids, self._shares)
         if not len(self._further):
-            return found
-        rest = engine_of(vertices).segment_sum(found[self.terms :, :], self._further, self.terms)
-        return found[: self.terms, :] + rest
+            return sums
+        rest = engine_of(vertices).segment_sum(sums[self.terms :, :], self._further, self.terms)
+        return sums[: self.terms, :] + rest
 
     def _residuals(self, vertices: Array) -> Array:
-        found = self._coordinates(vertices)
-        return found if self._at_rest is None else found - engine_of(vertices).constant(self._at_rest, vertices)
+        offsets = self._coordinates(vertices)
+        return offsets if self._at_rest is None else offsets - engine_of(vertices).constant(self._at_rest, vertices)
 
 
 def _table(
     vertex: np.ndarray, values: np.ndarray, shares: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What belongs to each vertex, as a table of few columns however many neighbours some vertices have.
+    """Values of each vertex in a table of `WIDTH` columns; vertices with more values have further rows.
 
     Args:
         vertex: (M,) integers, in order.
-        values: (M,) integers that belong to them.
-        shares: (M,) float.
+        values: (M,) integers, a value of each of these vertices.
+        shares: (M,) float, a share of each.
         count: the number of vertices.
 
     Returns:
-        Values and shares (count + F, WIDTH), filled up with zeros: a row for each vertex, then further ones; and (F,)
-        whose these are.
+        Values and shares (count + F, WIDTH), filled up with zeros: a row for each vertex, then F further rows; and (F,)
+        the vertex of each further row.
     """
     rank = np.arange(len(vertex)) - np.searchsorted(vertex, vertex)
     column, row = rank % WIDTH, vertex.astype(np.int64)

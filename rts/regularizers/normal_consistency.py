@@ -1,4 +1,4 @@
-"""Normals of adjacent faces, held alike."""
+"""The energy `NormalConsistency`, which aligns the normals of adjacent faces."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from rts.regularizers.regularizer import Regularizer, check_count, combined, kno
 from rts.scene.topology import index_table
 
 FLAT = 8.0
-"""As many roundings of its longest side as the height of a triangle must be, at least, to have a normal."""
+"""Least height of a triangle that has a normal, in roundings of its longest side."""
 
 
 class NormalConsistency(Regularizer):
     """Normals of faces that share an edge: E = Σ (1 − cos θ) over the pairs, without unit; θ is 0 on a flat sheet.
 
-    It is what PyTorch3D (Ravi et al. 2020) takes the mean of in `mesh_normal_consistency`. Where more than two faces
-    share an edge all pairs count. Faces that are oriented in opposite ways are compared as if they were not: only θ
-    counts. Pairs with a triangle whose height is lost in rounding, which has no normal, count nothing.
+    PyTorch3D (Ravi et al. 2020) takes the mean of these terms in `mesh_normal_consistency`. Where more than two faces
+    share an edge, all pairs count. Faces of opposite orientation are compared as if oriented alike: only θ counts. A
+    triangle whose height is lost in rounding has no normal, and its pairs count nothing.
 
     `residuals` is (P, 3): (n₁ − n₂) / √2, of squared length 1 − cos θ. There are P terms, perhaps none.
 
     Args:
-        vertices: (V, 3), as the other energies take them; only their number is kept. `NormalConsistency(faces)` will
-            do, too: normals know no shape at rest.
+        vertices: (V, 3), as for the other energies; only their number is kept. `NormalConsistency(faces)` will do,
+            too, since the energy has no shape at rest.
         faces: (T, 3) integers; copied.
 
     Attributes:
         pairs: (P, 2) int32 into faces.
 
     Raises:
-        InputError: one of these is something else.
+        InputError: an argument is of another kind or shape.
     """
 
     def __init__(self, vertices: Any = None, faces: Any = None):
@@ -61,12 +61,12 @@ class NormalConsistency(Regularizer):
     def _residuals(self, vertices: Array) -> Array:
         engine, xp = engine_of(vertices), namespace(vertices)
         normals, lost = self._normals(vertices)
-        found = combined(normals, self.pairs, self._differences)
+        differences = combined(normals, self.pairs, self._differences)
         first, second = (xp.take(lost, engine.constant(self.pairs[:, i], vertices), axis=0) for i in range(2))
-        return xp.where((first | second)[:, None], xp.zeros_like(found), found)
+        return xp.where((first | second)[:, None], xp.zeros_like(differences), differences)
 
     def _normals(self, vertices: Array) -> tuple[Array, Array]:
-        """(T, 3) unit normals, zero where there is none; and (T,) where that is."""
+        """(T, 3) unit normals, zero for triangles without one; and a mask (T,) of these triangles."""
         engine, xp = engine_of(vertices), namespace(vertices)
         sides = combined(vertices, self._sides, self._ends)
         # In units of the longest side, so that neither squares nor their inverses leave the range of float32.
@@ -77,6 +77,6 @@ class NormalConsistency(Regularizer):
         a, b = sides[: len(self.faces)] * scale, sides[len(self.faces) :] * scale
         normals = xp.linalg.cross(a, b)
         square = xp.sum(normals * normals, axis=-1)
-        lost = square <= (FLAT * xp.finfo(vertices.dtype).eps) ** 2  # False of NaN, which is to stay.
+        lost = square <= (FLAT * xp.finfo(vertices.dtype).eps) ** 2  # False for NaN, so that it stays.
         length = xp.sqrt(xp.where(lost, xp.ones_like(square), square))
         return xp.where(lost[:, None], xp.zeros_like(normals), normals / length[:, None]), lost

@@ -1,4 +1,4 @@
-"""The base of all energies: a sum of squares of residuals, which are functions of a mesh's vertices."""
+"""The base class of energies, which are sums of squares of functions of a mesh's vertices."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from rts.scene.topology import index_table
 class Regularizer(abc.ABC):
     """An energy of a mesh's vertices: the sum of squares of its residuals.
 
-    Vertices (V, 3) are float32 or float64 arrays. NumPy's give the value; those of torch and jax have derivatives too,
-    compiled and in batches (`vmap`). The result is of their engine, dtype and device. What is known of the mesh is kept
-    as NumPy arrays. Vertices that are not finite give an energy that is not.
+    Vertices (V, 3) are float32 or float64 arrays. NumPy arrays give the value; torch and jax arrays have derivatives,
+    too, compiled and in batches (`vmap`). The result has the engine, dtype and device of the vertices. Data of the mesh
+    itself is kept as NumPy arrays. If vertices are not finite, neither is the energy.
 
     The energy is a sum, as in the papers, and grows with the number of vertices; `energy(vertices) / energy.terms` is a
     mean.
 
     Attributes:
         faces: (T, 3) int32, read-only.
-        terms: how many terms the sum has: edges, vertices or pairs of faces, as each class says.
+        terms: number of terms of the sum: edges, vertices or pairs of faces, see each class.
     """
 
     faces: np.ndarray
@@ -41,20 +41,20 @@ class Regularizer(abc.ABC):
             vertices: (V, 3) float32 or float64.
 
         Raises:
-            InputError: vertices of another number, shape or dtype.
+            InputError: the number, shape or dtype of the vertices is wrong.
         """
-        found = self.residuals(vertices)
-        return namespace(found).sum(found * found)
+        residuals = self.residuals(vertices)
+        return namespace(residuals).sum(residuals * residuals)
 
     @uncompiled
     def residuals(self, vertices: Array) -> Array:
-        """Residuals whose sum of squares is the energy, such as `rts.fit(method="lm")` takes; see the class.
+        """Residuals whose sum of squares is the energy, for `rts.fit(method="lm")`; see the class.
 
         Args:
             vertices: (V, 3) float32 or float64.
 
         Raises:
-            InputError: vertices of another number, shape or dtype.
+            InputError: the number, shape or dtype of the vertices is wrong.
         """
         vertices = from_numbers(vertices, "vertices")
         shape = shape_of(vertices)
@@ -72,18 +72,18 @@ class Regularizer(abc.ABC):
 
     @abc.abstractmethod
     def _residuals(self, vertices: Array) -> Array:
-        """`residuals` of vertices that have been checked."""
+        """`residuals` of checked vertices."""
 
 
 class OfRestShape(Regularizer):
-    """An energy that is told a mesh at rest.
+    """An energy relative to a mesh at rest.
 
     Args:
         vertices: (V, 3) finite numbers, an array of any engine; copied, without derivatives.
         faces: (T, 3) integers into vertices; copied.
 
     Raises:
-        InputError: one of these is something else.
+        InputError: an argument is of another kind or shape.
     """
 
     def __init__(self, vertices: Any, faces: Any):
@@ -101,23 +101,23 @@ def check_count(count: int, expected: int) -> None:
 
 
 def known_vertices(name: str, vertices: Any, faces: np.ndarray) -> np.ndarray:
-    """A copy (V, 3) float64 of the values of vertices at rest, refused where faces name others."""
+    """A copy (V, 3) float64 of vertices at rest, refused if faces name a vertex that does not exist."""
     shape = shape_of(vertices := from_numbers(vertices, name))
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise InputError(f"{name} is {quoted(vertices)}; expected (V, 3) numbers, at least one row")
-    known = check_numbers(name, vertices, shape)
-    if known is None:
+    values = check_numbers(name, vertices, shape)
+    if values is None:
         raise InputError(f"{name} is traced; make the energy outside of jit and vmap, or give it NumPy arrays")
-    if faces.max() >= len(known):
+    if faces.max() >= len(values):
         raise InputError(
-            f"faces name vertex {faces.max()}, but there are {len(known)} vertices; check the indices (they count from "
-            f"0)"
+            f"faces name vertex {faces.max()}, but there are {len(values)} vertices; check the indices (they count "
+            f"from 0)"
         )
-    return np.array(known, np.float64)
+    return np.array(values, np.float64)
 
 
 def combined(rows: Array, ids: np.ndarray, weights: np.ndarray) -> Array:
-    """(N, C): Σᵢ wᵢ rowᵢ of rows (V, C), with ids and weights (N, I) that are the mesh's own."""
+    """(N, C): Σᵢ wᵢ rowᵢ of rows (V, C), with constant ids and weights (N, I)."""
     engine = engine_of(rows)
     weights_, ids_ = engine.constant(weights, rows), engine.constant(ids, rows)
     return COMBINE(rows, weights_, ids_, column=0, count=ids.shape[1], affine=False)

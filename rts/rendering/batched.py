@@ -11,6 +11,7 @@ import numpy as np
 from rts.arrays.array_functions import described, shape_of
 from rts.arrays.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.arrays.trees import Array
+from rts.compiling.threads import each
 from rts.contracts.checks import check_background, check_cameras
 from rts.contracts.records import Sampled
 from rts.errors import InputError
@@ -28,7 +29,6 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
 from rts.splatting.side_by_side import Picture, at_once
-from rts.threads import each
 
 _T = TypeVar("_T")
 
@@ -47,21 +47,21 @@ def render_views(
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Array:
-    """Render several views of a scene; they are those of a loop of `render`, but for rounding.
+    """Render several views of a scene. The images equal the results of a loop of `render` up to rounding.
 
-    Where layers are nearer to one another than float32 tells apart at their distance, gradients of hidden parts may
-    differ more: what counts as equal goes by the farthest view, and is up to twice what it is of a view alone.
+    Gradients of hidden parts may differ more where layers are closer than float32 resolves at their distance. The
+    threshold for equal depths is set by the farthest view, and is up to twice that of a single view.
 
-    Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
-    the surface computes of the whole of θ, such as smooth normals, serves them all, one splat does, and one call of a
-    shader that `takes_views`, as the built-in ones do but for those with mipmaps. With jax, and under `torch.func`,
-    that is so for shaders which take views, for parts of one colour, and for one picture; else one view follows the
-    other, as with `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered one on each
-    core. With torch and jax memory is that of all views at once, with a gradient or without.
+    Views lie side by side in one picture of at most 1024² cells. Python's overhead, results for the whole of θ such as
+    smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`; the built-in
+    shaders without mipmaps do. With jax, and under `torch.func`, this needs shaders that take views, or parts of one
+    colour, and views that fit into one picture. Otherwise views are rendered one after another, as with `layers="auto"`
+    and in bands. NumPy views that are too large for a picture are rendered one on each core. With torch and jax all
+    views are in memory at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
-        cameras: B cameras, or what `Camera.stack` made of them.
+        cameras: B cameras, or one stacked by `Camera.stack`.
         size: (height, width) of each view, in pixels.
         sampler: as in `render`.
         splatter: as in `render`.
@@ -75,11 +75,11 @@ def render_views(
         (B, H, W, 4), as in `render`.
 
     Raises:
-        InputError: what was given cannot be rendered.
+        InputError: an argument is wrong; the scene cannot be rendered.
         EngineError: torch and jax arrays in one scene.
 
     Warns:
-        EmptyImageWarning: nothing is seen in a view; it says why.
+        EmptyImageWarning: nothing is seen in a view; the warning says why.
         AspectWarning: a camera is for images of another ratio of width to height.
     """
     listed = check_cameras(cameras)
@@ -97,7 +97,7 @@ def render_views(
 
 
 def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:
-    """One background for all views, or one for each."""
+    """The background as an array: one for all views, or (B, H, W, ·), one for each."""
     if background is None or len(shape_of(background)) < 4:
         return check_background(background, size, channels)
     if shape_of(background)[0] != count:
@@ -106,27 +106,27 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 
 def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The images (B, H, W, C + 1) of several views of one scene, over nothing."""
+    """The images (B, H, W, C + 1) of several views of one scene, without a background."""
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
-    # Where layers are "auto" it may warn, which is for this thread.
+    # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
     if settings.layers != "auto" and settings.side is not None and len(settings.bands(size)) == 1:
         height, width = (settings.side * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
-        given = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
-        if place.views > 1 and all(own.possible for own in given):
-            # Of padded rows it is not known which are those of a view, so that there must be one call for all.
-            alike = len(given) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
-            known = settings.capacity is None and engine.concurrent() and engine.on_host(like)
-            if alike if engine.padded(like) else known:
-                return _as_pictures([sampled_as_one(own) for own in given], scenes, context, settings)
+        samplings = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
+        if place.views > 1 and all(own.possible for own in samplings):
+            # The view of a padded row is unknown, so that one call must serve all views.
+            one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
+            countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
+            if one_call if engine.padded(like) else countable:
+                return _as_pictures([sampled_as_one(own) for own in samplings], scenes, context, settings)
         if several and differentiates:
             views = _sampled_at_once(scenes, size, settings)
             pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
-            found = [picture for picture in pictures if picture is not None]
-            if len(found) == len(pictures):
-                return _as_pictures(found, scenes, context, settings)
+            complete = [picture for picture in pictures if picture is not None]
+            if len(complete) == len(pictures):
+                return _as_pictures(complete, scenes, context, settings)
             return _one_by_one(scenes, views, context, settings)
     elif settings.side is None and several and differentiates and settings.contrast is None:
         return _one_by_one(scenes, _sampled_at_once(scenes, size, settings), context, settings)
@@ -139,19 +139,19 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
 
 
 def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
-    """The samples of views, one on each core."""
+    """The samples of each view; every core samples one view at a time."""
     return each(lambda own: sampled_scene(own, own.camera, size, settings, settles=True), scenes)
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
-    """Views in as few groups as there are with so many at most, which are about as large as one another."""
+    """Views in the fewest groups of at most `most` views, of about equal size."""
     count = -(-len(views) // most)
     size = -(-len(views) // count)
     return [views[first : first + size] for first in range(0, len(views), size)]
 
 
 def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
-    """The images (B, H, W, C + 1) of views that were sampled, each by a splat of its own."""
+    """The images (B, H, W, C + 1) of sampled views, by a splat for each view."""
     pairs = zip(views, scenes, strict=True)
     images = [splatted(own, scene, scene.camera, context, settings.reader) for own, scene in pairs]
     return namespace(*images).stack(images)
@@ -160,7 +160,7 @@ def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Cont
 def _as_pictures(
     pictures: Sequence[Views], scenes: Sequence[Scene], context: Context, settings: RenderSettings
 ) -> Array:
-    """The images (B, H, W, C + 1) of views that were sampled, by a splat of each picture."""
+    """The images (B, H, W, C + 1) of sampled views, by a splat for each picture."""
     images, cameras = [], [scene.camera for scene in scenes]
     for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
         cells = views.picture.apart(cropped_image(settings.reader, splats), views.sampled.apron)
@@ -172,7 +172,7 @@ def _as_pictures(
 
 
 def _concurrent(scene: Scene) -> bool:
-    """Whether several threads may sample the scene at once."""
+    """True if several threads may sample the scene at once."""
     engine, like = scene.context
     # On devices work is queued by thread.
     on_host = like is None or engine.on_host(like)

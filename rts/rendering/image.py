@@ -1,4 +1,4 @@
-"""Rendering: sample → evaluate → shade → project → splat, and its half with derivatives."""
+"""`rts.render`, sample → evaluate → shade → project → splat, and `rts.render_samples`, its differentiable half."""
 
 from __future__ import annotations
 
@@ -45,39 +45,38 @@ def render(
     """Render a scene, differentiably in everything that is a torch or jax array.
 
     Args:
-        parts: one part or several, or what `prepare` made of them; NumPy arrays in them are constants.
+        parts: one part or several, or the result of `prepare`; NumPy arrays in them are constants.
         camera: the camera.
         size: (height, width) in pixels.
         sampler: name or object of a `Sampler`.
         splatter: name or object of a `Splatter`.
-        layers: K, the number of surface layers kept at each pixel; or "auto", as many as count where surfaces hide one
-            another, up to 8 (a warning says if there are more).
+        layers: K, the number of surface layers kept at each pixel. With "auto" it is the number that the image needs
+            where surfaces hide one another, up to 8 (a warning says if more are needed).
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
-            bands of rows, so that memory stays bounded; in a gradient each band is then made once more. Or an
-            `rts.Adaptive`, for as many only where outlines are; there are no bands then.
+            bands of rows, so that memory stays bounded; for a gradient each band is then rendered twice. An
+            `rts.Adaptive` takes s² samples only at outlines, and renders without bands.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
-            transparent. Of C or C + 1 channels where the image has C and alpha.
+            transparent. It has C or C + 1 channels if the image has C and alpha.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
-            for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
-            fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
-            image is rendered in bands, it is the capacity of each band. With `rts.Adaptive` the fine samples have as
-            many rows again, `layers` for each fine cell of active pixels and their aprons; pixels that find no room
-            stay coarse, and are counted.
-        engine: name of the engine to compute with, "torch" or "jax", where the scene alone does not tell: its arrays
-            are all NumPy, but a shader holds a network. None for the engine of the arrays.
+            for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. Samples
+            beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them. If the
+            image is rendered in bands, each band has this capacity. With `rts.Adaptive` the fine samples have as many
+            rows again, `layers` for each fine cell of active pixels and their aprons. Pixels that find no room stay
+            coarse, and are counted.
+        engine: name of the engine to compute with, "torch" or "jax". Needed where all arrays are NumPy, but a shader
+            holds a network. None for the engine of the arrays.
 
     Returns:
-        (H, W, 4) premultiplied linear RGBA, row 0 on top; (H, W, C + 1), alpha last, where shaders say that they give
-        C `channels`. Its dtype is the widest floating one of the torch or jax
-        arrays in parts and camera; in a scene of NumPy arrays, the widest in any θ; at least float32. What else is
-        NumPy, such as a camera in float64, does not widen it.
+        (H, W, 4) premultiplied linear RGBA, row 0 on top; (H, W, C + 1), alpha last, for shaders with C `channels`.
+        The dtype is the widest floating one of the torch or jax arrays in parts and camera; in a scene of NumPy
+        arrays, the widest in any θ; at least float32. Other NumPy arrays, such as a camera in float64, do not widen it.
 
     Raises:
-        InputError: what was given cannot be rendered.
+        InputError: an argument is wrong; the scene cannot be rendered.
         EngineError: torch and jax arrays in one scene.
 
     Warns:
-        EmptyImageWarning: nothing is seen; it says why.
+        EmptyImageWarning: nothing is seen; the warning says why.
         AspectWarning: the camera is for images of another ratio of width to height.
         InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`.
     """
@@ -87,13 +86,13 @@ def render(
 
 
 def image_over(scene: Scene, size: tuple[int, int], background: Array | None, settings: RenderSettings) -> Array:
-    """The image of a scene for images of a size, over a checked background; see `render`."""
+    """The image (H, W, C + 1) of a checked scene over a checked background; see `render`."""
     context = scene.context if is_constant(background) else scene.context_with(background)
     return over_background(seen(image_of(scene, size, context, settings), scene), background)
 
 
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image of a scene for images of a size, over nothing; `context` is for the half with derivatives."""
+    """The image (H, W, C + 1) of a checked scene, without a background; `context` is for the differentiable half."""
     if settings.contrast is not None:
         return _of_contrast(scene, size, context, settings)
     bands, reader = settings.bands(size), settings.reader
@@ -109,11 +108,11 @@ def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: Re
 
 
 def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
-    """The samples of a window of the image, with a warning if some that are in front find no room."""
+    """The samples of a window of the image, with a warning if front samples exceed the capacity."""
     sampled = sampled_scene(scene, window, size, settings, settles=True)
     if settings.capacity is not None:
         left_out, row = value_of(sampled.overflow), value_of(sampled.row)
-        # Layers are left out from the deepest on.
+        # The deepest layers are left out first.
         if left_out is not None and left_out.any() and row is not None and not (row[..., 1:, :, :] >= 0).any():
             warn(
                 f"capacity is {settings.capacity}, and {int(left_out.max())} samples find no room, some of them in "
@@ -124,7 +123,7 @@ def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: Rend
 
 
 def _of_contrast(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image with fine samples also where colours change, which are those of the coarse samples."""
+    """The image with fine samples where the colours of coarse samples change, too."""
     coarse = coarse_scene(scene, scene.camera, size, settings)
     splats = to_splats(coarse, scene.parts, scene.camera, scene.camera, context)
     colors = value_of(splats.rgba)
@@ -150,8 +149,8 @@ def render_samples(
     """The half of `render` with derivatives: evaluate the parts at the samples, shade, project and splat.
 
     Args:
-        sampled: what `sample` gave for these parts. θ, transform and camera may have other values now, but for one
-            case: a surface whose θ is NumPy, beside torch or jax arrays, was evaluated when it was sampled.
+        sampled: the result of `sample` for these parts. θ, transform and camera may have other values now, with one
+            exception: a surface whose θ is NumPy, beside torch or jax arrays, was evaluated when it was sampled.
         parts: as in `render`.
         camera: as in `render`.
         splatter: as in `render`.
@@ -162,7 +161,7 @@ def render_samples(
         (H, W, 4) premultiplied linear RGBA, row 0 on top.
 
     Raises:
-        InputError: the samples are not of these parts, their apron is too narrow for the splatter, or some that it
+        InputError: the samples are of other parts, their apron is too narrow for the splatter, or samples that it
             needs were left out.
         EngineError: torch and jax arrays in one scene.
     """
@@ -194,7 +193,7 @@ def render_samples(
 
 
 def _narrowed(sampled: Sampled, count: int) -> Sampled:
-    """Samples with an apron that is narrower by so many cells."""
+    """Samples with an apron that is narrower by `count` cells."""
     if count == 0:
         return sampled
     rows, columns = (slice(count, n - count) for n in sampled.row.shape[1:])
@@ -212,15 +211,15 @@ def splatted(
     splatter: Splatter,
     splats: Splats | None = None,
 ) -> Array:
-    """The image (H, W, 4) of what was sampled through a window of the camera's image.
+    """The image (H, W, 4) of samples of a window of the camera's image.
 
     Args:
         sampled: the samples.
         scene: checked; shaders see the camera of the whole image.
         window: the camera of the samples.
-        context: the engine to compute with, and what its constants are like.
+        context: the engine to compute with, and an exemplar of its constants.
         splatter: a splatter.
-        splats: of the samples, but for the fine ones, if they are known.
+        splats: the splats of the coarse samples, if computed already.
     """
     fine = sampled.fine
     if fine is None or not fine.flat:
@@ -232,22 +231,22 @@ def splatted(
     finer = to_fine_splats(fine, scene.parts, scene.camera, context)
     small = cropped_image(splatter, finer)
     if splats is None:
-        told = fine.pixel, sampled.row[0], sampled.settled
-        pixel, row, settled = constants(told, engine_of(small), small)
+        arrays = fine.pixel, sampled.row[0], sampled.settled
+        pixel, row, settled = constants(arrays, engine_of(small), small)
         return painted_inset(finer.rgba[0, ...], small, pixel, row, settled, fine.supersample)
     image = cropped_image(splatter, splats.replace(wanted=context_of(splats.rgba).constants(fine.coarse)))
     return with_inset(image, small, constants(fine.pixel, engine_of(image), image), fine.supersample)
 
 
 def seen(image: Array, scene: Scene, name: str = "the image") -> Array:
-    """The image, with a warning if nothing is seen in it, which calls it by a name."""
+    """The image itself; a warning names it if nothing is seen in it."""
     engine, (height, width) = engine_of(image), image.shape[:2]
     if not engine.on_host(image):
         seen = value_of(engine.namespace.any(image[..., -1] > 0))
         if seen is None or seen.any():
             return image
-    known = engine.known(image)
-    if known is None or known[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or known[..., -1].any():
+    pixels = engine.known(image)
+    if pixels is None or pixels[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or pixels[..., -1].any():
         return image
     warn(f"nothing is seen in {name}: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
     return image

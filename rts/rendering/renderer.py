@@ -1,4 +1,4 @@
-"""`rts.prepare`, and a renderer for loops: what stays is checked, looked up and built once."""
+"""`rts.prepare`, and a renderer for loops: fixed parts of a scene are checked, looked up and built once."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rts.scene.parts import Part
 
 
 class PreparedParts(Prepared):
-    """Parts with what their samplers have built; `render` and `sample` take it in place of parts.
+    """Parts with structures that their samplers built; `render` and `sample` take it in place of parts.
 
-    Their argument `sampler` has no effect then. Functions given to `jax.jit` close over it.
+    The argument `sampler` of these functions has no effect then. Functions given to `jax.jit` close over the object.
     """
 
     def renderer(self, camera: Camera, size: tuple[int, int], **settings: Any) -> Renderer:
-        """A function that renders these parts, for loops: `draw(transform=…)`, with what changes at each call.
+        """A function that renders these parts, for loops: `draw(transform=…)`, with the changes of each call.
 
         Args:
             camera: as in `render`.
@@ -32,10 +32,10 @@ class PreparedParts(Prepared):
             **settings: `splatter`, `layers`, `supersample`, `background`, `capacity` and `engine`, as in `render`.
 
         Returns:
-            A function `(index=0, **changes)`, which gives the image of `render` with some fields of one part changed.
+            A function `(index=0, **changes)`, which returns the image of `render` with some fields of one part changed.
 
         Raises:
-            InputError: what was given cannot be rendered.
+            InputError: an argument is wrong; the scene cannot be rendered.
         """
         return Renderer(self, camera, size, **settings)
 
@@ -47,25 +47,25 @@ def prepare(
     camera: Camera | None = None,
     size: tuple[int, int] | None = None,
 ) -> PreparedParts:
-    """Build what a sampler needs of each part, once.
+    """Build the structures that a sampler needs of each part, once.
 
-    `raster` puts the triangles of large meshes in order by place, so that it can pass over many at once. That takes 22
-    bytes for each triangle of a closed mesh, and as long as to draw them some 5 to 40 times.
+    `raster` sorts the triangles of large meshes by place, so that it can skip many at once. Sorting takes as long as
+    drawing them some 5 to 40 times; the order takes 22 bytes for each triangle of a closed mesh.
 
     Args:
-        parts: one part or several, with values that are known (not traced).
-        sampler: as in `rts.render`; "auto" takes the triangles for static.
+        parts: one part or several, not traced.
+        sampler: as in `rts.render`; "auto" assumes that the triangles are static.
         camera: needed for surfaces whose triangles depend on the view.
-        size: (height, width), needed likewise.
+        size: (height, width); needed for the same surfaces.
 
     Returns:
-        A handle. Later changes to vertices are not seen; `replace` changes transforms, shaders and the rest of θ.
+        A handle. Later changes to vertices have no effect; `replace` changes transforms, shaders and the rest of θ.
     """
     return PreparedParts.of(parts, sampler, camera, size)
 
 
 class Renderer:
-    """Renders prepared parts through one camera again and again; made by `PreparedParts.renderer`."""
+    """A function that renders prepared parts through one camera; made by `PreparedParts.renderer`."""
 
     def __init__(
         self,
@@ -87,17 +87,17 @@ class Renderer:
 
     @uncompiled
     def __call__(self, index: int = 0, **changes: Any) -> Array:
-        """The image, as `render` gives it, with some fields of one part changed.
+        """The image of `render`, with some fields of one part changed.
 
         Args:
             index: the part.
-            **changes: its `transform`, `theta`, `shader` or `cull`; they hold for this call alone.
+            **changes: its `transform`, `theta`, `shader` or `cull`, for this call alone.
 
         Returns:
             (H, W, 4) premultiplied linear RGBA.
 
         Raises:
-            InputError: there is no such part or field, or what is given does not suit.
+            InputError: there is no such part or field, or its value is wrong.
         """
         scene = self._scene
         check_changes(index, changes, len(scene.parts))

@@ -1,8 +1,8 @@
 """Several views of a scene, sampled side by side in one picture.
 
-What is decided cell by cell is decided for all views by one pass over the picture: which samples splatters need, which
-side of a surface is seen, and where each sample stands in the table. So Python's share is paid once, and threads have
-long loops. Only the triangles are drawn view by view.
+One pass over the picture decides for all views which samples splatters need, which side of a surface is seen, and
+where each sample stands in the table. So Python's overhead is paid once, and threads run long loops. Only the triangles
+are drawn view by view.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from rts.arrays.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.arrays.extremes import largest
 from rts.arrays.trees import Array
+from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart, check_memory
 from rts.contracts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
@@ -32,19 +33,18 @@ from rts.sampling.sample_checks import check_fragments, checked_pieces
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.splatting.side_by_side import Picture, depth_scales
-from rts.threads import each
 
 
 class Views(NamedTuple):
     """Samples of several views, side by side.
 
     Attributes:
-        sampled: the samples; the grid is that of the picture, and the apron that of each view. In the table of a part
-            those of one view stand together, in the order of the views.
-        picture: where the views are.
-        view: of each part (N,) int32, the number of each row's view, from 1 on; 0 for rows that are not used.
-        counts: of each part (B,), how many rows are those of a view; None where that is not known yet.
-        scales: (B,) factors of depths, by which splatters are to compare them.
+        sampled: the samples, on the grid of the picture; the apron is that of each view. In the table of a part the
+            samples of one view stand together, in the order of the views.
+        picture: the layout of the views.
+        view: for each part (N,) int32, the number of each row's view, from 1 on; 0 for unused rows.
+        counts: for each part (B,), the number of rows of each view; None if unknown, as in traced programs.
+        scales: (B,) factors on depths, with which splatters compare them.
     """
 
     sampled: Sampled
@@ -55,13 +55,13 @@ class Views(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """How views are to be sampled as one picture.
+    """Arguments for sampling views as one picture.
 
     Attributes:
         scenes: the scene with the camera of each view, for images of the size.
-        picture: where the views are to be.
+        picture: the layout of the views.
         size: (height, width) of each view, pixels.
-        settings: with a number of layers, and one of cells along each side of a pixel; the capacity is of each view.
+        settings: with numbers for layers and for cells along each side of a pixel; the capacity is of each view.
     """
 
     scenes: Sequence[Scene]
@@ -77,16 +77,16 @@ class Sampling(NamedTuple):
 
     @property
     def possible(self) -> bool:
-        """Whether views can be sampled so, and not one by one.
+        """True if views can be sampled as one picture, not only one by one.
 
-        One by one are sampled surfaces that refine their samples or leave them off their rays, that intersect rays or
-        have other triangles for each view, parts with exits, and what a sampler with a `sample` of its own samples.
+        Views of some parts must be sampled one by one: parts with exits, and parts whose sampler overrides `sample`. So
+        must views of surfaces that refine samples, leave them off their rays, intersect rays, or depend on the view.
         """
         exits = self.scenes[0].context.engine.differentiates and "exit" in self.settings.reader.reads
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
 
     def parts(self) -> list[tuple[Any, Any, Any]]:
-        """Each part, its sampler, and what that has prepared."""
+        """Each part, its sampler, and the structure that the sampler has prepared."""
         first = self.scenes[0]
         return list(zip(first.parts, first.chosen(), first.entries, strict=True))
 
@@ -100,10 +100,10 @@ class Sampling(NamedTuple):
     def of_part(
         self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, hidden: HiddenBySplatter | None
     ) -> tuple[Samples, Array, Array]:
-        """The samples of a part in all views, less what is not needed, by one call to the host; and of `Views`.
+        """The needed samples of a part in all views, by one call to the host.
 
         Returns:
-            Samples, `view` and `scales`.
+            Samples, and `view` and `scales` of `Views`.
         """
         settings = self.settings
         grids = [Grid.sampled(scene, scene.camera, self.cells, settings.apron) for scene in self.scenes]
@@ -114,7 +114,7 @@ class Sampling(NamedTuple):
         tells = tells and overrides(surface, "pieces", TriangleSurface)
         capacity = None if settings.capacity is None else picture.views * settings.capacity
         shape = Shape(layers, picture.size, capacity, picture.size)
-        beside = {
+        specs = {
             "view": shape.row_spec(np.int32),
             "scales": ArraySpec((picture.views,), np.float32),
             **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
@@ -122,43 +122,43 @@ class Sampling(NamedTuple):
         }
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
-            def drawn(known: Entry) -> tuple[Entry, Fragments, np.ndarray]:
-                return known, *_drawn(sampler, known, own, picture, layers, part.cull)
+            def drawn(built: Entry) -> tuple[Entry, Fragments, np.ndarray]:
+                return built, *_drawn(sampler, built, own, picture, layers, part.cull)
 
-            known, fragments, covered = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
-            size = known.size or largest(known.proxy.vertices)
+            built, fragments, covered = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
+            size = built.size or largest(built.proxy.vertices)
             (kept, settled, _), scales = decided_in_views(hidden, picture, Question(covered, fragments.depth, size))
-            more: dict[str, np.ndarray] = {"scales": scales}
+            extras: dict[str, np.ndarray] = {"scales": scales}
             if settled is not None:
-                more["settled"] = settled
+                extras["settled"] = settled
             if tells:
-                pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
-                more["facing"] = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
+                pieces = checked_pieces(surface, built.proxy) if kept[1:].any() else np.zeros(1, np.int16)
+                extras["facing"] = facing_of_views(fragments, kept, built.proxy, pieces, own, picture.view)
             over = 0
             if settings.capacity is not None:
                 kept = kept.copy()
                 over = _leave_out(kept, picture, settings.capacity)
-            found = lift(fragments, known.proxy, capacity, kept, views=(picture.down, picture.across))
-            counts = _counts(found.row, len(found.ids) if capacity is None else 0, picture)
-            more["view"] = _numbers(counts, len(found.ids))
-            return replace(found, overflow=np.asarray(over, np.int32)), more
+            lifted = lift(fragments, built.proxy, capacity, kept, views=(picture.down, picture.across))
+            counts = _counts(lifted.row, len(lifted.ids) if capacity is None else 0, picture)
+            extras["view"] = _numbers(counts, len(lifted.ids))
+            return replace(lifted, overflow=np.asarray(over, np.int32)), extras
 
-        samples, more = HostCall(part, surface, cameras, shape, entry).samples(find, beside)
-        view, scales = more.pop("view"), more.pop("scales")
-        return samples.replace(**more), view, scales
+        samples, extras = HostCall(part, surface, cameras, shape, entry).samples(find, specs)
+        view, scales = extras.pop("view"), extras.pop("scales")
+        return samples.replace(**extras), view, scales
 
 
-def sampled_as_one(given: Sampling) -> Views:
+def sampled_as_one(sampling: Sampling) -> Views:
     """The views of a scene, sampled as one picture."""
-    hidden, parts, picture = given.hidden(), given.parts(), given.picture
-    found = [given.of_part(*part, hidden if len(parts) == 1 else None) for part in parts]
-    sampled, scales = merge([samples for samples, _, _ in found], given.settings.most_layers), found[0][2]
+    hidden, parts, picture = sampling.hidden(), sampling.parts(), sampling.picture
+    results = [sampling.of_part(*part, hidden if len(parts) == 1 else None) for part in parts]
+    sampled, scales = merge([samples for samples, _, _ in results], sampling.settings.most_layers), results[0][2]
     if len(parts) > 1:
         scales = _scales_of(sampled.depth, picture)
         if hidden is not None and not is_traced(sampled.row):
             sampled = without_hidden(sampled, lambda question: decided_in_views(hidden, picture, question)[0])
-    sampled = replace(sampled, supersample=given.settings.side, apron=given.settings.apron)
-    padded, view = engine_of(sampled.row).padded(sampled.row), tuple(own for _, own, _ in found)
+    sampled = replace(sampled, supersample=sampling.settings.side, apron=sampling.settings.apron)
+    padded, view = engine_of(sampled.row).padded(sampled.row), tuple(own for _, own, _ in results)
     if is_traced(sampled.row) or (padded and len(parts) == 1):
         return Views(sampled, picture, view, None, scales)
     if len(parts) == 1:
@@ -171,7 +171,7 @@ def sampled_as_one(given: Sampling) -> Views:
 
 
 def _views_of(samples: Samples, picture: Picture) -> Array:
-    """(N,) the view of each row in a table of a part, of which each stands in one cell; 0 for others."""
+    """(N,) the view of each row in the table of a part, each of which stands in one cell; 0 for unused rows."""
     size = samples.ids.shape[0]
 
     def host(row: np.ndarray) -> tuple[np.ndarray]:
@@ -181,21 +181,21 @@ def _views_of(samples: Samples, picture: Picture) -> Array:
 
 
 def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
-    """(size,) int32, the number of each row's view, from 1 on, of so many rows each; 0 for those that are left."""
-    found = np.zeros(size, np.int32)
-    found[: counts.sum()] = np.repeat(np.arange(1, len(counts) + 1), counts)
-    return found
+    """(size,) int32, the number of each row's view, from 1 on, for `counts` rows a view; then 0 for unused rows."""
+    numbers = np.zeros(size, np.int32)
+    numbers[: counts.sum()] = np.repeat(np.arange(1, len(counts) + 1), counts)
+    return numbers
 
 
 def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
-    """Views whose samples are known, and all used."""
+    """`Views` of samples that are not traced, with all rows in use."""
     constant = engine_of(sampled.row).constant
     view = tuple(constant(_numbers(own, own.sum())) for own in counts)
     return Views(sampled, picture, view, counts, scales)
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
-    """Leave out what does not fit into so many rows for each view, deepest layers first; how many that are.
+    """Leave out samples beyond the capacity of each view, deepest layers first. Returns their number.
 
     `kept` (K, height, width) is changed in place.
     """
@@ -210,33 +210,33 @@ def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
 
 
 def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | None:
-    """Views that were sampled one by one, as one picture; None where samples of several cannot stand in one table."""
+    """One picture of views that were sampled one by one; None if their samples cannot share a table."""
     first, engine = views[0], engine_of(views[0].row)
     for view in views:
         if engine.padded(view.row) or any(set(s.by_sample) != set(s.tables) for s in view.samples):
             return None
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
-    # Rows of all parts are counted part by part, in each view and in the picture.
+    # Rows are numbered part by part, in each view and in the picture.
     own_starts = np.cumsum(counts, axis=1, dtype=np.int32) - counts
     total = counts.sum(axis=0, dtype=np.int32)
     shifts = np.cumsum(total, dtype=np.int32) - total + starts - own_starts
     xp, samples = namespace(first.row), []
 
     def laid_out(grids: Sequence[Array | None], empty: int, shift: np.ndarray | None = None) -> Array | None:
-        """One grid of those of all views; `shift` (B, parts) is added to rows of each part."""
-        known = [grid for grid in grids if grid is not None]
-        if not known:
+        """One grid from the grids of all views; `shift` (B, parts) is added to rows of each part."""
+        recorded = [grid for grid in grids if grid is not None]
+        if not recorded:
             return None
-        several = len(known[0].shape) == 3
-        stacked = xp.stack([x if several else x[None, ...] for x in known])
+        several = len(recorded[0].shape) == 3
+        stacked = xp.stack([x if several else x[None, ...] for x in recorded])
         if shift is not None:
-            given = stacked
+            rows = stacked
             for index in range(shift.shape[1]):
-                from_row, by = (engine.constant(x[:, index, None, None, None], given) for x in (own_starts, shift))
-                stacked = xp.where(given >= from_row if index else given >= 0, given + by, stacked)
-        found = picture.laid_out(stacked, empty)
-        return found if several else found[0, ...]
+                from_row, by = (engine.constant(x[:, index, None, None, None], rows) for x in (own_starts, shift))
+                stacked = xp.where(rows >= from_row if index else rows >= 0, rows + by, stacked)
+        whole = picture.laid_out(stacked, empty)
+        return whole if several else whole[0, ...]
 
     for index in range(len(first.samples)):
         own = [view.samples[index] for view in views]
@@ -258,20 +258,20 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
-    """The rows of several samples of one part, one after the other; their grids are those of the first."""
+    """Samples of one part in several views as one table, one after the other, with the grids of the first."""
     if len(samples) == 1:
         return samples[0]
     first, xp = samples[0], namespace(samples[0].ids)
     tables = {name: xp.concat([s.tables[name] for s in samples]) for name in first.tables}
-    known = None
+    gbuffer = None
     if first.gbuffer is not None:
-        known = {name: xp.concat([(s.gbuffer or {})[name] for s in samples]) for name in first.gbuffer}
+        gbuffer = {name: xp.concat([(s.gbuffer or {})[name] for s in samples]) for name in first.gbuffer}
     ids, params = xp.concat([s.ids for s in samples]), xp.concat([s.params for s in samples])
-    return replace(first, ids=ids, params=params, tables=tables, gbuffer=known)
+    return replace(first, ids=ids, params=params, tables=tables, gbuffer=gbuffer)
 
 
 def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
-    """Whether views of a part can be sampled as one; with `exits` where somebody reads them."""
+    """True if views of a part can be sampled as one picture; `exits` says if the splatter reads exits."""
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or overrides(sampler, "sample", TriangleSampler):
         return False
@@ -281,27 +281,27 @@ def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
 
 
 def _drawn(
-    sampler: TriangleSampler, known: Entry, cameras: Sequence[Camera], picture: Picture, layers: int, cull: str
+    sampler: TriangleSampler, built: Entry, cameras: Sequence[Camera], picture: Picture, layers: int, cull: str
 ) -> tuple[Fragments, np.ndarray]:
-    """The fragments (K, height, width) of the picture, and where there are any, bool.
+    """The fragments (K, height, width) of the picture, and a bool mask of the covered cells.
 
     Views are drawn on all cores, if the sampler is `concurrent`.
     """
-    shape, faces, places = (layers, *picture.size), len(known.proxy.faces), picture.places()
-    # One array for them all: where such are allotted anew in each call, the system gives fewer pages.
+    shape, faces, places = (layers, *picture.size), len(built.proxy.faces), picture.places()
+    # One array for all fields: fewer pages are allotted in each call.
     numbers = np.empty((4, *shape), np.float32)
-    found = Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
+    fragments = Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
     covered = np.zeros(shape, np.bool_)
     if not faces or len(places) < picture.down * picture.across:
-        for x, nothing in zip(found, (-1, 0, 0), strict=True):
+        for x, nothing in zip(fragments, (-1, 0, 0), strict=True):
             x[...] = nothing
     if not faces:
-        return found, covered
+        return fragments, covered
 
     def draw(b: int) -> None:
-        own = sampler.rasterize(known.prepared, cameras[b], picture.view, layers, cull)
+        own = sampler.rasterize(built.prepared, cameras[b], picture.view, layers, cull)
         covered[:, *places[b]] = check_fragments(own, (layers, *picture.view), faces, sampler)
-        for to, x in zip(found, own, strict=True):
+        for to, x in zip(fragments, own, strict=True):
             to[:, *places[b]] = x
 
     if sampler.draws_at_once:
@@ -309,25 +309,25 @@ def _drawn(
     else:
         for b in range(len(cameras)):
             draw(b)
-    return found, covered
+    return fragments, covered
 
 
 def decided_in_views(
     hidden: HiddenBySplatter | None, picture: Picture, question: Question
 ) -> tuple[Decision, np.ndarray]:
-    """Which samples (K, height, width) of views are needed, and the scales (B,) by which their depths are compared.
+    """Decide on the samples (K, height, width) of views; also the scales (B,) with which depths are compared.
 
     Args:
         hidden: the rule for one view; None to keep all.
-        picture: where the views are.
-        question: of the samples of the picture.
+        picture: the layout of the views.
+        question: the samples of the picture.
     """
     covered, depth, size = question
     far = _largest(depth, picture)
     scales = depth_scales(far)
     if hidden is None:
         return Decision(covered, None, covered), scales
-    # Whether numbers are too large is decided here: depths are in other units below.
+    # The check for too large numbers comes first: below, depths are in other units.
     if max(size, hidden.size) > FAR * far[far > 0].min(initial=np.inf):
         settled = np.full(covered.shape[1:], -1, np.int8) if hidden.settles else None
         return Decision(covered, settled, covered), scales
@@ -337,15 +337,15 @@ def decided_in_views(
 
 
 def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:
-    """(height, width) the factor of each cell."""
-    found = np.ones(picture.size, dtype)
+    """(height, width) the factor on the depth of each cell."""
+    factors = np.ones(picture.size, dtype)
     for (lines, columns), scale in zip(picture.places(), scales, strict=True):
-        found[lines, columns] = scale
-    return found
+        factors[lines, columns] = scale
+    return factors
 
 
 def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
-    """(B,) the largest depth of each view, of depths (K, height, width) of the picture."""
+    """(B,) the largest depth of each view, from depths (K, height, width) of the picture."""
     layers, (height, width) = len(depth), picture.view
     lines = depth.reshape(-1, width)
     sizes = np.maximum(lines.max(axis=1, initial=0), -lines.min(axis=1, initial=0))
@@ -362,10 +362,10 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
-    """(B,) how many rows of a table of at least so many are those of a view, of which each stands in one cell."""
+    """(B,) number of rows of each view, each of which stands in one cell; at least `rows` in all."""
     from rts.sampling import packing_loops
 
     assert row is not None
     counts = packing_loops.count_in_views(row >= 0, (picture.down, picture.across))[: picture.views]
-    counts[0] += max(0, rows - counts.sum())  # Where nothing is seen there is a row nevertheless.
+    counts[0] += max(0, rows - counts.sum())  # Tables of empty pictures have a row nevertheless.
     return counts

@@ -1,4 +1,4 @@
-"""Scenes sampled: all parts on one grid, without derivative, the half of `rts.render` that knows no colours."""
+"""`rts.sample`, the half of `rts.render` without derivative: all parts of a scene sampled on one grid."""
 
 from __future__ import annotations
 
@@ -50,21 +50,20 @@ def sample(
         camera: as in `render`.
         size: as in `render`.
         sampler: as in `render`.
-        splatter: the splatter that the samples are for: the apron suits its reach, and hidden samples that it does not
-            need are dropped. None keeps all, with an apron that suits every built-in splatter.
+        splatter: the splatter for these samples: the apron suits its reach, and hidden samples that it does not need
+            are dropped. None keeps all samples, with an apron that suits every built-in splatter.
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
-        settles: leave out samples of a single part of one colour that only cells amid it need, which show this colour
-            whatever moves. What renders them must be given the values of θ, transform and camera that are given here.
-            `render` does so.
+        settles: leave out samples of cells whose colour cannot change, inside a single part of one colour. Render the
+            samples with the same values of θ, transform and camera, as `render` does. See `Cells.settled`.
 
     Returns:
         Samples for `render_samples`, which may be handed to a function under `jax.jit`.
 
     Raises:
-        InputError: what was given cannot be sampled.
+        InputError: an argument is wrong; the scene cannot be sampled.
         EngineError: torch and jax arrays in one scene.
     """
     scene = Scene.of(parts, camera, sampler, engine)
@@ -86,18 +85,18 @@ def sampled_scene(
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window.
 
-    See `sample`; where `settles`, samples that only cells of one colour need may be left out.
+    See `sample`. With `settles`, samples of cells whose colour cannot change may be left out.
     """
     hidden, side = scene.hidden_by(settings.splatter, settles), settings.side
     if side is not None:
         return _on_one_grid(scene, camera, size, settings, side, hidden)
-    # Outlines move on the fine grid alone, unless there is no room for some.
+    # Outlines lie on the fine grid alone, unless its capacity is exceeded.
     coarse = _on_one_grid(scene, camera, size, settings, 1, hidden, exits=settings.capacity is not None)
     return with_fine(scene, camera, size, coarse, settings, hidden)
 
 
 def coarse_scene(scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
-    """One sample a pixel of a window of the image, none of them left out for its colour."""
+    """One sample a pixel of a window of the image, including cells whose colour cannot change."""
     return _on_one_grid(scene, camera, size, settings, 1, scene.hidden_by(settings.splatter))
 
 
@@ -110,7 +109,7 @@ def _on_one_grid(
     hidden: HiddenBySplatter | None,
     exits: bool = True,
 ) -> Sampled:
-    """The samples of side² cells a pixel; with exits where somebody reads them, if asked for."""
+    """The samples of side² cells a pixel; with `exits`, also exits where the splatter reads them."""
     height, width = side * size[0], side * size[1]
     gradient, capacity, reader = scene.context.engine.differentiates, settings.capacity, settings.reader
     check_memory(height, width, settings.most_layers, capacity, gradient=gradient)
@@ -122,19 +121,19 @@ def _on_one_grid(
 
 
 def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidden | None) -> Sampled:
-    """The samples of a grid of cells, or of those that are listed; less hidden ones that are not needed."""
+    """The needed samples of a grid of cells, or of the cells listed in the request."""
     samples, alone, listed = [], len(scene.parts) == 1, request.cells
     for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
         camera = grid.camera.within(part.transform)
-        asked = replace(request, entry=entry, hidden=hidden if alone else None)
-        found = sampler.sample(part, camera, grid.size, count, asked)
-        if listed is None or "cells" in found.followed:
-            check_samples(found, grid.size if listed is None else tuple(listed.shape), sampler)
+        own_request = replace(request, entry=entry, hidden=hidden if alone else None)
+        own = sampler.sample(part, camera, grid.size, count, own_request)
+        if listed is None or "cells" in own.followed:
+            check_samples(own, grid.size if listed is None else tuple(listed.shape), sampler)
         else:
-            found = at_cells(check_samples(found, grid.size, sampler), listed, request.capacity)
-        samples.append(found)
+            own = at_cells(check_samples(own, grid.size, sampler), listed, request.capacity)
+        samples.append(own)
     sampled = merge(samples, count)
-    # Traced arrays have the shape of the worst case, with hidden samples or without.
+    # Traced arrays have the shape of the worst case anyway.
     if hidden is None or "hidden" in samples[0].followed or is_traced(sampled.row):
         return sampled
     return without_hidden(sampled, hidden.decide)
@@ -149,7 +148,7 @@ def with_fine(
     hidden: HiddenBySplatter | None,
     colors: np.ndarray | None = None,
 ) -> Sampled:
-    """Coarse samples, and fine ones where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
+    """Coarse samples, and fine ones at outlines and, if `colors` (N, 4) of coarse samples are given, at contrasts."""
     adaptive, splatter = settings.supersample, settings.splatter
     assert isinstance(adaptive, Adaptive)
     cells = FineGrid(size, adaptive.samples, settings.apron)

@@ -1,4 +1,4 @@
-"""A scene that is checked, once for sampling and shading; and the grids of cells that it is sampled on."""
+"""A checked scene, shared by sampling and shading, and the grids of cells that it is sampled on."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Scene(NamedTuple):
         parts: checked parts.
         camera: the camera of the whole image.
         samplers: the sampler of each part, as the user chose it.
-        entries: what each sampler has built for its part, or None.
-        sizes: of each part the largest number that its surface reads, where that is known; else None.
+        entries: the structure that each sampler has built for its part, or None.
+        sizes: for each part the largest number that its surface reads; None if unknown.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
     """
 
@@ -39,21 +39,21 @@ class Scene(NamedTuple):
 
     @property
     def channels(self) -> int:
-        """The number of channels that its shaders give, besides alpha."""
+        """The number of channels of the shaders, besides alpha."""
         return self.parts[0].shader.channels
 
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | Prepared, camera: Camera, sampler: Any, engine: str | None) -> Scene:
-        """The scene of what the user gave."""
+        """The checked scene of a user's arguments."""
         prepared = isinstance(parts, Prepared)
         checked, camera = check_scene(parts.parts if prepared else parts, camera)
         warn_of_unread(checked)
         warn_of_winding(checked, camera)
         if prepared:
-            known = parts.samplers, parts.entries, parts.sizes
+            fields = parts.samplers, parts.entries, parts.sizes
         else:
-            known = [check_sampler(sampler)] * len(checked), [None] * len(checked), [None] * len(checked)
-        return cls(checked, camera, *known, context_of_scene(checked, camera, engine=engine))
+            fields = [check_sampler(sampler)] * len(checked), [None] * len(checked), [None] * len(checked)
+        return cls(checked, camera, *fields, context_of_scene(checked, camera, engine=engine))
 
     def at(self, size: tuple[int, int]) -> Scene:
         """The scene for images of a size."""
@@ -61,7 +61,7 @@ class Scene(NamedTuple):
         return self._replace(camera=self.camera.for_size(size))
 
     def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenBySplatter | None:
-        """The rule by which hidden samples are decided; None to keep all. See `rts.sampling.hidden.hidden_by`."""
+        """The decider on hidden samples; None to keep all. See `rts.sampling.hidden.hidden_by`."""
         return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
 
     def chosen(self) -> list[Sampler]:
@@ -71,12 +71,12 @@ class Scene(NamedTuple):
 
     def context_with(self, *others: Tree) -> Context:
         """As `context`, with further arrays in the scene."""
-        found = context_of_scene(self.parts, self.camera, *others)
-        return found if found.engine.differentiates else self.context
+        context = context_of_scene(self.parts, self.camera, *others)
+        return context if context.engine.differentiates else self.context
 
 
 class Grid(NamedTuple):
-    """A grid of cells: its camera, constant, and its height and width."""
+    """A grid of cells: its camera and its size (height, width)."""
 
     camera: Camera
     size: tuple[int, int]
@@ -88,8 +88,8 @@ class Grid(NamedTuple):
 
     @classmethod
     def sampled(cls, scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
-        """As `around`, to sample a scene: its camera is a constant of the scene's engine."""
-        # Every part is sampled by the one engine, and by the very views that samples are projected with.
+        """As `around`, for sampling a scene: the camera is a constant of the scene's engine."""
+        # One engine samples every part, through the same matrices that later project the samples.
         wide = cls.around(camera, size, apron)
         if not scene.context.engine.differentiates:
             return wide

@@ -1,4 +1,4 @@
-"""How a scene is to be rendered, besides the scene itself: the settings that all ways of rendering share."""
+"""Settings of a render, beside the scene: splatter, layers, supersampling and capacity."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned
 
 BAND = 2**20
-"""Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
+"""Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class RenderSettings:
     """Checked settings of a render.
 
     Attributes:
-        splatter: the splatter that samples are for; None where they are for any, and none may be left out.
+        splatter: the splatter that samples are for; None for any splatter, so that no sample may be left out.
         layers: K, or "auto".
         supersample: samples along each side of a pixel, or an `Adaptive`.
         capacity: rows to allot for the samples of a part; None for as many as there are.
@@ -39,14 +39,14 @@ class RenderSettings:
         """(height, width) as integers, and the settings.
 
         Args:
-            size: what the user gave for (height, width).
+            size: (height, width), as the user gave it.
             splatter: name or object of a splatter.
-            layers: as the user gave it, as are the others.
-            supersample: see `layers`.
-            capacity: see `layers`.
+            layers: as in `rts.render`.
+            supersample: as in `rts.render`.
+            capacity: as in `rts.render`.
 
         Raises:
-            InputError: one of them is of another kind, or makes no image.
+            InputError: an argument is of another kind, or makes no image.
         """
         finest = supersample.samples if isinstance(supersample, Adaptive) else supersample
         size = check_size(size, layers, capacity, finest)
@@ -56,34 +56,34 @@ class RenderSettings:
 
     @property
     def side(self) -> int | None:
-        """Cells along each side of a pixel, where that is one number for the image; None for `Adaptive`."""
+        """Number of cells along each side of a pixel; None for `Adaptive`."""
         return None if isinstance(self.supersample, Adaptive) else self.supersample
 
     @property
     def contrast(self) -> float | None:
-        """The contrast from which on `Adaptive` takes more samples; None where it does not look."""
+        """The contrast above which `Adaptive` takes more samples; None if contrast does not matter."""
         return self.supersample.contrast if isinstance(self.supersample, Adaptive) else None
 
     @property
     def most_layers(self) -> int:
-        """Layers to count with, before those of "auto" are known."""
+        """The number of layers to plan for; with "auto" an estimate."""
         return planned(self.layers)
 
     @property
     def reader(self) -> Splatter:
-        """The splatter that says what is to be found beside samples; the default one where there is none."""
+        """The splatter whose `reads` and `reach` guide sampling: the given one, or the default."""
         return self.splatter or check_splatter("auto")
 
     @property
     def apron(self) -> int:
-        """How many cells to sample on each side beyond the image: as many as the splatter reaches, and one more.
+        """Number of cells sampled beyond each side of the image: the splatter's reach plus one.
 
-        Samples within reach have an effect on the image, and pairing looks at one cell beside theirs.
+        Samples within reach affect the image, and pairing reads one cell beside theirs.
         """
         return self.reader.reach + 1
 
     def bands(self, size: tuple[int, int]) -> list[tuple[int, int]]:
-        """(first row, number of rows) of the bands in which an image (height, width) is rendered."""
+        """(first row, number of rows) of each band of an image (height, width)."""
         height, width = size
         if self.side is None or self.side == 1:
             return [(0, height)]

@@ -1,4 +1,4 @@
-"""What a part looks like at samples: its G-buffer in world space, and the colours that its shader gives."""
+"""Evaluating and shading a part at samples: its G-buffer in world space, and its colours."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def _read(part: CheckedPart) -> dict[str, Tree]:
 
 
 def shaded_at_once(part: CheckedPart) -> bool:
-    """Whether a part's shader takes the samples of several views in one call."""
-    # The footprint of a sample is found by the camera of its view.
-    tells = part.reads is not None and FOOTPRINT not in part.reads
-    return part.uniform or (part.takes_views and tells)
+    """True if a part's shader takes the samples of several views in one call."""
+    # The footprint of a sample depends on the camera of its view.
+    needs_no_footprint = part.reads is not None and FOOTPRINT not in part.reads
+    return part.uniform or (part.takes_views and needs_no_footprint)
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
@@ -66,7 +66,7 @@ def add_footprint(
     grid: tuple[int, int],
     context: Context,
 ) -> None:
-    """Add the footprint to the G-buffer of samples in one view, where there is uv; arguments as in `uv_footprint`."""
+    """Add "uv_footprint" to the G-buffer of samples in one view, if it has uv; arguments as in `uv_footprint`."""
     if "uv" in local and FOOTPRINT not in local:
         local.defer(FOOTPRINT, partial(uv_footprint, part.surface, _read(part), samples, local, own, grid, *context))
 
@@ -80,21 +80,21 @@ def shade(
     camera: Camera | RowCameras,
     engine: Engine,
 ) -> tuple[GBuffer, Array]:
-    """What the shader of a part reads, in world space, and the colours (N, C + 1) that it gives.
+    """The G-buffer of a part in world space, and the colours (N, C + 1) of its shader.
 
     Args:
         part: the part.
-        theta: what `theta_of` gave.
-        transform: the part's.
+        theta: the result of `theta_of`.
+        transform: the part's transform, in arrays of the engine.
         samples: the samples.
         local: their G-buffer, in local space.
-        camera: of the whole image, or those of the samples.
+        camera: the camera of the whole image, or of each sample.
         engine: the engine to compute with.
     """
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.uniform:  # One colour, of however many rows.
+    if part.uniform:  # One colour, however many rows are in use.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):
@@ -110,16 +110,16 @@ def shade(
 
 
 NUMBER = "the numbers of views"
-"""What stands for the numbers of `RowCameras` beside attributes."""
+"""The key of `RowCameras.number` among attributes; no attribute has this name."""
 
 
 def apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
-    """The samples of several views, of so many rows each, and their G-buffers, from those of them all."""
-    known, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
+    """The samples and G-buffer of each view, cut from the arrays of all views; `sizes` are numbers of rows."""
+    pieces, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
 
     def split(name: str) -> Sequence[Array]:
         with lock:  # Views are shaded by several threads.
-            return known(name)
+            return pieces(name)
 
     rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *samples.tables.values())]
     views = []
@@ -133,7 +133,7 @@ def apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engi
 
 
 def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
-    """What the shader of a part returns."""
+    """The result of a part's shader."""
     try:
         return part.shader(theta, gbuffer, camera)
     except TypeError as error:
@@ -146,7 +146,7 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
 
 
 class _UnreadError(Exception):
-    """A shader reads what it did not read before."""
+    """A shader reads an attribute that it did not read before."""
 
 
 def _colors(
@@ -157,7 +157,7 @@ def _colors(
     names: Sequence[str],
     attributes: Mapping[str, Array],
 ) -> Array:
-    """What the shader of a part returns for attributes in local space, of those names that it has read."""
+    """The result of a part's shader for some rows of the attributes that it has read, in local space."""
 
     def unread() -> Array:
         raise _UnreadError
@@ -170,14 +170,14 @@ def _colors(
 
 
 def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
-    """The G-buffer for shaders: rows that no cell refers to hold values at which derivatives are finite, too."""
+    """The G-buffer for shaders: unused rows hold values with finite derivatives, too."""
     if not engine.padded(samples.row):
         return gbuffer
-    found = GBuffer()
-    found.like = gbuffer["position"]
+    readable = GBuffer()
+    readable.like = gbuffer["position"]
     for name in gbuffer:
-        found.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
-    return found
+        readable.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
+    return readable
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:

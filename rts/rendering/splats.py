@@ -1,4 +1,4 @@
-"""Samples of scenes evaluated, shaded and projected: what splatters take of one view, or of several."""
+"""From samples to splats: evaluate, shade and project the samples of one view, or of several."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
+from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart, check_splats
 from rts.contracts.records import ON_RAYS, Fine, Sampled, Samples, Splats
 from rts.errors import InputError
@@ -20,7 +21,6 @@ from rts.rendering.scene import Grid
 from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
-from rts.threads import each
 
 
 def to_splats(
@@ -30,14 +30,14 @@ def to_splats(
     window: Camera,
     context: Context,
 ) -> Splats:
-    """Evaluate, shade and project samples: what splatters take, with the apron as border. Fine ones are left out.
+    """Evaluate, shade and project samples into splats, with the apron as border. Fine samples are left out.
 
     Args:
         sampled: the samples.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
         window: the camera of the samples.
-        context: the engine to compute with, and what its constants and the splats are like.
+        context: the engine to compute with, and an exemplar of its constants and of the splats.
     """
     height, width, apron = *sampled.row.shape[1:], sampled.apron
     grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
@@ -47,12 +47,12 @@ def to_splats(
 
 
 def _owned(tree: Tree, row: Array, context: Context) -> Tree:
-    """Samples in arrays of the engine, one of which is `row`."""
+    """Samples in arrays of the context's engine; `row` is one of their arrays."""
     return tree if context.engine.owns(row) else _of_inputs(context).constants(tree)
 
 
 def _of_inputs(context: Context) -> Context:
-    """The context of what is computed from: without derivatives it keeps the dtypes that are given."""
+    """The context of inputs; an engine without derivatives keeps their dtypes."""
     return context if context.engine.differentiates else context._replace(like=None)
 
 
@@ -62,10 +62,10 @@ def views_to_splats(
     cameras: Sequence[Camera],
     context: Context,
 ) -> list[Splats]:
-    """The splats of pictures of several views: those of a picture have no border, but cells that are wanted.
+    """The splats of pictures of several views. They have no border; `wanted` marks the cells to show instead.
 
-    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all. So are
-    shaders that take views; others are asked view by view.
+    A surface is evaluated once, at the samples of all views, so that results for the whole of θ serve all. Shaders that
+    take views are called once, too; others are called view by view.
 
     Args:
         pictures: the samples of the views; pictures are of one size.
@@ -80,18 +80,18 @@ def views_to_splats(
     shown = [
         _shown_in_views(index, part, pictures, sampled, cameras, grids, context) for index, part in enumerate(parts)
     ]
-    made, start = [], 0
+    splats, start = [], 0
     for picture, whole in zip(pictures, sampled, strict=True):
         here = slice(start, start := start + picture.picture.views)
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = _together(*zip(*of_parts, strict=True))
         wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
-        made.append(_splats(whole, positions, rgba, context, wanted=wanted))
-    return made
+        splats.append(_splats(whole, positions, rgba, context, wanted=wanted))
+    return splats
 
 
 def _of_views(tables: Sequence[Array], pictures: Sequence[Views], part: int, views: slice) -> Sequence[Array]:
-    """The rows of some views in tables of a part in all pictures."""
+    """The rows of some views, in tables of a part for all pictures."""
     if len(pictures) == 1:
         return tables
     counts = _counts_of(pictures, part)
@@ -101,13 +101,13 @@ def _of_views(tables: Sequence[Array], pictures: Sequence[Views], part: int, vie
 
 
 def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
-    """(B,) how many samples of a part there are in each view of all pictures; None where that is not known."""
-    known = [picture.counts[part] for picture in pictures if picture.counts is not None]
-    return np.concatenate(known) if len(known) == len(pictures) else None
+    """(B,) number of samples of a part in each view of all pictures; None if unknown."""
+    counts = [picture.counts[part] for picture in pictures if picture.counts is not None]
+    return np.concatenate(counts) if len(counts) == len(pictures) else None
 
 
 def _places_of(pictures: Sequence[Views], context: Context) -> Array:
-    """(B, 3) of each view what is added to columns and lines in its picture, and by what depth is multiplied."""
+    """(B, 3) for each view the offsets of columns and lines in its picture, and the factor on depth."""
     corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
     scales = [context.constants(picture.scales) for picture in pictures]
     xp = namespace(*scales)
@@ -115,7 +115,7 @@ def _places_of(pictures: Sequence[Views], context: Context) -> Array:
 
 
 def _splats(sampled: Sampled, positions: Array, rgba: Array, context: Context, **more: Any) -> Splats:
-    """The splats of samples whose positions and colours are known; `more` of their fields are given."""
+    """The splats of samples with these positions and colours; `more` are further fields of `Splats`."""
     cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
     if not context.engine.owns(rgba):
         cells, part = context_of(positions, rgba).constants((cells, part))
@@ -123,7 +123,7 @@ def _splats(sampled: Sampled, positions: Array, rgba: Array, context: Context, *
 
 
 def to_fine_splats(fine: Fine, parts: Sequence[CheckedPart], camera: Camera, context: Context) -> Splats:
-    """Evaluate, shade and project fine samples: splats in the places of their layout. Arguments as in `to_splats`."""
+    """Evaluate, shade and project fine samples into splats of their layout. Arguments as in `to_splats`."""
     height, width = (n * fine.supersample for n in fine.pixel.shape)
     fine, grid = _owned(fine, fine.row, context), Grid.around(camera, (height, width), fine.apron)
     positions, rgba = _together(*_shown(fine.samples, fine.index, parts, camera, grid, context))
@@ -145,11 +145,11 @@ def _shown(
 
     Args:
         sampled: the samples of each part.
-        row: integers, those of them that are seen.
+        row: integers, the numbers of the visible samples.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
         grid: the cells of the samples, and their camera.
-        context: the engine to compute with, and what the results are like.
+        context: the engine to compute with, and an exemplar of the results.
     """
     inputs, engine = _of_inputs(context), context.engine
     seen = grid.camera.replace(view=inputs.constants(grid.camera.view))
@@ -183,11 +183,11 @@ def _shown_in_views(
     """Positions (N, 3) in their pictures and colours (N, C + 1) of the samples of a part in several views.
 
     Args:
-        index: the part's.
-        part: the part; `shaded_at_once`, where the number of samples in each view is not known.
+        index: the index of the part.
+        part: the part; it must be `shaded_at_once` if the number of samples in each view is unknown.
         pictures: the views.
         sampled: their samples, in arrays of the engine.
-        cameras: of the whole image of each view.
+        cameras: the camera of the whole image of each view.
         grids: the cells of each view, and their camera.
         context: as in `_shown`.
     """
@@ -218,8 +218,8 @@ def _shown_in_views(
             add_footprint(part, samples, local, own, size, inputs)
             shaded.append((samples, local))
 
-        def colored(given: tuple) -> Array:
-            camera, (samples, local) = given
+        def colored(pair: tuple) -> Array:
+            camera, (samples, local) = pair
             if not local["position"].shape[0]:
                 # Shaders may expect a row at least.
                 none = namespace(local["position"]).broadcast_to(
@@ -235,16 +235,16 @@ def _shown_in_views(
     rgba = context.constants(rgba)
     if engine_of(rgba) is not engine:
         positions, rgba = context_of(rgba).constants((positions, rgba))
-    # Where rows are not used, values are not looked at.
+    # Values in unused rows are not checked.
     every = np.arange(gbuffer["position"].shape[0], dtype=np.int32)[None, None] if counts is not None else whole.row
     check_splats(index, part, gbuffer, positions, rgba, every, 0)
     return positions, rgba
 
 
 def _on_rays(samples: Samples, position: Array) -> Array:
-    """Positions (N, 3) of samples, put on the rays of their cells where they are not, with the derivative they have.
+    """Positions (N, 3) of samples, moved onto the rays of their cells; derivatives stay.
 
-    Splatters can only tell how samples move from the centres of their cells. There, too, a projection is finite.
+    Splatters need samples that move from the centres of their cells. On the rays, projections are finite, too.
     """
     if samples.centered:
         return position
@@ -259,5 +259,5 @@ def _on_rays(samples: Samples, position: Array) -> Array:
 
 
 def _together(*kinds: Sequence[Array]) -> list[Array]:
-    """One array of each kind, positions and colours, from several."""
+    """One concatenated array of each kind, such as positions and colours."""
     return [arrays[0] if len(arrays) == 1 else namespace(arrays[0]).concat(list(arrays)) for arrays in kinds]

@@ -1,4 +1,4 @@
-"""Samples where outlines are: which pixels take many, decided by one sample a pixel."""
+"""Adaptive sampling: one sample in most pixels, many in those near outlines, which one sample a pixel shows."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.checks import CheckedPart, is_count, is_real
 from rts.errors import InputError
-from rts.threads import parallel, read_only
 
 MOST = 64
 """The most samples along each side of an active pixel. All fine samples are in memory at once."""
@@ -20,14 +20,15 @@ MOST = 64
 
 @dataclass(frozen=True)
 class Adaptive:
-    """In place of a number of `supersample`: s² samples where outlines are, one in every other pixel.
+    """A value for `supersample`: s² samples in pixels near outlines, one in every other pixel.
 
-    A pixel is active if, of one sample a pixel, its front ends towards a neighbour (nothing is there, or another
-    surface), or a neighbour's towards it. Active pixels are those of `supersample=samples`, the others those of 1.
+    A pixel with s² samples is called active. One sample a pixel decides: a pixel is active if its front ends towards
+    a neighbour, where nothing or another surface is, or a neighbour's front towards it. Active pixels look as with
+    `supersample=samples`, the others as with `supersample=1`.
 
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
-        dilated: whether the eight neighbours of active pixels are active too. Colours that change near outlines need
+        dilated: True if the eight neighbours of active pixels are active too. Colours that change near outlines need
             that; None for where some part's shader is not `uniform`.
         contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
             four directions: edges of colour on surfaces. Needs colours, which `rts.sample` does not have, nor do
@@ -58,7 +59,7 @@ class Adaptive:
         object.__setattr__(self, "samples", int(self.samples))
 
     def dilates(self, parts: Sequence[CheckedPart]) -> bool:
-        """Whether active pixels of a scene are dilated."""
+        """True if the neighbours of a scene's active pixels are active, too."""
         if self.dilated is None:
             return self.contrast is not None or not all(part.uniform for part in parts)
         return self.dilated
@@ -95,12 +96,12 @@ def _number(text: str) -> float | None:
 
 
 def finest(supersample: Any) -> Any:
-    """Samples along each side of a pixel, where there are most; what is neither is returned as it is."""
+    """The most samples along a side of a pixel: those of an `Adaptive`, else the argument itself."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 
 
 def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:
-    """Cells (H, W) bool whose fronts end towards a neighbour, or a neighbour's towards them, or may by rounding.
+    """Cells (H, W) bool at outlines: a front ends, or may by rounding, towards a neighbour, or the reverse.
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.
@@ -118,19 +119,19 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
     least, largest = depth.min(initial=0), depth.max(initial=0)
     beyond = 2 * (largest - least) or 1
     marks = np.empty(row.shape[1:], np.uint8)
-    given = (
+    arguments = (
         read_only(row, np.int32),
         read_only(settled, np.int8),
         depth,
         np.cumsum(sizes)[:-1],
         *map(kind, (beyond, TIE * max(largest, -least), CONTINUED)),
     )
-    parallel(adaptive_loops.mark, len(marks), *given, marks, work=4 * row.size)
+    parallel(adaptive_loops.mark, len(marks), *arguments, marks, work=4 * row.size)
     return marks.view(bool)
 
 
 def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
-    """Cells (H, W) bool whose front's colour differs by more than `least` from the mean line of two opposite ones.
+    """Cells (H, W) bool where the front's colour has a second difference above `least` along any of four directions.
 
     Args:
         row: (H, W), the front of each cell.
@@ -144,8 +145,8 @@ def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
     def at(x: np.ndarray, v: int, u: int) -> np.ndarray:
         return x[1 + v : 1 + v + height, 1 + u : 1 + u + width]
 
-    found = np.zeros(row.shape, bool)
+    contrasting = np.zeros(row.shape, bool)
     for v, u in ((0, 1), (1, 0), (1, 1), (1, -1)):
         second = np.abs(at(color, v, u) - 2 * at(color, 0, 0) + at(color, -v, -u)).max(axis=-1)
-        found |= (second > least) & at(covered, v, u) & at(covered, -v, -u) & at(covered, 0, 0)
-    return found
+        contrasting |= (second > least) & at(covered, v, u) & at(covered, -v, -u) & at(covered, 0, 0)
+    return contrasting

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 
 
 @loop
@@ -52,7 +52,7 @@ def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, ma
 
 @compiled
 def _differ(marks, above, level, below):
-    """Mark the cells of a row beside which another part is seen, or nothing."""
+    """Mark the cells of a row that have a neighbour with another part, or with nothing."""
     for x in range(len(marks)):
         own = level[x + 1]
         found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
@@ -62,7 +62,7 @@ def _differ(marks, above, level, below):
 
 @compiled
 def _unite(near, above, level, below):
-    """Fill in where any of nine cells is marked; whether there are such."""
+    """Mark the cells with a mark among the nine around them. Returns True if there are any."""
     some = np.uint8(0)
     for x in range(len(near)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
@@ -74,7 +74,7 @@ def _unite(near, above, level, below):
 
 @compiled
 def _ends(row, depth, y, x, beyond, margin, continued):
-    """Whether the front of a cell, whose neighbours are covered, too, ends towards one of them."""
+    """True if the front of a cell ends towards one of its neighbours, all of which are covered."""
     _, height, width = row.shape
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1
@@ -87,7 +87,7 @@ def _ends(row, depth, y, x, beyond, margin, continued):
 
 @compiled
 def _parted(row, depth, y, x, v, u, beyond, margin, continued):
-    """Whether the front of a covered target (y, x) may not pair with the source's, from which (u, v) leads to it."""
+    """True if the front of a covered target (y, x) may not pair with that of the source at (y − v, x − u)."""
     layers, height, width = row.shape
     py, px = y - v, x - u
     source, target = depth[0, py, px], depth[0, y, x]

@@ -1,4 +1,4 @@
-"""`sampler="auto"`: which sampler a part needs, and why."""
+"""`sampler="auto"`: the sampler that suits a part, and the reason."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _log = logging.getLogger("rts")
 
 
 class Choice(NamedTuple):
-    """What is done for a part.
+    """The decision for a part: its sampler, the reason, and the number of samples.
 
     Attributes:
         sampler: the sampler that `sampler="auto"` takes, by name.
         reason: why.
-        samples: how many samples are taken, at a size that is given; None where that is not known.
-        fine: how many of them are fine ones, of `rts.Adaptive`; None without.
-        active: how many pixels of the image take fine samples, for all parts together; None without.
-        remarks: what looks like a mistake, a line each: entries of θ that nobody reads, a mesh wound inside out.
+        samples: the number of samples, for a given size; None where it is not known.
+        fine: the number of fine samples among them, of `rts.Adaptive`; None without.
+        active: the number of pixels of the image with fine samples, for all parts together; None without.
+        remarks: likely mistakes, a line each: entries of θ that nothing reads, a mesh wound inside out.
     """
 
     sampler: str
@@ -62,7 +62,7 @@ def choose(part: Part, *, static: bool) -> Choice:
 
 
 def is_static(part: Part, camera: Camera) -> bool:
-    """Whether something is differentiated, but not what the surface reads: so calls repeat, and triangles stay."""
+    """True if something is differentiated, but nothing that the surface reads: calls repeat, and triangles stay."""
     constant = is_constant([part.theta[name] for name in part.surface.reads(part.theta)])
     return constant and engine_of(part, camera).differentiates
 

@@ -1,4 +1,4 @@
-"""What samplers build for a surface, kept between calls: structures over triangles, buffers on a device.
+"""A cache of what samplers build for a surface: structures over triangles, buffers on a device.
 
 Optimisers change arrays in place, so identity proves nothing: what is kept goes by a fingerprint of the bytes that the
 proxy was made of.
@@ -23,13 +23,13 @@ KEPT = 2
 
 
 class Entry(NamedTuple):
-    """A proxy, and what a sampler built over it.
+    """An entry of the cache: a proxy, and the structure that a sampler built over it.
 
     Attributes:
         proxy: the triangles.
-        prepared: what the sampler built.
-        size: the largest number of those that they were made of, or larger; None where nobody has looked.
-        inputs: what the proxy was made of, where samples are refined later.
+        prepared: the sampler's structure.
+        size: the largest number that the triangles were made of, or a larger one; None if it was not computed.
+        inputs: inputs of the proxy, where samples are refined later.
     """
 
     proxy: Proxy
@@ -59,7 +59,7 @@ class Keeper:
 
         Args:
             surface: the surface; entries are dropped when it is.
-            key: what the proxy depends on.
+            key: a key of the proxy's inputs.
             build: makes the entry.
             follow: makes it of an older one, in place, or gives None where it cannot.
         """
@@ -76,7 +76,7 @@ class Keeper:
 
 
 def same_faces(a: Proxy, b: Proxy) -> bool:
-    """Whether two proxies differ in the places of their vertices only."""
+    """True if two proxies differ at most in the positions of their vertices."""
     same_count = len(a.vertices) == len(b.vertices)
     return same_count and (a.faces is b.faces or np.array_equal(a.faces, b.faces))
 

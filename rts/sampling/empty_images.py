@@ -45,7 +45,7 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
 
 
 def out_of_view(part: CheckedPart, camera: Camera) -> str | None:
-    """Where a part lies if not in the view, beginning with a verb; None where some of it may be, or nobody knows."""
+    """The place of a part outside of the view, such as "lies behind …"; None if it may be seen, or is traced."""
     if not isinstance(part.surface, TriangleSurface):
         return None
     known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
@@ -57,7 +57,7 @@ def out_of_view(part: CheckedPart, camera: Camera) -> str | None:
 
 
 def _outside(proxy: Proxy, local: Camera) -> str | None:
-    """Where triangles lie, all of them, if not in the view."""
+    """The place of triangles that all lie outside of the view, in words; None if some may be seen."""
     corners = proxy.vertices[np.unique(proxy.faces)].astype(np.float64)
     at = np.concatenate([corners, np.ones((len(corners), 1))], axis=1) @ (local.projection @ local.view).T
     depth = -(corners @ local.view[2, :3] + local.view[2, 3])
@@ -74,13 +74,13 @@ def _outside(proxy: Proxy, local: Camera) -> str | None:
 
 
 def known_tree(tree: Tree) -> Tree | None:
-    """A tree with NumPy arrays, None if one of them is traced or of a batch."""
-    found = []
+    """A tree of NumPy arrays; None if an array is traced or batched."""
+    is_known = []
 
     def value(x: object) -> object:
-        known = value_of(x)
-        found.append(known is not None and known.shape == tuple(getattr(x, "shape", ())))
-        return known
+        array = value_of(x)
+        is_known.append(array is not None and array.shape == tuple(getattr(x, "shape", ())))
+        return array
 
     host = map_leaves(value, tree)
-    return host if all(found) else None
+    return host if all(is_known) else None

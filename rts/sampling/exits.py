@@ -1,4 +1,4 @@
-"""Where rays leave the closed parts that they met: what tells splatters how outlines of culled parts move."""
+"""Exits: points where rays leave a closed part. They tell splatters how outlines of culled parts move."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.compiling.threads import read_only
 from rts.contracts.records import Fragments
-from rts.threads import read_only
 
 
 class Exits(NamedTuple):
-    """Some cells, and where rays leave the part in them.
+    """The exits of rays through some cells.
 
     Attributes:
         cells: (1, M) int32, flat indices of cells in the grid.
-        fragments: (1, 1, M), what is seen from behind in them.
-        there: (1, 1, M) bool, whether the ray leaves there.
+        fragments: (1, 1, M), triangles seen from behind in these cells.
+        there: (1, 1, M) bool, True where the ray leaves the part.
     """
 
     cells: np.ndarray
@@ -25,13 +25,13 @@ class Exits(NamedTuple):
 
     @classmethod
     def of(cls, fragments: Fragments, cells: np.ndarray, backs: Fragments) -> Exits:
-        """The exits among backs (1, 1, M), those that do not lie before the fronts of fragments (K, H, W)."""
+        """The exits among backs (1, 1, M): backs that do not lie before the fronts of fragments (K, H, W)."""
         front = fragments.depth[0].reshape(-1)[cells]
         return cls(cells, backs, (backs.triangle_ids >= 0) & (backs.depth >= front))
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:
-    """Cells (1, M) int32 of fronts that may end beside them, and of fronts beside those, as flat indices.
+    """Cells (1, M) int32 whose front may end beside them, and neighbours of such cells, as flat indices.
 
     Fronts end before nothing, and where hidden layers are in play.
 

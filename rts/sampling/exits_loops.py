@@ -1,10 +1,10 @@
-"""Which cells lie beside outlines, compiled."""
+"""Cells beside outlines, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 from rts.sampling.windows_loops import add, unite
 
 BLOCK = 32
@@ -13,7 +13,7 @@ BLOCK = 32
 
 @loop
 def find(kept, cells):
-    """Fill `cells` (H · W,) with the places that `exits.beside_outlines` returns; how many there are."""
+    """Fill `cells` (H · W,) with the places that `exits.beside_outlines` returns. Returns their number."""
     layers, height, width = kept.shape
     # With one more cell at each side, the cells of all rows follow on each other: loops over all are quick.
     pitch = width + 2
@@ -36,7 +36,7 @@ def find(kept, cells):
 
 @compiled
 def _list(cells, count, first, marks):
-    """List the marks of a row, whose first cell has a number, from a place on; what comes after is the next place."""
+    """List the marks of a row, whose first cell has a number, from a place on. Returns the next place."""
     for start in range(0, len(marks), BLOCK):
         if _any(marks[start : start + BLOCK]):
             for x in range(start, min(start + BLOCK, len(marks))):

@@ -1,4 +1,4 @@
-"""Which side of a surface is seen where hidden layers are: what keeps a front and a back from pairing."""
+"""The side of a surface that each layer shows, by which splatters do not pair a front with a back."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Cells, Fragments, Proxy
 from rts.scene.camera import Camera
-from rts.threads import parallel, read_only
 
 OTHER_COLUMNS = np.array([[j for j in range(4) if j != i] for i in range(4)])
 ALTERNATING = np.array([1, -1, 1, -1])
@@ -17,18 +17,18 @@ ALTERNATING = np.array([1, -1, 1, -1])
 def facing(
     fragments: Fragments, kept: np.ndarray, proxy: Proxy, pieces: np.ndarray, camera: Camera, listed: bool
 ) -> np.ndarray:
-    """Which piece is seen, and from which side: (K, H, W) int16, see `rts.contracts.records.Samples`.
+    """The piece that each fragment shows, and its side: (K, H, W) int16, see `rts.contracts.records.Samples`.
 
-    It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere.
-    The last layer of fragments is marked by `MORE_BEHIND`.
+    Splatters compare it in cells that have hidden layers, and beside them; elsewhere it is 0. The last layer of
+    fragments is marked by `MORE_BEHIND`.
 
     Args:
-        fragments: what was sampled.
-        kept: (K, H, W) bool, which of them are samples.
+        fragments: the fragments of all layers.
+        kept: (K, H, W) bool, the fragments that are samples.
         proxy: the triangles.
         pieces: (T,) int16, the number of each triangle's piece; or (1,), of all.
         camera: host matrices.
-        listed: whether the cells are those of a list, so that what lies side by side in it may not do so in the image.
+        listed: True for the cells of a list: neighbours in the list may not be neighbours in the image.
     """
     return facing_of_views(fragments, kept, proxy, pieces, [camera], kept.shape[1:], listed)
 
@@ -42,19 +42,19 @@ def facing_of_views(
     view: tuple[int, ...],
     listed: bool = False,
 ) -> np.ndarray:
-    """As `facing`, of views (height, width) that lie side by side, line after line; each has a camera."""
+    """`facing` of views (height, width) that lie side by side, line after line; each has a camera."""
     from rts.sampling import facing_loops
 
     behind = np.count_nonzero(kept[1:])
     if not behind:
         return np.zeros(kept.shape, np.int16)
-    found = np.empty(kept.shape, np.int16)
-    given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
+    sides = np.empty(kept.shape, np.int16)
+    marks = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
     triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
     eyes = np.stack([eye(camera) for camera in cameras])
-    arrays = *given, *triangles, eyes, *view, listed, Cells.MORE_BEHIND
-    parallel(facing_loops.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
-    return found
+    arrays = *marks, *triangles, eyes, *view, listed, Cells.MORE_BEHIND
+    parallel(facing_loops.fill, kept.shape[1], *arrays, sides, work=kept[0].size + 100 * behind)
+    return sides
 
 
 def eye(camera: Camera) -> np.ndarray:
@@ -65,7 +65,7 @@ def eye(camera: Camera) -> np.ndarray:
     """
     rows = camera.projection[[0, 1, 3]] @ camera.view
     minors = rows[:, OTHER_COLUMNS].transpose(1, 0, 2)
-    *found, handedness = np.linalg.det(np.concatenate([minors, camera.view[None, :3, :3]]))
+    *point, handedness = np.linalg.det(np.concatenate([minors, camera.view[None, :3, :3]]))
     p = camera.projection
     winding = handedness * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])
-    return np.array(found) * ALTERNATING if winding > 0 else -np.array(found) * ALTERNATING
+    return np.array(point) * ALTERNATING if winding > 0 else -np.array(point) * ALTERNATING

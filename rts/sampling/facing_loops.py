@@ -1,10 +1,10 @@
-"""Which side of their surface fragments show, compiled."""
+"""The side of their surface that fragments show, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 from rts.sampling.windows_loops import add, spread
 
 
@@ -47,7 +47,7 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
 
 @compiled
 def _front(vertices, faces, t, eye):
-    """Whether a triangle is seen from the side from which its corners go round counter-clockwise."""
+    """True if a triangle is seen from its front, where its corners go round counter-clockwise."""
     a, b, c = np.uint32(faces[t, 0]), np.uint32(faces[t, 1]), np.uint32(faces[t, 2])
     x, y, z = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
     bx, by, bz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z

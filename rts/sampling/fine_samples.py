@@ -19,12 +19,12 @@ from rts.splatting.layers import dilated
 
 
 class Where(NamedTuple):
-    """Which pixels are active.
+    """The rule by which pixels are active.
 
     Attributes:
-        adaptive: what the user asked for.
-        dilates: whether the neighbours of such pixels are active, too.
-        colors: (N, 4) of the coarse samples, to look for contrast; or None.
+        adaptive: the user's settings.
+        dilates: True if the neighbours of active pixels are active, too.
+        colors: (N, 4) of the coarse samples, to measure contrast; or None.
     """
 
     adaptive: Adaptive
@@ -42,11 +42,11 @@ def active(
     where: Where,
 ) -> np.ndarray:
     """Active pixels (H, W) bool of coarse samples (K, ·, ·) with an apron; see `outlines`."""
-    found = outlines(row, depth, sizes, settled)
+    pixels = outlines(row, depth, sizes, settled)
     if where.colors is not None and where.adaptive.contrast is not None:
-        found |= contrasts(row[0], where.colors, where.adaptive.contrast)
-    found = dilated(found) if where.dilates else found
-    return np.ascontiguousarray(found[apron:-apron, apron:-apron])
+        pixels |= contrasts(row[0], where.colors, where.adaptive.contrast)
+    pixels = dilated(pixels) if where.dilates else pixels
+    return np.ascontiguousarray(pixels[apron:-apron, apron:-apron])
 
 
 def fine_samples(
@@ -64,28 +64,31 @@ def fine_samples(
     Args:
         coarse: one sample a pixel.
         grid: the sizes.
-        where: which pixels are active.
+        where: the rule by which pixels are active.
         take: samples the fine grid: a number of layers, a rule for hidden samples, cells and capacity → `Sampled`.
-        hidden: the rule for those of an image; None to keep all.
+        hidden: the rule for hidden samples of an image; None to keep all.
         layers: K, or "auto".
         capacity: rows to allot, or None for as many as there are, or could be.
-        flat: whether the samples of pixels that are not active are fronts of one colour alone, if any is settled.
+        flat: True if pixels that are not active show fronts of one colour alone, where any cell is `settled`.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
-    most, told = planned(layers), [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])]
+    most, coarse_arrays = (
+        planned(layers),
+        [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])],
+    )
     find = partial(active, sizes=sizes, apron=coarse.apron, where=where)
-    given = [value for x in told if (value := engine.known(x)) is not None]
-    if len(given) < len(told) or given[0].ndim != 3:
+    values = [array for x in coarse_arrays if (array := engine.known(x)) is not None]
+    if len(values) < len(coarse_arrays) or values[0].ndim != 3:
         room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
-        def laid_out(*given: np.ndarray) -> tuple[np.ndarray, ...]:
-            return tuple(lay_out(find(*given), grid, room))
+        def laid_out(*values: np.ndarray) -> tuple[np.ndarray, ...]:
+            return tuple(lay_out(find(*values), grid, room))
 
-        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *told))
+        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *coarse_arrays))
         known, allotted, flat = None, most * room.cells, False
     else:
-        pixels, few = find(*given), engine.padded(coarse.row)
+        pixels, few = find(*values), engine.padded(coarse.row)
         room = None if capacity is None else grid.room(capacity, most)
         if room is None:  # Aprons come on top; but to lay out what is far too large would take for ever.
             check_memory(1, int(pixels.sum()) * grid.side**2, most, None, gradient=engine.differentiates)
@@ -93,7 +96,7 @@ def fine_samples(
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
         known = None if hidden is None else HiddenInStrips(hidden, host)
-        flat = flat and bool(given[-1].any()) and not host.dropped
+        flat = flat and bool(values[-1].any()) and not host.dropped
     taken = partial(take, listed=layout.cells, capacity=allotted)
     sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known)
     return replace(arranged(sampled, layout, grid), flat=flat)

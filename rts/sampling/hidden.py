@@ -1,6 +1,6 @@
-"""Hidden samples: which of them can reach the image, and how many layers of them a scene needs.
+"""Hidden samples that can reach the image, and the number of layers that a scene needs.
 
-Others are dropped before they cost anything.
+Other hidden samples are dropped before they cost anything.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ def planned(layers: int | Literal["auto"]) -> int:
 def hidden_by(
     splatter: Splatter, parts: Sequence[CheckedPart], sizes: Sequence[float | None], settles: bool
 ) -> HiddenBySplatter | None:
-    """The rule by which hidden samples of a scene are decided; None to keep all.
+    """The rule that drops hidden samples of a scene; None to keep all.
 
-    Hidden samples are only without effect if all samples are opaque and lie on cells' centres; and only if numbers of
-    the scene are not so large that rounding reorders depths. Where these are not known, since they are traced, the
-    sampler looks at the triangles, unless samples are refined.
+    A hidden sample has no effect only if all samples are opaque and lie on cells' centres, and if no number of the
+    scene is so large that rounding reorders depths. Where these numbers are traced, and so not known, the sampler
+    looks at the triangles, unless samples are refined.
 
     Args:
         splatter: the splatter.
         parts: checked parts.
-        sizes: of each part the largest number of those that its surface reads, or None where it is to be looked for.
-        settles: whether samples of a scene of one part may be left out that only cells amid its one colour need. Where
-            samples are to be evaluated at other values of θ than they were found for, they may not.
+        sizes: for each part the largest number that its surface reads, or None where it is still to be looked up.
+        settles: True if cells amid the one colour of a scene of one part may go without samples (`Cells.settled`).
+            Samples that will be evaluated at other values of θ must all stay.
     """
     if not overrides(splatter, "needed", Splatter) or not all(p.shader.opaque for p in parts):
         return None
@@ -60,7 +60,7 @@ def hidden_by(
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
-    """The largest number of those that surfaces read; None where one is traced."""
+    """The largest number that surfaces read; None if one is traced."""
     size = 0.0
     for part, known in zip(parts, sizes, strict=True):
         read = {name: part.theta[name] for name in part.surface.reads(part.theta)}
@@ -78,12 +78,12 @@ def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float 
 
 @dataclass(frozen=True)
 class HiddenBySplatter:
-    """What a splatter needs of the samples of an image.
+    """The rule of a splatter for the samples of an image: which of them it needs.
 
     Attributes:
         splatter: the splatter.
-        size: of the largest number that surfaces read; 0 where that is not known.
-        settles: whether all samples have one colour, and the splatter makes use of it.
+        size: of the largest number that surfaces read; 0 where it is not known.
+        settles: True if all samples have one colour, and the splatter makes use of it.
     """
 
     splatter: Splatter
@@ -91,7 +91,7 @@ class HiddenBySplatter:
     settles: bool
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
-        """The samples that can reach the image, or those of its cells (H, W) that are `wanted`."""
+        """The samples that can reach the image, or its cells (H, W) that are `wanted`."""
         covered, depth, size = question
         too_rough = (self.settles or len(covered) > 1) and too_far(max(size, self.size), depth)
         needed = covered if too_rough or len(covered) == 1 else self._needed(covered, depth)
@@ -102,7 +102,7 @@ class HiddenBySplatter:
         from rts.sampling import interiors_loops
 
         kept = needed.copy()
-        # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
+        # Cells beside unwanted ones still need their samples, and may look at one cell more.
         reach = self.splatter.reach + (wanted is not None)
         amid = interiors_loops.settle(covered, depth, kept, reach, wanted)
         return Decision(kept, numbers_of(amid), needed)
@@ -110,23 +110,23 @@ class HiddenBySplatter:
     def _needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         kept = self.splatter.needed(covered, depth)
         if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
-            given = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
+            description = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
             raise InputError(
-                f"needed of {self.splatter!r} gave {given}; expected a NumPy array, bool of {covered.shape}"
+                f"needed of {self.splatter!r} gave {description}; expected a NumPy array, bool of {covered.shape}"
             )
         return kept & covered
 
 
 def numbers_of(settled: np.ndarray) -> np.ndarray:
-    """`Cells.settled` of a scene of one part, (H, W) int8: the first sample in cells that are settled (H, W) bool."""
+    """`Cells.settled` (H, W) int8 of a scene of one part, from marks (H, W) bool: 0, the first sample, or −1."""
     return settled.view(np.int8) - np.int8(1)
 
 
 def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidden: Hidden | None) -> Sampled:
-    """The scene with as many layers as its image needs.
+    """A scene sampled with as many layers as its image needs.
 
     Args:
-        taken: samples the scene with a number of layers, less what a rule drops.
+        taken: samples the scene with a number of layers, without the samples that a rule drops.
         hidden: the rule; None to keep all.
     """
     count = 3  # A closed surface before nothing needs two: the second at its outlines.
@@ -136,8 +136,8 @@ def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidde
         row = value_of(sampled.row)
         if row is None:
             raise InputError('layers is "auto", but the values that decide are traced; give a number of layers')
-        others = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
-        counts = (row[..., 1:, :, :] >= 0).sum(axis=others)
+        other_axes = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
+        counts = (row[..., 1:, :, :] >= 0).sum(axis=other_axes)
         most = 1 + int(np.flatnonzero(np.append(1, counts)).max())
         if (most < count and not _ran_out(sampled)) or count > LAYER_LIMIT:
             break
@@ -154,7 +154,7 @@ def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidde
 
 
 def _ran_out(sampled: Sampled) -> bool:
-    """Whether triangles ran out in some cells before all layers of a refined surface were found: there may be more."""
+    """True if triangles ran out in some cells before a refined surface had all its layers: there may be more."""
     known = (None if s.ran_out is None else value_of(s.ran_out) for s in sampled.samples)
     return any(bool(x) for x in known if x is not None)
 
@@ -188,9 +188,9 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
-    found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
-    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) :]
-    exits = None if sampled.exit is None else found[1 + len(sizes)]
+    results = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
+    row, own_rows, indices = results[0], results[1 : 1 + len(sizes)], results[len(rows) :]
+    exits = None if sampled.exit is None else results[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
     xp = namespace(row)
     # Row numbers are within parts up to here, since an engine may have padded what comes before.

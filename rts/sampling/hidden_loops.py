@@ -1,18 +1,18 @@
-"""Samples that are left out, and the numbers of those that stay, compiled."""
+"""New numbers for the samples that stay when others are left out, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 
 
 class Numbering:
-    """New numbers for those rows of samples of several parts that are used.
+    """New numbers for the used rows of samples of several parts.
 
     Args:
-        sizes: how many rows each part has.
+        sizes: the number of rows of each part.
     """
 
     def __init__(self, sizes: list[int]):
@@ -38,7 +38,7 @@ class Numbering:
 
         Args:
             row: rows counted over all parts, or of one part; −1 for none.
-            part: whose rows they are; None for those of all.
+            part: the part whose rows they are; None for rows of all parts.
         """
         given = read_only(row, np.int32).reshape(-1, row.shape[-1])
         found, first = np.empty(given.shape, np.int32), self._firsts[part or 0]

@@ -1,4 +1,4 @@
-"""The one call to the host in which a part of triangles is sampled: what goes there, and what comes back."""
+"""The one call to the host in which a part of triangles is sampled: its operands and its results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Find = Callable[..., tuple[Samples, Mapping[str, np.ndarray]]]
 
 
 class Shape(NamedTuple):
-    """How many samples there may be.
+    """Bounds on the number of samples: layers, cells and rows.
 
     Attributes:
         layers: K.
@@ -48,7 +48,7 @@ class Shape(NamedTuple):
         return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
 
     def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:
-        """The specs of what a surface's `refine` fills."""
+        """Specs of the tables that a surface's `refine` fills."""
         specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1], self.capacity))
         for name, spec in specs.items():
             if spec.by_sample:
@@ -68,14 +68,14 @@ class Shape(NamedTuple):
 
 
 class HostCall:
-    """What is known of a part before it is sampled on the host.
+    """One call to the host that samples a part: its inputs, and the shapes of its results.
 
     Args:
         part: the part.
         surface: its surface.
         cameras: through which it is seen, in its local space, without derivatives.
-        shape: how many samples there may be.
-        entry: what is prepared of it, if that is known: the inputs of its proxy are not looked at, then.
+        shape: bounds on the number of samples.
+        entry: the part's prepared entry, if known; the inputs of its proxy are then not read.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class HostCall:
         self._engine, like = context_of(part.theta, cameras)
         self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
         reads = {name: part.theta[name] for name in surface.reads(part.theta)}
-        # What has no derivative is evaluated where it is sampled.
+        # A surface without derivatives is evaluated where it is sampled, on the host.
         self._theta = reads if self._engine.differentiates and is_constant(reads) else None
         self._asked = part.reads if isinstance(part, CheckedPart) else None
         self._attributes = _attribute_specs(surface, self._asked, self._theta, shape, like)
@@ -103,45 +103,44 @@ class HostCall:
         tables: Mapping[str, ArraySpec] | None = None,
         arrays: Sequence[Array] = (),
     ) -> tuple[Samples, dict[str, Array]]:
-        """The samples that `find` finds, and what else, by one call to the host.
+        """Samples and further arrays that `find` computes, by one call to the host.
 
         Args:
-            find: does it, on the host.
-            beside: what it gives beside samples.
-            tables: `Samples.tables` of the samples.
-            arrays: what it is given beside cameras and inputs.
+            find: computes them on the host.
+            beside: specs of the further results, by name.
+            tables: specs of `Samples.tables`.
+            arrays: further operands of `find`, after cameras and inputs.
         """
         tables = dict(tables or {})
         if not self._surface.centered:
             tables[ON_RAYS] = self._shape.row_spec(np.float32, 3)._replace(by_sample=True)
 
-        def host(*given: np.ndarray) -> tuple[Any, ...]:
-            it = iter(given)
-            own = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in self._cameras]
+        def host(*operands: np.ndarray) -> tuple[Any, ...]:
+            it = iter(operands)
+            seen = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in self._cameras]
             moved = [next(it) for _ in self._transform]
-            cameras = [check_camera(camera, *moved) for camera in own]
-            others = [next(it) for _ in arrays]
+            cameras = [check_camera(camera, *moved) for camera in seen]
+            further = [next(it) for _ in arrays]
             inputs = map_leaves(lambda _: next(it), self._inputs) if self._entry is None else self._entry.inputs
-            found, more = find(cameras, inputs, *others)
-            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, found)
+            samples, more = find(cameras, inputs, *further)
+            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, samples)
             if ON_RAYS in tables:
-                on_rays = _on_rays(found, cameras[0], self._shape.view, *others)
-                found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
+                on_rays = _on_rays(samples, cameras[0], self._shape.view, *further)
+                samples = replace(samples, tables={**samples.tables, ON_RAYS: on_rays})
             return (
-                *(found.ids, found.params, found.row, found.depth, found.overflow),
+                *(samples.ids, samples.params, samples.row, samples.depth, samples.overflow),
                 *(more[name] for name in beside),
-                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
+                *(_allotted(samples.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in self._attributes.items()),
             )
 
-        own = self._shape.specs(self._surface.sample_widths)
-        specs = *own, *beside.values(), *tables.values(), *self._attributes.values()
+        own_specs = self._shape.specs(self._surface.sample_widths)
+        specs = *own_specs, *beside.values(), *tables.values(), *self._attributes.values()
         matrices = [m for camera in self._cameras for m in (camera.view, camera.projection)]
-        given = *matrices, *self._transform, *arrays, *leaves(self._inputs)
-        results = iter(self._engine.call_host(host, specs, *given))
-        found = [next(results) for _ in own]
+        operands = *matrices, *self._transform, *arrays, *leaves(self._inputs)
+        results = iter(self._engine.call_host(host, specs, *operands))
+        ids, params, row, depth, overflow = (next(results) for _ in own_specs)
         more, filled, known = ({name: next(results) for name in x} for x in (beside, tables, self._attributes))
-        ids, params, row, depth, overflow = found
         samples = Samples(
             ids,
             params,
@@ -157,7 +156,7 @@ class HostCall:
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:
-    """`ON_RAYS` of samples in a view, or in some of its cells; rows that no cell has do as the first."""
+    """`ON_RAYS` of samples in a view, or in some of its cells; a row without a cell repeats the first."""
     rays, covered = rays_of(samples, camera, view, cells), samples.row >= 0
     depth, used = np.ones(len(samples.ids)), np.zeros(len(samples.ids), bool)
     depth[samples.row[covered]], used[samples.row[covered]] = samples.depth[covered], True
@@ -169,7 +168,7 @@ def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.
 
 
 def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
-    """A table with zeros added up to the number of rows that its spec fixes."""
+    """A table padded with zeros to the number of rows that its spec fixes."""
     if spec.packed or len(table) == spec.shape[0]:
         return table
     return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
@@ -178,7 +177,7 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
 def _attribute_specs(
     surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
 ) -> dict[str, ArraySpec]:
-    """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
+    """Specs of the attributes of a constant surface that its shader reads; the host evaluates these."""
     if host_theta is None:
         return {}
     real = np.float64 if like is not None and floating_bits(like) == 64 else np.float32

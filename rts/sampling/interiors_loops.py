@@ -1,13 +1,13 @@
-"""Cells that show one colour whatever moves: they need no samples, nor do those that affect only such cells."""
+"""Cells amid one colour, whose image no movement changes: they need no samples, nor do samples seen only there."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rts.arrays.extremes import places
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel
 from rts.sampling.windows_loops import add, unite
-from rts.threads import parallel
 
 LONG = 2
 """Nanoseconds that a cell of a layer takes."""
@@ -20,17 +20,17 @@ def settle(
     reach: int,
     wanted: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Cells (H, W) bool amid nine fronts and no hidden sample that is kept; samples that only these need are left out.
+    """Mark cells (H, W) bool amid nine fronts without a hidden sample that is kept; drop the samples only they need.
 
-    Those stay that are within reach of a cell that is wanted and not settled. So do the nearest and the farthest front,
-    since splatters measure differences of depth by these.
+    Samples within reach of any other wanted cell stay. So do the nearest and the farthest front, since splatters
+    measure differences of depth by these.
 
     Args:
         covered: (K, H, W) bool.
         depth: (K, H, W) float, of one dtype.
         kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
         reach: cells.
-        wanted: (H, W) bool, the cells that are looked at; None for all, and those beyond the border.
+        wanted: (H, W) bool, the cells that are shown; None for all, and those beyond the border.
     """
     layers, height, width = covered.shape
     wanted = np.empty((0, width), np.bool_) if wanted is None else np.ascontiguousarray(wanted)
@@ -47,14 +47,14 @@ def settle(
 
 @loop
 def _settle(start, stop, covered, kept, wanted, reach, found, near):
-    """Fill rows [start, stop) of what is found, and of cells near any that are not."""
+    """Fill rows [start, stop) of `found`, cells amid one colour, and of `near`, cells within reach of any other."""
     layers, height, width = covered.shape
     around = reach + 1
     rows = stop - start + 2 * around
-    # A border of cells that are not amid fronts, as nothing is known there.
+    # The border counts as not amid fronts, as nothing is known there.
     loose, middle = np.ones((rows, width + 2 * around), np.uint8), slice(around, around + width)
     wide, far = np.ones((rows, width), np.uint8), 2 * around - 2
-    # What is not settled lies in blocks of 3 × 3 cells; what is wanted of it, anywhere.
+    # Cells that are not amid one colour come in blocks of 3 × 3; wanted ones among them lie anywhere.
     step = 1 if len(wanted) > 0 else 3
     column, nine = np.empty(width + 2 * around, np.uint8), np.empty(width + 2 * around - 2, np.uint8)
     for r in range(rows):
@@ -87,7 +87,7 @@ def _settle(start, stop, covered, kept, wanted, reach, found, near):
 
 @loop
 def _drop(start, stop, near, kept):
-    """Leave out what is not near."""
+    """Drop samples of cells that are not near."""
     for k in range(len(kept)):
         for y in range(start, stop):
             _mask(kept[k, y], near[y])

@@ -20,12 +20,12 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         return Sampled(tuple(samples), samples[0].cells, overflow)
-    given = [*(s.row for s in samples), *(s.depth for s in samples)]
+    tables = [*(s.row for s in samples), *(s.depth for s in samples)]
     if any(s.facing is not None for s in samples):
-        given += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]
+        tables += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]
     sizes = tuple(s.ids.shape[0] for s in samples)
     on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
-    part, row, depth, *facing = engine_of(given).by_host(on_host, elsewhere, *given)
+    part, row, depth, *facing = engine_of(tables).by_host(on_host, elsewhere, *tables)
     xp, start = namespace(row), 0
     exits, left = xp.full_like(row[0], -1), None
     for i, s in enumerate(samples):
@@ -41,23 +41,23 @@ def _nothing_told(row: Array) -> Array:
     return xp.zeros_like(row, dtype=xp.int16)
 
 
-def _interleaved(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Array, ...]:
-    """Part, row within it, depth and what faces the viewer, (K, H, W) each, from those three of each part.
+def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
+    """Part, row within the part, depth and facing (K, H, W), merged from row, depth and facing of each part.
 
     The last are missing where they are not given.
     """
-    xp, count = namespace(given[0]), len(sizes)
-    rows, facing = given[:count], given[2 * count :]
-    row, depth = xp.concat(rows), xp.concat(given[count : 2 * count])
+    xp, count = namespace(tables[0]), len(sizes)
+    rows, facing = tables[:count], tables[2 * count :]
+    row, depth = xp.concat(rows), xp.concat(tables[count : 2 * count])
     part = xp.concat([xp.where(r >= 0, i, r) for i, r in enumerate(rows)])
     order = xp.argsort(xp.where(row >= 0, depth, xp.inf), axis=0, stable=True)[:layers]
     part, row, depth = (xp.take_along_axis(x, order, axis=0) for x in (part, row, depth))
     if not facing:
         return part, row, depth
-    told = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
-    last, bit = told[-1:, ...], Cells.MORE_BEHIND
+    merged_facing = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
+    last, bit = merged_facing[-1:, ...], Cells.MORE_BEHIND
     marked = xp.where((last != 0) & (xp.abs(last) < bit), last + xp.where(last > 0, bit, -bit), last)
-    return part, row, depth, xp.concat([told[:-1, ...], xp.astype(marked, told.dtype)])
+    return part, row, depth, xp.concat([merged_facing[:-1, ...], xp.astype(marked, merged_facing.dtype)])
 
 
 def _of_part(facing: Array, part: int, count: int) -> Array:
@@ -71,10 +71,10 @@ def _of_part(facing: Array, part: int, count: int) -> Array:
     return xp.astype(xp.where(facing > 0, number, -number), facing.dtype)
 
 
-def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Array, ...]:
+def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
     """`_interleaved`, compiled: sorting many short columns takes array code far longer."""
     count = len(sizes)
-    rows, depths = given[:count], given[count : 2 * count]
+    rows, depths = tables[:count], tables[count : 2 * count]
     shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
     dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
 
@@ -84,9 +84,9 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
-        given = arrays[:count], arrays[count : 2 * count], arrays[2 * count :]
-        return merging_loops.interleave(*given, layers, Cells.MORE_BEHIND)
+        arguments = arrays[:count], arrays[count : 2 * count], arrays[2 * count :]
+        return merging_loops.interleave(*arguments, layers, Cells.MORE_BEHIND)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
-    specs = specs if len(given) == 2 * count else (*specs, ArraySpec(shape, np.int16))
-    return engine_of(given).call_host(host, specs, *given)
+    specs = specs if len(tables) == 2 * count else (*specs, ArraySpec(shape, np.int16))
+    return engine_of(tables).call_host(host, specs, *tables)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel, read_only
 
 
 def interleave(
@@ -33,7 +33,7 @@ def interleave(
         (read_only(r, np.int32), read_only(d, kind), read_only(facing[i] if facing else r[:0], np.int16))
         for i, (r, d) in enumerate(zip(rows, depths, strict=True))
     ]
-    # One part after the other: those before are merged already, but for the first.
+    # One part after the other: earlier parts are merged already.
     before: tuple[np.ndarray, ...] = (np.empty((0, height, width), np.int32), *given[0])
     given += [tuple(x[:0] for x in given[0])] * (len(rows) == 1)  # With one alone nothing is merged.
     for number, own in enumerate(given[1:], start=1):

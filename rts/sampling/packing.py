@@ -12,24 +12,24 @@ from rts.errors import InputError
 from rts.sampling.exits import Exits
 
 FAR = 20
-"""How many times larger than the farthest depth coordinates may be, so that depths, computed of them in float32, differ
-from those that were sampled by less than splatters allow for."""
+"""Largest ratio of coordinates to the farthest depth. Up to it, depths computed in float32 differ from sampled ones by
+less than splatters allow for."""
 
 
 EVERY = 16
-"""One of so many rows of depths is looked at before the others: where there is anything, it often tells enough."""
+"""Every so many rows of depths, one is looked at first: where anything is in view, it often suffices."""
 
 
 def too_far(size: float, depth: np.ndarray) -> bool:
-    """Whether coordinates of a size are so large that rounding may reorder depths (0 where there is none)."""
+    """True if coordinates of this size are so large that rounding may reorder depths (0 in empty cells)."""
     return size > 0 and all(size > FAR * largest(x) for x in (depth[:1, ::EVERY], depth))
 
 
 def covered_cells(triangle_ids: np.ndarray) -> tuple[np.ndarray, int]:
-    """Where `Fragments.triangle_ids` name a triangle, bool, and the largest that they name, or −1.
+    """Cells (bool) where `Fragments.triangle_ids` name a triangle, and the largest index among these, or −1.
 
     Raises:
-        InputError: some are neither indices nor −1.
+        InputError: an entry is neither an index nor −1.
     """
     covered, least, last = named(np.asarray(triangle_ids))
     if least < -1:
@@ -48,9 +48,9 @@ def lift(
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
-    that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
-    of the `covered_cells` to take, None for all. `exits` come last, as many as there is room for, in as
-    many rows as there are cells and layers at most.
+    that later steps stay connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool marks the
+    `covered_cells` to take, None for all. `exits` come last, as many as there is room for: rows number at most
+    cells times layers.
     """
     from rts.sampling import packing_loops
 
@@ -60,16 +60,16 @@ def lift(
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     beside = () if exits is None else ((exits.fragments, exits.there),)
     packed = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0, *beside, views=views)
-    found = None
+    exit_rows = None
     if exits is not None:
-        found = np.full(kept[0].shape, -1, np.int32)
-        found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
+        exit_rows = np.full(kept[0].shape, -1, np.int32)
+        exit_rows.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
     ids, params, row, depth, total = packed[:5]
-    return Samples(ids, params, Cells(row, depth, exit=found), np.asarray(max(0, total - len(ids)), np.int32))
+    return Samples(ids, params, Cells(row, depth, exit=exit_rows), np.asarray(max(0, total - len(ids)), np.int32))
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
-    """Samples packed anew: those whose cells are kept, numbered layer by layer.
+    """Samples of the cells that are kept, packed anew and numbered layer by layer.
 
     Args:
         samples: on the host.
@@ -83,9 +83,9 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
     index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
 
     def packed(x: np.ndarray) -> np.ndarray:
-        found = np.zeros((rows, *x.shape[1:]), x.dtype)
-        found[: len(index)] = x[index]
-        return found
+        rows_kept = np.zeros((rows, *x.shape[1:]), x.dtype)
+        rows_kept[: len(index)] = x[index]
+        return rows_kept
 
     return replace(
         samples,

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel
 from rts.contracts.records import Fragments
-from rts.threads import parallel
 
 
 def pack(
@@ -20,17 +20,17 @@ def pack(
     *more: tuple[Fragments, np.ndarray],
     views: tuple[int, int] = (1, 1),
 ) -> tuple[Any, ...]:
-    """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and how many there are in all.
+    """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of samples.
 
     Args:
-        fragments: what was sampled.
+        fragments: the fragments of all layers.
         kept: (K, H, W) bool, which of them to take; covered ones.
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
         capacity: rows to allot, or 0 for as many as are covered, at least one.
         *more: further fragments, and which of them to take, for rows behind all others, at most K · H · W in all. Their
             row is returned last; they do not count in how many there are.
-        views: how many views the grid is of, down and across; each is packed by itself, one after the other.
+        views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
     grids = [_Lines.of(fragments, kept, views), *(_Lines.of(*given) for given in more)]
     total, room = int(grids[0].counts.sum()), capacity or max(1, grids[0].kept.size)
@@ -53,7 +53,7 @@ def pack(
 
 
 class _Lines(NamedTuple):
-    """Fragments as lines of cells of a view, which of them to take, and how many of each line."""
+    """Fragments as lines of cells of a view, with the fragments to take and their number in each line."""
 
     kept: np.ndarray
     triangle_ids: np.ndarray
@@ -75,7 +75,7 @@ class _Lines(NamedTuple):
         return cls(taken, triangle_ids, barycentrics, depths, counts, shape, views)
 
     def offsets(self) -> np.ndarray:
-        """How many cells are taken before each line: views one after the other, each layer by layer."""
+        """The number of cells taken before each line: view after view, each layer by layer."""
         (layers, height, _), (down, across) = self.shape, self.views
         counts = self.counts.reshape(layers, down, height // down, across).transpose(1, 3, 0, 2)
         before = (np.cumsum(counts) - counts.reshape(-1)).reshape(counts.shape)
@@ -83,7 +83,7 @@ class _Lines(NamedTuple):
 
 
 def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
-    """How many cells (K, H, W) bool are taken in each of the views of a grid, so many down and across."""
+    """The number of cells (K, H, W) bool that are taken in each view of a grid of views, so many down and across."""
     layers, height, width = kept.shape
     lines, counts = kept.reshape(-1, width // views[1]), np.zeros(layers * height * views[1], np.int64)
     parallel(_count, len(lines), np.ascontiguousarray(lines), counts, work=kept.size // 8)

@@ -18,13 +18,13 @@ from rts.scene.parts import Part
 
 
 class Prepared:
-    """Parts with what their samplers have built.
+    """Parts, with the structures that their samplers have built.
 
     Attributes:
         parts: the parts.
         samplers: the sampler of each.
-        entries: what the sampler has built of each, or None where it builds nothing.
-        sizes: of each the largest number that its surface read when it was built, or None where nothing was.
+        entries: the sampler's entry for each part, or None where it builds nothing.
+        sizes: for each part the largest number that its surface read when it was built, or None where nothing was.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Prepared:
     def of(
         cls, parts: Part | Sequence[Part], sampler: Any, camera: Camera | None, size: tuple[int, int] | None
     ) -> Self:
-        """What samplers build of parts; arguments as in `rts.prepare`."""
+        """Prepared parts, with what their samplers build; arguments as in `rts.prepare`."""
         identity = Camera.look_at((0, 0, 1), (0, 0, 0))
         checked, _ = check_scene(parts, identity if camera is None else camera)
         size = None if size is None else check_pixels(size)
@@ -48,7 +48,7 @@ class Prepared:
         return cls(checked, samplers, entries, sizes)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but what samplers have built, of which the triangles are enough."""
+        """All but the samplers' structures, which can be built again from the triangles."""
         kept = [e._replace(prepared=None) if isinstance(e, Entry) else e for e in self.entries]
         return {**self.__dict__, "entries": kept}
 
@@ -59,7 +59,7 @@ class Prepared:
         self.__dict__.update(state, entries=entries)
 
     def replace(self, index: int = 0, **changes: Any) -> Self:
-        """A copy with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
+        """A copy with some fields of one part changed, such as its `transform`; the triangles stay as prepared."""
         check_changes(index, changes, len(self.parts))
         parts = list(self.parts)
         parts[index] = parts[index].replace(**changes)
@@ -71,6 +71,6 @@ def _built(sampler: Any, kept: Entry) -> Entry:
 
 
 def _size(part: Part) -> float:
-    """The largest floating number of those that a part's surface reads."""
+    """The largest floating number that a part's surface reads."""
     read = [value_of(x) for name in part.surface.reads(part.theta) for x in leaves(part.theta[name])]
     return max([0.0, *(largest(x) for x in read if x is not None and np.issubdtype(x.dtype, np.floating))])

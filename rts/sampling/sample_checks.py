@@ -1,4 +1,4 @@
-"""What is refused of cameras, proxies, fragments, samples and refined samples, on the host."""
+"""Checks of cameras, proxies, fragments, samples and refined samples, on the host."""
 
 from __future__ import annotations
 
@@ -47,10 +47,12 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
         )
     width = 2 if corners is None else corners.shape[2]
     if not surface.refines and width != surface.sample_widths[1]:
-        given = "no corner_params, and so 2 barycentrics" if corners is None else f"corner_params of {width} numbers"
+        corner_text = (
+            "no corner_params, and so 2 barycentrics" if corners is None else f"corner_params of {width} numbers"
+        )
         raise InputError(
-            f"the proxy of {surface!r} has {given} a corner, but sample_widths says {surface.sample_widths[1]}; make "
-            f"them agree"
+            f"the proxy of {surface!r} has {corner_text} a corner, but sample_widths says "
+            f"{surface.sample_widths[1]}; make them agree"
         )
     for name, array in (("ids", ids), ("corner_params", corners)):
         if array is not None and len(array) < len(faces):
@@ -92,7 +94,7 @@ def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: 
 
 
 def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
-    """What `pieces` of a surface gives, refused where compiled code would read out of its bounds."""
+    """The result of a surface's `pieces`, refused where compiled code would read out of its bounds."""
     pieces = np.asarray(surface.pieces(proxy))
     if pieces.dtype != np.int16 or pieces.shape not in ((1,), (len(proxy.faces),)):
         raise InputError(
@@ -103,10 +105,10 @@ def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
 
 
 def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samples:
-    """The samples of a part that `sample` of a sampler gave, refused where they do not fit its cells, or one another.
+    """A sampler's samples of a part, refused where they do not fit its cells, or one another.
 
     Args:
-        samples: the samples; values that are traced are not looked at.
+        samples: the samples; traced values are not checked.
         grid: (H, W) of the cells.
         sampler: the sampler.
     """
@@ -129,16 +131,18 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
 
 
 def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> np.ndarray:
-    """Which cells (K, H, W) bool are covered; what `rasterize` of a sampler should not have returned is refused."""
+    """The covered cells (K, H, W) bool of a sampler's fragments, which are refused if they break the contract."""
     if isinstance(fragments, Fragments):
         ids, barycentrics, depth = fragments
         fits = shape_of(ids) == shape_of(depth) == shape and shape_of(barycentrics) == (*shape, 2)
     else:
         fits = False
     if not fits:
-        given = tuple(shape_of(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
+        description = (
+            tuple(shape_of(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
+        )
         raise InputError(
-            f"rasterize of {type(sampler).__name__} returned {given}; expected Fragments of "
+            f"rasterize of {type(sampler).__name__} returned {description}; expected Fragments of "
             f"{(shape, (*shape, 2), shape)}"
         )
     covered, last = covered_cells(fragments.triangle_ids)
@@ -158,7 +162,7 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
 
     Args:
         camera: float64; its view is that of the camera times the part's transform.
-        transform: that transform, where there is one, to know what to blame.
+        transform: the part's transform, if it has one, which an error may blame.
 
     Returns:
         The camera, the last row of its view without rounding.
@@ -194,7 +198,7 @@ def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
 
 
 ROUNDING = 1e-6
-"""What entries of a last row may be off by, relative to its largest."""
+"""Tolerance of the entries of a matrix's last row, relative to its largest."""
 
 
 def _spread(m: np.ndarray) -> float:
@@ -233,21 +237,21 @@ def check_proxy(proxy: Proxy, surface: Any) -> None:
         )
 
 
-def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Samples:
-    """What `refine` of a surface gave, with arrays of the right dtypes; refused where it breaks its contract."""
+def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> Samples:
+    """The result of a surface's `refine` in arrays of the right dtypes, refused where it breaks its contract."""
     who = f"refine of {surface!r}"
-    if not isinstance(found, Samples):
-        raise InputError(f"{who} gave a {type(found).__name__}; expected Samples")
-    rows, grid, (i, p) = len(given.ids), given.row.shape, surface.sample_widths
-    ids = _array(f"{who} gave ids", found.ids, (rows, i), np.integer, np.int32)
-    params = _array(f"{who} gave params", found.params, (rows, p), np.floating, np.float32)
-    row = _array(f"{who} gave row", found.row, grid, np.integer, np.int32)
-    depth = _array(f"{who} gave depth", found.depth, grid, np.floating, np.float32)
-    overflow = _array(f"{who} gave overflow", found.overflow, (), np.integer, np.int32)
-    if ((row != given.row) & (row != -1)).any():
+    if not isinstance(refined, Samples):
+        raise InputError(f"{who} gave a {type(refined).__name__}; expected Samples")
+    rows, grid, (i, p) = len(lifted.ids), lifted.row.shape, surface.sample_widths
+    ids = _array(f"{who} gave ids", refined.ids, (rows, i), np.integer, np.int32)
+    params = _array(f"{who} gave params", refined.params, (rows, p), np.floating, np.float32)
+    row = _array(f"{who} gave row", refined.row, grid, np.integer, np.int32)
+    depth = _array(f"{who} gave depth", refined.depth, grid, np.floating, np.float32)
+    overflow = _array(f"{who} gave overflow", refined.overflow, (), np.integer, np.int32)
+    if ((row != lifted.row) & (row != -1)).any():
         raise InputError(f"{who} gave another number to a row; expected what it was given, or −1 to drop a sample")
-    if overflow < given.overflow:
-        raise InputError(f"{who} gave an overflow of {overflow}; expected at least the {given.overflow} it was given")
+    if overflow < lifted.overflow:
+        raise InputError(f"{who} gave an overflow of {overflow}; expected at least the {lifted.overflow} it was given")
     covered = row >= 0
     bad = covered & ~np.isfinite(depth)
     if bad.any():
@@ -255,12 +259,12 @@ def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Sam
     if not np.isfinite(params).all() and not np.isfinite(used := params[row[covered]]).all():
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
-    tables = _checked_tables(found.tables, given, who)
-    return given.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
+    tables = _checked_tables(refined.tables, lifted, who)
+    return lifted.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 
 def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any) -> np.ndarray:
-    """A value as an array of a dtype, refused where it has another shape, or is of another kind."""
+    """A value as an array of a dtype, refused where its shape or its kind is another."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -273,16 +277,16 @@ def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any
         return np.ascontiguousarray(array, dtype) if array.ndim else array.astype(dtype)
 
 
-def _checked_tables(found: Any, given: Samples, who: str) -> dict[str, np.ndarray]:
-    """Tables that fit into those that were allotted."""
-    if set(found) != set(given.tables):
-        raise InputError(f"{who} gave the tables {sorted(found)}; table_specs declares {sorted(given.tables)}")
+def _checked_tables(refined: Any, lifted: Samples, who: str) -> dict[str, np.ndarray]:
+    """The tables of refined samples, refused where they do not fit into the allotted ones."""
+    if set(refined) != set(lifted.tables):
+        raise InputError(f"{who} gave the tables {sorted(refined)}; table_specs declares {sorted(lifted.tables)}")
     tables = {}
-    for name, allotted in given.tables.items():
-        table = np.asarray(found[name], allotted.dtype)
-        if name in given.by_sample and len(table) != len(given.ids):
+    for name, allotted in lifted.tables.items():
+        table = np.asarray(refined[name], allotted.dtype)
+        if name in lifted.by_sample and len(table) != len(lifted.ids):
             raise InputError(
-                f"{who} gave a table {name!r} of {len(table)} rows; expected {len(given.ids)}, one a sample"
+                f"{who} gave a table {name!r} of {len(table)} rows; expected {len(lifted.ids)}, one a sample"
             )
         if table.shape[1:] != allotted.shape[1:] or len(table) > len(allotted):
             raise InputError(

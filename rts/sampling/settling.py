@@ -10,13 +10,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from rts.arrays.trees import Tree
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.packing import lift
 from rts.sampling.sample_checks import checked_refined
 from rts.scene.camera import Camera
 from rts.scene.rays import Rays
-from rts.threads import parallel, read_only
 
 SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6
 """Layers whose depths differ by less, in widths of a pixel and relative to the depth, are one root found twice."""
@@ -40,14 +40,14 @@ def on_surface(
 
     Args:
         surface: the surface.
-        inputs: what its `proxy_inputs` gave, on the host.
+        inputs: the result of its `proxy_inputs`, on the host.
         fragments: where rays meet the triangles, in `layers` layers or more.
         proxy: the triangles.
         camera: host matrices.
         layers: K.
         tables: what the surface's `table_specs` allots.
         size: (height, width) of the grid of cells.
-        cells: (L, C), the cells that the samples are of, as flat indices in the grid; None for all.
+        cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
     """
     first = Fragments(*(x[:layers] for x in fragments))
     moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables, size, cells)
@@ -81,16 +81,16 @@ def refined(
     size: tuple[int, ...] | None = None,
     cells: np.ndarray | None = None,
 ) -> tuple[Samples, Rays]:
-    """What `refine` of a surface makes of samples on its triangles, checked; and their rays.
+    """Samples moved from triangles onto the surface by its `refine`, checked; and their rays.
 
     Args:
         surface: the surface.
-        inputs: what its `proxy_inputs` gave, on the host.
+        inputs: the result of its `proxy_inputs`, on the host.
         lifted: the samples, a row for each covered cell.
         camera: host matrices.
         tables: what the surface's `table_specs` allots.
         size: (height, width) of the grid of cells; None for that of the samples.
-        cells: (L, C), the cells that the samples are of, as flat indices in the grid; None for all.
+        cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
     """
     by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
     allotted = {
@@ -104,22 +104,22 @@ def refined(
 
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
-    """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
+    """The rays of packed samples (N, 3). A single row that no cell refers to gets the ray of the first pixel."""
     from rts.sampling import settling_loops
 
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
     ends = np.empty((len(samples.ids), 3)), np.empty((len(samples.ids), 3))
     height, width = size
-    given = (height, width), *matrices, *ends
+    arguments = (height, width), *matrices, *ends
     if len(samples.ids) == 1:
         none = np.zeros(1, np.int64)
-        settling_loops.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *given)
+        settling_loops.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *arguments)
     if cells is not None:
         lines, columns = np.divmod(cells.reshape(-1), width)
-        settling_loops.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *given)
+        settling_loops.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *arguments)
     else:
         lines = read_only(samples.row, np.int32).reshape(-1, width)
-        parallel(settling_loops.rays_of, len(lines), lines, *given, work=20 * len(samples.ids))
+        parallel(settling_loops.rays_of, len(lines), lines, *arguments, work=20 * len(samples.ids))
     return Rays(*ends, camera.spread((height, width)))
 
 
@@ -127,12 +127,12 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     """The samples with the layers of each cell in order, equal roots merged and gaps closed; packed rows stay.
 
     Args:
-        samples: what a surface's `refine` gave; rows that are −1 are no samples.
+        samples: the result of a surface's `refine`; rows that are −1 are no samples.
         camera: host matrices.
         spread: the `spread` of `Rays`, local units.
 
     Returns:
-        Samples with another `row` and `depth`. What lies before the near or beyond the far plane is gone.
+        Samples with another `row` and `depth`; those before the near or beyond the far plane are dropped.
     """
     from rts.sampling import settling_loops
 
@@ -140,13 +140,13 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     # Depths are in the camera's units, the spread in the surface's: the view scales by this cube root.
     near, slope = SAME_ROOT_PIXELS * np.abs(np.linalg.det(camera.view[:3, :3])) ** (1 / 3) * spread
     limits = np.array([*_planes(camera), near, slope + SAME_ROOT])
-    given = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
-    parallel(settling_loops.settle_lines, row.shape[1], *given, limits, row, depth, work=10 * row.size)
+    arguments = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
+    parallel(settling_loops.settle_lines, row.shape[1], *arguments, limits, row, depth, work=10 * row.size)
     return samples.replace(row=row, depth=depth)
 
 
 def _planes(camera: Camera) -> tuple[float, float]:
-    """Depths of the near and the far plane, a little wider for rounding; infinite where they are not straight on."""
+    """Depths of the near and the far plane, widened for rounding; infinite if the planes are oblique."""
     p = camera.projection
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return -np.inf, np.inf

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 
 
 @loop
 def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
-    """See `rts.sampling.settling.settle`; for lines `start` to `stop` of the image.
+    """Settle lines [start, stop) of the image; see `rts.sampling.settling.settle`.
 
     Args:
         start: the first line.
         stop: the line after the last.
         row: (K, H, W) int32.
         depth: (K, H, W) float32.
-        limits: (4,) depths of the near and far plane; and by how much the depths of two roots differ at least, the
-            second number in units of the depth.
+        limits: (4,) depths of the near and far plane; and the least difference of the depths of two roots: a constant,
+            and a factor of the depth.
         out_row: (K, H, W), to be filled.
         out_depth: (K, H, W), to be filled.
     """

@@ -18,13 +18,12 @@ import numpy as np
 
 from rts.arrays.engines import Engine, constants, engine_of, namespace
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import ArraySpec, Cells, Decision, Fine, Question, Sampled, Samples
 from rts.sampling.hidden import HiddenBySplatter, numbers_of
-from rts.threads import parallel, read_only
 
 STRIP = 16
-"""Lines of fine cells in a strip without its apron, about: with fewer there are more of aprons, with more, more of
-empty cells."""
+"""Lines of fine cells in a strip without its apron, about. Fewer make more aprons, more make more empty cells."""
 
 LINE = 256
 """Fine cells that are sampled, in a line of their list."""
@@ -82,10 +81,10 @@ class FineGrid(NamedTuple):
 
 
 class Room(NamedTuple):
-    """How much there is room for.
+    """The size of a layout: columns of strips, and fine cells.
 
     Attributes:
-        columns: columns of strips, a pixel wide, those that aprons take included.
+        columns: columns of strips, a pixel wide, those of aprons included.
         cells: fine cells to sample.
     """
 
@@ -94,7 +93,7 @@ class Room(NamedTuple):
 
 
 def rounded(count: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few, so that what is compiled for a shape serves again."""
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few shapes, so that compiled programs serve again."""
     size = 16
     while size < count:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
@@ -106,12 +105,12 @@ class Layout(NamedTuple):
 
     Attributes:
         cells: (L, LINE) int32, the cells to sample, as flat indices in the grid with its apron; −1 for none.
-        place: (h, w) int32, which of these each place of the layout shows, or −1.
+        place: (h, w) int32, the index in `cells` that each place of the layout shows, or −1.
         kinds: (h, w) uint8, bits of `strips_loops`.
         wanted: (h, w) bool, the cells of active pixels.
-        pixel: (H, W) int32, where in the layout, in pixels, an active pixel is; −1 for pixels that are not active.
+        pixel: (H, W) int32, the place of an active pixel in the layout, in pixels; −1 for other pixels.
         coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
-        dropped: () int32, pixels that there was no room for.
+        dropped: () int32, the number of pixels without room.
     """
 
     cells: Array
@@ -134,7 +133,7 @@ class Layout(NamedTuple):
 
 
 def _lines(grid: FineGrid, columns: int) -> tuple[int, int]:
-    """How many lines of a layout, and of how many columns, about square, have room for runs of so many in all."""
+    """Lines and columns of an about square layout with room for runs of so many columns in all."""
     # Where a line ends, up to `gap` columns stay empty, and a run that is cut has aprons once more.
     across = max(math.isqrt(columns * grid.pitch), 3 * grid.gap + 1)
     return -(-columns // (across - 2 * grid.gap)), across
@@ -154,9 +153,9 @@ def lay_out(
     Args:
         active: the pixels.
         grid: the sizes.
-        room: for how much; None for all.
-        sizes_of: where shapes follow from what is needed, how many columns, and lines of cells, to allot for a number
-            that is needed. None where they follow from `room`.
+        room: the room; None for all that is needed.
+        sizes_of: the number of columns, or of lines of cells, to allot for the number that is needed. None where
+            shapes follow from `room`.
     """
     from rts.sampling import strips_loops
 
@@ -176,8 +175,8 @@ def lay_out(
     cells, pixel = np.empty(allotted * LINE, np.int32), np.full(grid.size, -1, np.int32)
     cells[total:] = -1
     place, kinds = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)
-    given = marks, pieces, _firsts(pieces, grid), *sizes, np.cumsum(counts) - counts, cells, place, kinds
-    parallel(strips_loops.fill, len(counts), *given, work=4 * place.size)
+    arguments = marks, pieces, _firsts(pieces, grid), *sizes, np.cumsum(counts) - counts, cells, place, kinds
+    parallel(strips_loops.fill, len(counts), *arguments, work=4 * place.size)
     strips_loops.number(marks, pieces, grid.high, grid.pitch, across - grid.gap, pixel)
     left = np.count_nonzero(active) - np.count_nonzero(pixel >= 0)
     coarse = np.ones([n + 2 * grid.apron for n in grid.size], bool)
@@ -188,13 +187,13 @@ def lay_out(
 
 
 def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """The first pieces, as many as have no more cells than there is room for; and their cells in each line."""
+    """The first pieces, as many as there is room for; and the number of their cells in each line."""
     from rts.sampling import strips_loops
 
     def counted(n: int) -> np.ndarray:
         counts = np.zeros(grid.fine[0], np.int64)
-        given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high
-        parallel(strips_loops.count, len(counts), *given, grid.fine[1], counts, work=500 * len(counts))
+        arguments = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high
+        parallel(strips_loops.count, len(counts), *arguments, grid.fine[1], counts, work=500 * len(counts))
         return counts
 
     counts = counted(len(pieces))
@@ -208,17 +207,17 @@ def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | 
 
 
 def _firsts(pieces: np.ndarray, grid: FineGrid) -> np.ndarray:
-    """Where the pieces of each strip begin, and where the last one's end."""
+    """The first piece of each strip, and the end of the last strip's."""
     return np.searchsorted(pieces[:, 0], np.arange(grid.strips + 1))
 
 
 @dataclass(frozen=True)
 class HiddenInStrips:
-    """What a splatter needs of listed cells: the rule for images, asked of their layout.
+    """The rule of a splatter for the samples of listed cells: its rule for images, applied to their layout.
 
     Attributes:
-        rule: for images.
-        layout: on the host.
+        rule: the rule for images.
+        layout: the layout, on the host.
     """
 
     rule: HiddenBySplatter
@@ -249,27 +248,27 @@ class HiddenInStrips:
             needed = np.concatenate([covered[:1], self._listed(asked[1:], covered[1:], self.layout.kinds)])
         if settled is None:
             return Decision(needed, None, needed)
-        # The places beside a wanted one are the cells that lie beside it, those beside others may not be.
+        # Only beside a wanted place does the layout show the cells that lie beside it in the grid.
         amid = self._listed(((settled >= 0) & wanted)[None], covered[:1])[0]
         return Decision(self._listed(kept, needed), numbers_of(amid), needed)
 
     def _listed(self, marks: np.ndarray, among: np.ndarray, kinds: np.ndarray | None = None) -> np.ndarray:
-        """Those of listed cells (K, L, LINE) that have marks (K, h, w) in the layout; with `kinds`, near wanted ones.
+        """Listed cells (K, L, LINE) with a mark (K, h, w) in the layout; with `kinds`, only marks near wanted cells.
 
-        Other marks are then taken away.
+        Other marks are then cleared.
         """
         from rts.sampling import strips_loops
 
-        found, place = np.zeros((len(among), among[0].size), bool), self.layout.place
-        given = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, found
-        parallel(strips_loops.scatter, len(marks) * len(place), *given, work=marks.size)
-        found = found.reshape(among.shape)
-        found &= among
-        return found
+        marked, place = np.zeros((len(among), among[0].size), bool), self.layout.place
+        arguments = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, marked
+        parallel(strips_loops.scatter, len(marks) * len(place), *arguments, work=marks.size)
+        marked = marked.reshape(among.shape)
+        marked &= among
+        return marked
 
 
 def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
-    """Samples of listed cells, (K, L, LINE), put into the places that show these cells."""
+    """Samples of listed cells (K, L, LINE), put into the places of the layout that show these cells."""
     sizes = [s.ids.shape[-2] for s in sampled.samples]
     engine, layers = engine_of(sampled), sampled.row.shape[0]
     laid = layers, *layout.place.shape
@@ -280,23 +279,25 @@ def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
         ArraySpec(laid, np.int32),
         ArraySpec(laid, np.int32),
     ]
-    told = [] if sampled.facing is None else [sampled.facing]
-    specs += [ArraySpec(laid, np.int16) for _ in told]
+    facing = [] if sampled.facing is None else [sampled.facing]
+    specs += [ArraySpec(laid, np.int16) for _ in facing]
     amid = [] if sampled.settled is None else [sampled.settled]
     specs += [ArraySpec(laid[1:], np.int8) for _ in amid]
 
-    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *known: np.ndarray) -> tuple[np.ndarray, ...]:
-        sides = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in known[: len(told)]]
-        *found, settled = _arranged(row, place, cells, sizes, grid.fine[1], *known[len(told) :])
-        return *found, *sides, *([settled] if amid else [])
+    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *optional: np.ndarray) -> tuple[np.ndarray, ...]:
+        sides = [
+            np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in optional[: len(facing)]
+        ]
+        *placed, settled = _arranged(row, place, cells, sizes, grid.fine[1], *optional[len(facing) :])
+        return *placed, *sides, *([settled] if amid else [])
 
-    given = sampled.row, layout.place, layout.cells, *told, *amid
-    index, shift, row, part, *known = engine.call_host(host, tuple(specs), *given)
+    arguments = sampled.row, layout.place, layout.cells, *facing, *amid
+    index, shift, row, part, *optional = engine.call_host(host, tuple(specs), *arguments)
     return Fine(
         sampled.samples,
         index,
         shift,
-        Cells(row, facing=known[0] if told else None, settled=known[-1] if amid else None),
+        Cells(row, facing=optional[0] if facing else None, settled=optional[-1] if amid else None),
         part,
         layout.wanted,
         layout.pixel,
@@ -315,7 +316,7 @@ def _arranged(
     width: int,
     settled: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
-    """What `strips_loops.arrange` fills; there is always at least one splat."""
+    """The arrays that `strips_loops.arrange` fills; there is always at least one splat."""
     from rts.sampling import strips_loops
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
@@ -328,13 +329,13 @@ def _arranged(
     index, shift = make(max(1, total), np.int32), make((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
     shown = np.empty(place.shape if len(amid) else (0, 0), np.int8)
-    given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
-    parallel(strips_loops.arrange, lines, *given, work=2 * laid.size)
+    arguments = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
+    parallel(strips_loops.arrange, lines, *arguments, work=2 * laid.size)
     return index, shift, laid, part, shown
 
 
 def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
-    """Samples of all cells, less those that are not listed: what is done for samplers that know no lists.
+    """The samples of listed cells, selected from those of all cells, for samplers that do not follow lists.
 
     Args:
         whole: of the whole grid.
@@ -344,19 +345,21 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     layers, count = whole.row.shape[0], whole.ids.shape[0]
     rows = count if capacity is None else capacity
     grid = layers, *cells.shape
-    told = [] if whole.facing is None else [whole.facing]
+    whole_facing = [] if whole.facing is None else [whole.facing]
 
-    def host(row: np.ndarray, depth: np.ndarray, cells: np.ndarray, *told: np.ndarray) -> tuple[np.ndarray, ...]:
-        there = cells >= 0
-        at = np.where(there, cells, 0)
+    def host(
+        row: np.ndarray, depth: np.ndarray, cells: np.ndarray, *whole_facing: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        listed = cells >= 0
+        at = np.where(listed, cells, 0)
         row, depth = (x.reshape(layers, -1)[:, at] for x in (row, depth))
-        covered = (row >= 0) & there
+        covered = (row >= 0) & listed
         index = row[covered]
         number = np.full(grid, -1, np.int32)
         number[covered] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
         kept = np.zeros(max(1, len(index)) if capacity is None else rows, np.int32)
         kept[: len(index)] = index[: len(kept)]
-        sides = (np.where(number >= 0, x.reshape(layers, -1)[:, at], 0).astype(np.int16) for x in told)
+        sides = (np.where(number >= 0, x.reshape(layers, -1)[:, at], 0).astype(np.int16) for x in whole_facing)
         dropped = np.asarray(max(0, len(index) - rows), np.int32)
         return kept, number, np.where(number >= 0, depth, 0), dropped, *sides
 
@@ -366,10 +369,10 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         ArraySpec(grid, np.int32),
         ArraySpec(grid, kind),
         ArraySpec((), np.int32),
-        *(ArraySpec(grid, np.int16) for _ in told),
+        *(ArraySpec(grid, np.int16) for _ in whole_facing),
     )
-    given = whole.row, whole.depth, cells, *told
-    index, row, depth, overflow, *facing = engine_of(whole).call_host(host, specs, *given)
+    arguments = whole.row, whole.depth, cells, *whole_facing
+    index, row, depth, overflow, *facing = engine_of(whole).call_host(host, specs, *arguments)
     xp, gbuffer = namespace(index), whole.gbuffer
     tables = whole.tables.items()
     return replace(

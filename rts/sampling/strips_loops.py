@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 
 WANTED, NEAR = 1, 2
 """Bits of cells: inside of an active pixel, and within two cells of one."""
@@ -50,7 +50,7 @@ def _unite(some, active):
 
 @loop
 def split(runs, gap, lines, across):
-    """Pieces (P, 5) int32 of runs that fit into so many lines of so many columns; what finds no room is left out."""
+    """Pieces (P, 5) int32 of runs that fit into so many lines of so many columns; runs without room are left out."""
     pieces = np.empty((len(runs) + lines, 5), np.int32)
     found, line, at = 0, 0, 0
     for r in range(len(runs)):
@@ -70,7 +70,7 @@ def split(runs, gap, lines, across):
 
 @loop
 def number(active, pieces, high, pitch, across, pixel):
-    """Fill in where in the layout (in pixels, `across` in a line, lines of pieces `pitch` apart) active pixels are."""
+    """Fill in the places of active pixels in the layout, in pixels: `across` a line, lines of pieces `pitch` apart."""
     height, _ = active.shape
     for strip, first, columns, line, at in pieces:
         for y in range(strip * high, min(height, (strip + 1) * high)):
@@ -82,7 +82,7 @@ def number(active, pieces, high, pitch, across, pixel):
 
 @compiled
 def _needs(needs, active, line, strip, first, columns, side, apron, high):
-    """Which columns of a piece need a line of cells of the grid; whether any do."""
+    """Mark the columns of a piece that need a line of cells of the grid. Returns True if there are any."""
     needs[:columns] = 0
     top, bottom = strip * high, min(len(active), (strip + 1) * high)
     begin, end = _pixels(line, side, apron)
@@ -102,7 +102,7 @@ def _pixels(line, side, apron):
 
 @compiled
 def _end(marks, first):
-    """Where a run of marks that begins at the first ends."""
+    """The end of the run of marks that begins at `first`."""
     end = first + 1
     while end < len(marks) and marks[end]:
         end += 1
@@ -205,7 +205,7 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
 
 @compiled
 def _repeat(to, given, more):
-    """Numbers that are larger by so much than given ones, −1 apart."""
+    """Copy numbers and add `more` to each, except to −1."""
     more = to.dtype.type(more)
     for u in range(len(to)):
         to[u] = given[u] + more if given[u] >= 0 else given[u]
@@ -213,7 +213,7 @@ def _repeat(to, given, more):
 
 @compiled
 def _number(numbers, cells, first, n):
-    """Number the cells of a run that have no number yet, the first of which is told; what comes after the last."""
+    """Number the cells of a run that have no number yet, from n on. Returns the next number."""
     known = False
     for u in range(len(numbers)):
         known |= numbers[u] >= 0
@@ -237,7 +237,7 @@ def _copy(to, given):
 
 @compiled
 def _near(line, side, apron):
-    """First and end of the lines of pixels to which a line of cells of the grid is near, and the one that it is of."""
+    """First and end of the lines of pixels near a line of cells of the grid, and the line of pixels that holds it."""
     begin, end = _pixels(line, side, apron)
     own = line - apron
     return max(begin, (own - side - 2) // side + 1), min(end, (own + 2) // side + 1), own // side
@@ -245,7 +245,7 @@ def _near(line, side, apron):
 
 @compiled
 def _tell(kinds, active, near, strip, first, columns, side, apron, high):
-    """Bits of a line of cells of a piece, `near` lines of pixels."""
+    """Set the bits of a line of cells of a piece, from the active pixels on `near` lines of pixels."""
     around = min(apron, 2)
     begin, end, own = near
     for y in range(max(strip * high, begin), min(len(active), (strip + 1) * high, end)):
@@ -291,7 +291,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         shift: (N, 3) float32, to be filled: from the grid to the layout.
         laid: (K, h, w) int32, to be filled: the splat of each place.
         part: (K, h, w) int32, to be filled: its part.
-        shown: (h, w) int8, to be filled with what is settled; no rows for nothing.
+        shown: (h, w) int8, to be filled: `settled` of each place; no rows if there is none.
     """
     height, across = len(place), np.uint32(width)
     for line in range(start, stop):
@@ -316,7 +316,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
 
 @loop
 def gather(start, stop, covered, depth, place, laid, deep):
-    """What of (K, M) cells is covered, and how deep, in lines [start, stop) of a layout, counted over layers."""
+    """Copy cover and depth of cells (K, M) into lines [start, stop) of a layout, counted over layers."""
     height = len(place)
     for line in range(start, stop):
         k, y = line // height, line % height
@@ -330,7 +330,7 @@ def gather(start, stop, covered, depth, place, laid, deep):
 def scatter(start, stop, kept, kinds, place, found):
     """Mark the (K, M) cells that are kept (K, h, w), in lines [start, stop) of a layout, counted over layers.
 
-    Where there are kinds, what is not near wanted cells is not kept.
+    With kinds, marks that are not near wanted cells are cleared.
     """
     height = len(place)
     for line in range(start, stop):

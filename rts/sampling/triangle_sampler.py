@@ -34,24 +34,24 @@ NOTHING_ELSE = Request()
 """Asks for all samples, and nothing besides."""
 
 LEAST_LAYERS = 3
-"""Where a surface refines its samples, so many layers of triangles are looked for, or one more than samples are asked
-for, if that is more: at an outline both sides of a fold may stand where the surface is not."""
+"""Least number of layers of triangles for a surface that refines its samples; otherwise one more than was asked for.
+At an outline both sides of a fold of triangles may stand where the surface is not."""
 
 
 class TriangleSampler(Sampler):
-    """Base class of samplers that know only triangles: `sample` for any surface that gives a proxy.
+    """Base class of samplers of triangles: subclasses rasterize, this class samples any surface that has a proxy.
 
-    What was prepared is kept (`rts.sampling.cache`) until the proxy's inputs change.
+    The result of `prepare` is kept (`rts.sampling.cache`) until the proxy's inputs change.
 
     Attributes:
-        concurrent: whether several threads may call `rasterize` at once; those of a sampler with an `update` wait
-            for one another in any case.
+        concurrent: True if several threads may call `rasterize` at once. Threads of a sampler with an `update` always
+            wait for one another.
     """
 
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Give every instance a keeper, whatever `__init__` a subclass has; refuse what would never be called."""
+        """Give every instance a keeper, whatever `__init__` a subclass has; refuse an `update` that is never called."""
         if overrides(cls, "update", TriangleSampler) and not overrides(cls, "prepare", TriangleSampler):
             raise PluginError(
                 f"{cls.__qualname__} has an update, which adapts what prepare built, and no prepare; write prepare, or "
@@ -62,25 +62,25 @@ class TriangleSampler(Sampler):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """The sampler's own settings: copies, and those in other processes, build anew."""
+        """The sampler's own settings: a copy, such as in another process, prepares anew."""
         return {name: value for name, value in self.__dict__.items() if name != "_keeper"}
 
     def prepare(self, proxy: Proxy) -> Any:
-        """Build what `rasterize` needs: an acceleration structure, device buffers. The default is the proxy itself."""
+        """Build the input of `rasterize`: an acceleration structure, device buffers. The default gives the proxy."""
         check_faces(proxy)
         return proxy
 
     def update(self, prepared: Any, proxy: Proxy) -> Any:
-        """Adapt what was prepared to moved vertices of the same faces, and return it; None if it must be made anew.
+        """Adapt the result of `prepare` to moved vertices of the same faces, and return it; None to prepare anew.
 
         A class with this method has its own `prepare`, too.
         """
         return None
 
     def arrange(self, prepared: Any) -> Any:
-        """Rearrange what was prepared of triangles that will stay as they are, as `rts.prepare` promises.
+        """Rearrange the result of `prepare` for triangles that will stay, as `rts.prepare` promises.
 
-        It may take longer than to draw them a few times. The default returns what was prepared.
+        This may take longer than to draw them a few times. The default changes nothing.
         """
         return prepared
 
@@ -89,7 +89,7 @@ class TriangleSampler(Sampler):
         """The `layers` nearest triangles of every pixel, at its centre, between the near and the far plane.
 
         Args:
-            prepared: what `prepare` or `arrange` gave.
+            prepared: the result of `prepare` or `arrange`.
             camera: NumPy float64 matrices; world is the proxy's local space.
             size: (height, width).
             layers: K.
@@ -103,7 +103,7 @@ class TriangleSampler(Sampler):
     def rasterize_cells(
         self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
-        """As `rasterize`, of some cells alone. The default draws all, and takes those.
+        """Fragments of some cells alone; see `rasterize`. The default draws all cells, and selects those.
 
         Args:
             prepared: see `rasterize`.
@@ -116,10 +116,10 @@ class TriangleSampler(Sampler):
         Returns:
             Fragments, (K, L, C).
         """
-        whole, there = self.rasterize(prepared, camera, size, layers, cull), cells >= 0
+        whole, listed = self.rasterize(prepared, camera, size, layers, cull), cells >= 0
         check_fragments(whole, (layers, *size), np.iinfo(np.int32).max, self)
-        at = np.where(there, cells, 0)
-        ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
+        at = np.where(listed, cells, 0)
+        ids = np.where(listed, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
 
     def rasterize_exits(
@@ -153,7 +153,7 @@ class TriangleSampler(Sampler):
         return fragments, cells, backs
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
-        """See `Sampler`: the proxy of a part, and what is prepared of it."""
+        """The proxy of a part, and the result of `prepare` for it; see `Sampler`."""
         surface = _of_triangles(part.surface)
         if surface.depends_on_view and (camera is None or size is None):
             raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
@@ -171,14 +171,14 @@ class TriangleSampler(Sampler):
         return entry if entry.prepared is None else entry._replace(prepared=self.arrange(entry.prepared))
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
-        """A copy of the surface's proxy for host inputs, checked, and what this sampler prepares of it."""
+        """An entry of a copy of the surface's proxy, checked, and of the result of `prepare` for it."""
         proxy = checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
         return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None, largest(proxy.vertices))
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
-        """What `_built` gives, kept from call to call where that pays."""
+        """The entry that `_built` makes, kept from call to call where that pays."""
         if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
@@ -226,8 +226,8 @@ class TriangleSampler(Sampler):
         def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(cells[0], np.int32) if cells else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own)
-            found = search.moved() if moves else search.in_place(sides, exits)
-            return found, {name: getattr(found, name) for name in beside}
+            samples = search.moved() if moves else search.in_place(sides, exits)
+            return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
         samples, more = call.samples(find, beside, tables, [] if listed is None else [listed])
@@ -243,36 +243,36 @@ class TriangleSampler(Sampler):
         entry: Entry | None,
         work: Callable[[Entry], _T],
     ) -> _T:
-        """What `work` gives for what is prepared of a surface, which no other thread changes meanwhile.
+        """Call `work` with a surface's prepared entry, which no other thread changes meanwhile; returns its result.
 
         Args:
             surface: the surface.
             inputs: of its proxy, on the host.
             camera: the camera.
             view: (height, width) of the grid of cells.
-            entry: what is prepared, if it is known.
+            entry: the prepared entry, if known.
             work: may be called by several threads at once where several may draw.
         """
         with self._keeper.lock:
-            found = entry or self._entry(surface, inputs, camera, view)
+            known = entry or self._entry(surface, inputs, camera, view)
             if not self.draws_at_once:
-                return work(found)
-        return work(found)
+                return work(known)
+        return work(known)
 
     @property
     def draws_at_once(self) -> bool:
-        """Whether several threads may draw what is prepared of one surface at once."""
+        """True if several threads may draw one prepared entry at once."""
         return self.concurrent and not self._follows
 
     @property
     def _follows(self) -> bool:
-        """Whether what was prepared can follow moved vertices."""
+        """True if the sampler can adapt a prepared entry to moved vertices."""
         return overrides(self, "update", TriangleSampler)
 
 
 @dataclass(frozen=True)
 class _Search:
-    """How the samples of one view are found on the host.
+    """The search for the samples of one view, on the host.
 
     Attributes:
         sampler: draws the triangles.
@@ -280,10 +280,10 @@ class _Search:
         cull: the part's.
         inputs: of the surface's proxy.
         camera: host matrices.
-        shape: how many samples there may be.
+        shape: bounds on the number of samples.
         tables: what the surface's `table_specs` allots.
         hidden: the rule for hidden samples; None to keep all.
-        entry: what is prepared of the surface, if it is known.
+        entry: the surface's prepared entry, if known.
         cells: (L, C), the cells to sample; None for all.
     """
 
@@ -302,7 +302,7 @@ class _Search:
         """The samples where the triangles are, or where a surface that moves none refines them."""
         known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
-        # What is refined is not settled.
+        # Refined samples all stay, none is left out amid one colour.
         kept, facing = decision.needed if self.surface.refines else decision.kept, None
         if sides:
             # Nobody looks at them where no sample is hidden, and to find them takes long.
@@ -312,15 +312,15 @@ class _Search:
             lifted = lift(fragments, known.proxy, self.shape.capacity, kept, behind)
             return lifted.replace(facing=facing, settled=decision.settled)
         lifted = lift(fragments, known.proxy, None, kept)
-        found, _ = refined(self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells)
-        return repack(found, found.row >= 0, self.shape.capacity).replace(facing=facing)
+        samples, _ = refined(self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells)
+        return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
 
     def moved(self) -> Samples:
         """The samples where a surface moves them, off its triangles."""
         layers = self.shape.layers
         # Of tables there is but one set, so that no samples can be added later.
         known, fragments, covered, *_ = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
-        found = on_surface(
+        samples = on_surface(
             self.surface,
             self.inputs,
             fragments,
@@ -331,16 +331,16 @@ class _Search:
             self.shape.view,
             self.cells,
         )
-        there = kept = found.row >= 0
+        covers = kept = samples.row >= 0
         if self.hidden is not None:  # It is asked only now, since it goes by the final depths.
-            kept = self.hidden.decide(Question(there, found.depth)).needed
-        ran_out = np.count_nonzero(covered[-1] & ~there[-1])
-        return repack(found, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
+            kept = self.hidden.decide(Question(covers, samples.depth)).needed
+        ran_out = np.count_nonzero(covered[-1] & ~covers[-1])
+        return repack(samples, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
 
     def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
-        """What is prepared, the fragments (K, ·, ·), and where there are any; with `exits` what was decided for them.
+        """The prepared entry, the fragments (K, ·, ·), and their covered cells.
 
-        The last is where rays leave the part.
+        With `exits` also the decision for them, and where rays leave the part; else None for both.
         """
         sampler, (camera, view) = self.sampler, (self.camera, self.shape.view)
         grid = layers, *self.shape.size
@@ -349,12 +349,12 @@ class _Search:
             if not (count := len(known.proxy.faces)):
                 nowhere = Exits(np.empty((1, 0), np.int32), *_nothing((1, 1, 0))) if exits else None
                 return known, *_nothing(grid), None, nowhere
-            given = known.prepared, camera, view, layers
+            arguments = known.prepared, camera, view, layers
             if not exits:
                 if self.cells is None:
-                    fragments = sampler.rasterize(*given, self.cull)
+                    fragments = sampler.rasterize(*arguments, self.cull)
                 else:
-                    fragments = sampler.rasterize_cells(*given, self.cull, self.cells)
+                    fragments = sampler.rasterize_cells(*arguments, self.cull, self.cells)
                 return known, fragments, check_fragments(fragments, grid, count, sampler), None, None
             seen: list[tuple[Fragments, np.ndarray, Decision]] = []
 
@@ -363,7 +363,7 @@ class _Search:
                 seen[:] = [(fragments, covered, self._decided(covered, fragments, known))]
                 return beside_outlines(seen[0][2].needed)
 
-            fragments, asked, backs = sampler.rasterize_exits(*given, beside)
+            fragments, asked, backs = sampler.rasterize_exits(*arguments, beside)
             if not seen or fragments is not seen[0][0]:
                 covered = check_fragments(fragments, grid, count, sampler)
                 seen[:] = [(fragments, covered, self._decided(covered, fragments, known))]
@@ -374,22 +374,22 @@ class _Search:
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
 
     def _decided(self, covered: np.ndarray, fragments: Fragments, known: Entry) -> Decision:
-        """Which fragments, where nothing moves them any more, are to be samples."""
+        """The decision which fragments become samples; their depths are final."""
         if self.hidden is None:
             return Decision(covered, None, covered)
         return self.hidden.decide(Question(covered, fragments.depth, self._size(known)))
 
     def _size(self, known: Entry) -> float:
-        """The size of the largest coordinate of the triangles; 0 where the rule knows it."""
+        """The size of the largest coordinate of the triangles; 0 where the rule knows it already."""
         if known.size is not None or self.hidden is None:
             return known.size or 0.0
-        # Vertices that were looked at as a part of θ need not be looked at again.
+        # The rule has the size of vertices that are themselves a part of θ.
         read = self.hidden.size > 0 and any(np.may_share_memory(x, known.proxy.vertices) for x in leaves(self.inputs))
         return 0.0 if read else largest(known.proxy.vertices)
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:
-    """The surface, which must be one of triangles."""
+    """The surface, refused if it has no triangles."""
     if not isinstance(surface, TriangleSurface):
         raise InputError(
             f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
@@ -398,7 +398,7 @@ def _of_triangles(surface: Any) -> TriangleSurface:
 
 
 def _nothing(shape: tuple[int, int, int]) -> tuple[Fragments, np.ndarray]:
-    """Fragments of a shape without any, and where they are: nowhere."""
+    """Empty fragments of a shape, and their covered cells: none."""
     return _no_fragments(shape), np.zeros(shape, np.bool_)
 
 
@@ -407,7 +407,7 @@ def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
 
 
 def _held(x: Array) -> np.ndarray:
-    """The value of an array that is to be held on the host."""
+    """The value of an array, to be kept on the host; refused if it is traced."""
     value = value_of(x)
     if value is None or value.shape != shape_of(x):
         raise InputError(

@@ -22,19 +22,19 @@ _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
-    """Warn of culled parts that are wound inside out; each surface is looked at but once."""
+    """Warn of culled parts that are wound inside out; each surface is checked only once."""
     for index, part in enumerate(parts):
         if part.cull != "back" or _triangles_of(part) is None or not _is_new(part.surface):
             continue
-        found = is_inside_out(part, camera)
-        if found is None:
+        inside_out = is_inside_out(part, camera)
+        if inside_out is None:
             _looked_at.discard(part.surface)
-        if found:
+        if inside_out:
             warn(f"part {index} {INSIDE_OUT}; give it faces[:, ::-1]", InputWarning)
 
 
 def _is_new(surface: Any) -> bool:
-    """Whether a surface was not looked at so far; from now on it was."""
+    """True for a surface that was not checked before; it counts as checked from now on."""
     try:
         new = surface not in _looked_at
         _looked_at.add(surface)
@@ -47,9 +47,9 @@ INSIDE_OUT = "is closed and wound inside out: cull='back' leaves out the side th
 
 
 def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
-    """Whether a culled part is closed, seen from outside, and its triangles face its inside; None where it is traced.
+    """True if a culled part is closed, seen from outside, and its triangles face its inside; None if it is traced.
 
-    Seen from within, such as a room, it is as it should be.
+    A part seen from within, such as a room, is right with triangles that face its inside.
     """
     surface = _triangles_of(part)
     if part.cull != "back" or surface is None:
@@ -67,7 +67,7 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
 
 
 def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
-    """The surface of a part, if how it is wound is the user's to say, and is known at no cost."""
+    """The surface of a part, if the user chose its winding and its triangles cost nothing; else None."""
     surface = part.surface
     if isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view:
         return surface
@@ -75,7 +75,7 @@ def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
 
 
 def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether a mesh is closed and has a negative volume."""
+    """True if a mesh is closed and has a negative volume."""
     points = vertices.astype(np.float64)
     points -= points[faces].mean(axis=(0, 1))
     a, b, c = (points[faces[:, i]] for i in range(3))
@@ -89,5 +89,5 @@ def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool
     places, at = np.unique(vertices, axis=0, return_inverse=True)
     start = at.reshape(-1)[faces].astype(np.int64)
     end = np.roll(start, -1, axis=1)
-    there, back = start * len(places) + end, end * len(places) + start
-    return np.array_equal(np.sort(there, axis=None), np.sort(back, axis=None))
+    forward, backward = start * len(places) + end, end * len(places) + start
+    return np.array_equal(np.sort(forward, axis=None), np.sort(backward, axis=None))

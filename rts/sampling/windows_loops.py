@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled
+from rts.compiling.loops import compiled
 
 
 @compiled
@@ -19,7 +19,7 @@ def add(marks, more):
 
 @compiled
 def spread(found, above, level, below):
-    """Fill a row (W,) with whether there is a mark in the 3 × 3 window; marks have one cell more at each side."""
+    """Mark the cells of a row (W,) with a mark in their 3 × 3 window; rows of marks have one cell more at each side."""
     for x in range(len(found)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         found[x] = around | below[x] | below[x + 1] | below[x + 2]
@@ -27,6 +27,6 @@ def spread(found, above, level, below):
 
 @compiled
 def unite(found, a, b, c):
-    """Fill uint8 with what is marked in any of three; each may be longer."""
+    """Mark the cells that any of three rows marks, uint8; these may be longer."""
     for x in range(len(found)):
         found[x] = a[x] | b[x] | c[x]

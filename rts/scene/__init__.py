@@ -1,1 +1,1 @@
-"""What a scene is made of: parts, cameras, poses, and tables of triangles."""
+"""Elements of a scene: parts, cameras, poses, and tables of triangles."""

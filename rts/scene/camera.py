@@ -53,16 +53,16 @@ FAR_OVER_DISTANCE = 1e2
 
 @record(static=("aspect",))
 class Camera:
-    """A camera: two matrices, and for which ratio of width to height they are.
+    """A camera: two matrices, and the ratio of width to height that they are made for.
 
-    `Camera(view, projection)` takes matrices as they are. Linear depth is read off `view`, so a product of both, such
-    as makes vertices in clip space for nvdiffrast, is no `projection`: `Camera.from_mvp` takes it apart.
+    `Camera(view, projection)` takes matrices as they are. Linear depth is read off `view`, so the product of both
+    matrices, as used for nvdiffrast, is no `projection`: `Camera.from_mvp` takes it apart.
 
     Attributes:
         view: (4, 4) camera-from-world, affine.
         projection: (4, 4) OpenGL clip space from camera space; its last row is (0, 0, ±c, d).
-        aspect: width over height of the image that the projection is for; "open" if it is for a square one and to be
-            widened to any size, as `for_size` does; None if nobody knows.
+        aspect: width over height of the image that the projection is for. "open" if it is for a square image, and is
+            to be widened by `for_size`. None if unknown.
     """
 
     view: Array
@@ -78,7 +78,7 @@ class Camera:
         return iter((self.view, self.projection))
 
     def __eq__(self, other: Any) -> bool:
-        """Whether both have the same matrices, in value, and the same ratio."""
+        """True if both cameras have the same matrices, in value, and the same ratio."""
         if not isinstance(other, Camera):
             return NotImplemented
         pairs = (self.view, other.view), (self.projection, other.projection)
@@ -90,9 +90,9 @@ class Camera:
         """A copy with some fields changed."""
         if not changes.keys() <= self.__dict__.keys():
             raise TypeError(f"a camera has the fields {', '.join(self.__dict__)}, not {', '.join(changes)}")
-        made = object.__new__(Camera)  # Nothing is left to check, and cameras are copied often.
-        made.__dict__.update({**self.__dict__, **changes})
-        return made
+        camera = object.__new__(Camera)  # Skips __init__: cameras are copied often, and these fields are checked.
+        camera.__dict__.update({**self.__dict__, **changes})
+        return camera
 
     # ------------------------------------------------------------------------------------------ several views
 
@@ -100,7 +100,7 @@ class Camera:
     def stack(cls, cameras: Sequence[Camera]) -> Camera:
         """The cameras of several views as one, for `rts.render_views`: both matrices are (B, 4, 4).
 
-        It is a tree of two arrays, as any camera: `jax.vmap` and `torch.vmap` hand on one camera after the other.
+        The stack is a tree of two arrays, as any camera: `jax.vmap` and `torch.vmap` map over its views.
         `unstack()[b]` is the camera of view b.
 
         Args:
@@ -122,10 +122,10 @@ class Camera:
         return cls(xp.stack(both[::2]), xp.stack(both[1::2]), aspects.pop() if len(aspects) == 1 else None)
 
     def unstack(self) -> list[Camera]:
-        """The cameras that `stack` made one of; either matrix may be (4, 4), and is that of all.
+        """The cameras of the single views of a stack. A matrix of shape (4, 4) is shared by all views.
 
         Raises:
-            InputError: it is a camera of one view, or the matrices are not (B, 4, 4).
+            InputError: this is a camera of one view, or the matrices are not (B, 4, 4).
         """
         shapes = [shape_of(m) for m in (self.view, self.projection)]
         counts = {shape[0] for shape in shapes if len(shape) == 3}
@@ -135,7 +135,7 @@ class Camera:
 
     @property
     def is_stacked(self) -> bool:
-        """Whether it holds several views."""
+        """True for a camera of several views."""
         return len(shape_of(self.view)) == 3 or len(shape_of(self.projection)) == 3
 
     # ---------------------------------------------------------------------------------------- constructors
@@ -160,7 +160,7 @@ class Camera:
             target: (3,) world.
             up: (3,) direction that is up in the image. Where the camera looks along it, +x is to the right instead.
             fov_y: vertical field of view, degrees.
-            aspect: width over height of the image; None for that of the size it is rendered at.
+            aspect: width over height of the image; None for the ratio of the rendered size.
             near: near plane; default 1/100 of the distance to the target.
             far: far plane; default 100 times the distance to the target.
             principal_point: (2,) where the axis meets the image, NDC.
@@ -194,12 +194,12 @@ class Camera:
     ) -> Camera:
         """A perspective camera whose pose is a matrix; without one it is at the origin and looks along −z, +y up.
 
-        That is for objects whose pose is relative to the camera: they lie at negative z.
+        The default suits objects whose pose is relative to the camera: they lie at negative z.
 
         Args:
             fov_y: vertical field of view, degrees.
             view: (4, 4) camera-from-world, affine; None for the identity.
-            aspect: width over height of the image; None for that of the size it is rendered at.
+            aspect: width over height of the image; None for the ratio of the rendered size.
             near: near plane.
             far: far plane.
             principal_point: (2,) where the axis meets the image, NDC.
@@ -210,8 +210,8 @@ class Camera:
         Warns:
             InputWarning: a field of view below 2, likely to be in radians.
         """
-        known = None if view is None else check_numbers("view", view, (4, 4))
-        if known is not None and not (_is_affine(known) and is_invertible(known[:3, :3])):
+        value = None if view is None else check_numbers("view", view, (4, 4))
+        if value is not None and not (_is_affine(value) and is_invertible(value[:3, :3])):
             raise InputError("view is singular, or its last row is not (0, 0, 0, 1); expected a camera-from-world map")
         _, (view,) = promote(np.eye(4) if view is None else view)
         projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
@@ -237,8 +237,8 @@ class Camera:
             eye: (3,) world.
             target: (3,) world.
             up: (3,) direction that is up in the image. Where the camera looks along it, +x is to the right instead.
-            height: what the image shows from bottom to top, world units.
-            aspect: width over height of the image; None for that of the size it is rendered at.
+            height: extent of the image from bottom to top, world units.
+            aspect: width over height of the image; None for the ratio of the rendered size.
             near: depth of the near plane; may be negative.
             far: depth of the far plane.
             principal_point: (2,) where the axis meets the image, NDC.
@@ -303,14 +303,13 @@ class Camera:
     def from_mvp(cls, matrix: Any) -> Camera:
         """A camera from one matrix: model-view-projection, the product that takes the world to clip space.
 
-        For those who hold vertices in clip space, as nvdiffrast and diffren take them: give vertices in the world, and
-        the matrix that they were multiplied with. The image is the same, and depth is the linear one, in units of
-        the world, if the matrix is the product of any projection, perspective or parallel, and of a view that does
-        not scale.
+        For users of nvdiffrast and diffren, which take vertices in clip space: give vertices in the world, and the
+        matrix that took them to clip space. The image is the same. Depth is linear, in units of the world, if the
+        matrix is the product of any projection, perspective or parallel, and of a view that does not scale.
 
-        A matrix that is transposed (for row vectors), or multiplied in the other order, is refused where it shows: not
-        if the view does not turn, nor does more than that. Depths from 0 to 1, of Direct3D and Vulkan, look like those
-        of a near plane at about half its depth; pictures are the same. Where they run backwards, from 1 to 0, they are
+        A matrix that is transposed (for row vectors), or multiplied in the other order, is refused where it shows. It
+        does not show in a view without rotation, or of rotation alone. Depths from 0 to 1, as in Direct3D and Vulkan,
+        are read as those of a near plane at about half its depth; pictures are the same. Depths from 1 to 0 are
         refused.
 
         Args:
@@ -319,14 +318,14 @@ class Camera:
         Raises:
             InputError: the matrix is singular, transposed, in the other order, or has a plane behind the camera.
         """
-        known = check_numbers("matrix", matrix, (4, 4))
-        if known is not None and not is_invertible(known):
+        value = check_numbers("matrix", matrix, (4, 4))
+        if value is not None and not is_invertible(value):
             raise InputError("matrix is singular; expected an invertible product projection @ view")
-        if known is not None:
-            check_product(known)
+        if value is not None:
+            check_product(value)
         xp, (m,) = promote(matrix)
         x, y, z, w = (m[i, :3] for i in range(4))
-        parallel = known is not None and is_parallel_product(known)
+        parallel = value is not None and is_parallel_product(value)
         if parallel:  # Depth grows along the rays, from the near plane on.
             along = xp.linalg.cross(x, y)
             axis, start = unit(along * xp.sign(xp.sum(along * z))), m[2, :] + m[3, :]
@@ -344,7 +343,7 @@ class Camera:
 
     @classmethod
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
-        """A camera from OpenGL's matrices, whose conventions are those of this library.
+        """A camera from OpenGL's matrices, which have the conventions of this library.
 
         Args:
             modelview: (4, 4) camera-from-world.
@@ -359,8 +358,8 @@ class Camera:
     def from_nvdiffrast(cls, modelview: Any, projection: Any, *, top_down: bool = False) -> Camera:
         """A camera from the matrices whose product feeds `nvdiffrast`.
 
-        nvdiffrast's row 0 is NDC y = −1, the bottom. With plain OpenGL matrices its image is ours upside down, and the
-        matrices are taken unchanged.
+        nvdiffrast's row 0 is NDC y = −1, the bottom. With plain OpenGL matrices its image is ours upside down. The
+        matrices stay unchanged.
 
         Args:
             modelview: (4, 4) camera-from-world.
@@ -437,8 +436,8 @@ class Camera:
         Raises:
             InputError: the matrix is not affine or singular, or planes are out of order.
         """
-        known = check_numbers("camera_to_world", camera_to_world, (4, 4), (3, 4))
-        if known is not None and not (_is_affine(known) and is_invertible(known[:3, :3])):
+        value = check_numbers("camera_to_world", camera_to_world, (4, 4), (3, 4))
+        if value is not None and not (_is_affine(value) and is_invertible(value[:3, :3])):
             raise InputError(
                 "camera_to_world is singular, or its last row is not (0, 0, 0, 1); expected a rotation and a position"
             )
@@ -524,7 +523,7 @@ class Camera:
         return namespace(self.view).linalg.inv(self.view), p[1, 1] * size[0] / 2
 
     def _perspective(self, converter: str, size: tuple[int, int]) -> tuple[Any, Array]:
-        """Namespace and projection for a size; refused where it is known that there is no centre of projection."""
+        """Namespace and projection for a size. Cameras known to be orthographic are refused."""
         height, width = check_pixels(size)
         projection = self.for_size((height, width)).projection
         last = value_of(projection[3, 2])
@@ -535,7 +534,7 @@ class Camera:
     # ----------------------------------------------------------------------------------------------- use
 
     def for_size(self, size: tuple[int, int]) -> Camera:
-        """The camera for images of a size (height, width), if it leaves the ratio open; else the camera itself."""
+        """The camera for images of a size (height, width): itself, unless it leaves the ratio open."""
         if self.aspect is None or isinstance(self.aspect, Real):
             return self
         if not (isinstance(self.aspect, str) and self.aspect == "open"):
@@ -550,7 +549,7 @@ class Camera:
         return map_leaves(f, self)
 
     def within(self, transform: Array | None) -> Camera:
-        """This camera in the local space of a part, whose world-from-local transform is given."""
+        """This camera in the local space of a part with a world-from-local transform (4, 4)."""
         if transform is None:
             return self
         if shape_of(transform) != (4, 4):
@@ -595,7 +594,7 @@ class Camera:
             size: (height, width).
 
         Returns:
-            (N, 3). Points on the plane of the camera's centre have no image; they give finite values.
+            (N, 3). Points on the plane of the camera's centre have no image; their values are finite.
         """
         size, points = check_pixels(size), from_numbers(points, "points")
         if shape_of(points)[-1:] != (3,):
@@ -626,7 +625,7 @@ class Camera:
         return world_vectors(self.view, direction)
 
     def turned(self) -> Camera:
-        """The camera of the same image that looks along −z, for one that looks along +z."""
+        """An equivalent camera that looks along −z, for a camera that looks along +z."""
         columns = engine_of(self.projection).constant(np.array([1.0, 1, -1, 1]), self.projection)
         return self.replace(view=scaled_rows(self.view, (1, 1, -1, 1)), projection=self.projection * columns)
 
@@ -643,7 +642,7 @@ class Camera:
             )
 
     def depth_range(self) -> tuple[Array, Array]:
-        """Linear depths of the near and the far plane, whichever way clip z runs; infinity for no such plane."""
+        """Linear depths of the near and the far plane, in either direction of clip z; infinity for a missing plane."""
         xp, (p,) = promote(self.projection)
         depths = []
         for a, b in ((p[2, 3] + p[3, 3], p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3], p[2, 2] - p[3, 2])):
@@ -686,7 +685,7 @@ class Camera:
     def _spread(self, inverse: Array, size: tuple[int, int]) -> Array:
         """The `spread` (2,) of `Rays`; `inverse` is the inverse of the view."""
         xp, (inverse, p) = promote(inverse, self.projection)
-        # A pixel at clip w spans 4 w² / (height width) of what the first two columns of the projection span.
+        # A pixel at clip w spans 4 w² / (height width) of the area that the first two columns of the projection span.
         area = 4 / (size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
         a, b, c = (inverse[:3, i] for i in range(3))
         # If the view scales, widths are in its local units; a geometric mean if it scales axes differently.
@@ -708,7 +707,7 @@ def world_vectors(view: Array, direction: Sequence[float]) -> Array:
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
-    """View and projection in one engine and dtype: those of the one that is not constant."""
+    """View and projection in one engine and dtype. The matrix that is not constant decides them."""
     _, (view, projection) = promote(view, projection)
     return view, projection
 
@@ -729,12 +728,12 @@ def _is_affine(matrix: np.ndarray) -> bool:
 
 
 def _check_intrinsics(K: Any) -> None:
-    known = check_numbers("K", K, (3, 3))
-    if known is None:
+    value = check_numbers("K", K, (3, 3))
+    if value is None:
         return
-    rest = np.abs(known[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1])
-    if rest.max() > ROUNDING or min(known[0, 0], known[1, 1]) <= 0:
+    rest = np.abs(value[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1])
+    if rest.max() > ROUNDING or min(value[0, 0], value[1, 1]) <= 0:
         raise InputError(
-            f"K is {known.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, with positive fx and "
+            f"K is {value.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, with positive fx and "
             f"fy"
         )

@@ -1,4 +1,4 @@
-"""The matrix of a rigid pose and its Jacobian, compiled: sixty array operations on so few numbers are far slower."""
+"""The matrix of a rigid pose and its Jacobian, compiled: as sixty small array operations they are far slower."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 
 SMALL = 1e-2
-"""Squared angles below which series are used, which are right to 3e-14 there."""
+"""Limit of the squared angle below which series replace sine and cosine; their error is below 3e-14."""
 
 
 def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

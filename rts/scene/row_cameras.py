@@ -1,4 +1,4 @@
-"""The cameras of samples of several views, for shaders that colour them all in one call."""
+"""Cameras of samples of several views, for shaders that colour all views in one call."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from rts.scene.camera import Camera, toward_rows, world_vectors
 
 @record()
 class RowCameras:
-    """A camera for each of N samples: what a shader is given that `takes_views`.
+    """A camera for each of N samples, for shaders that promise `takes_views`.
 
-    Its methods are those of a `Camera` of one view, and give a row for each sample. Points are those of the N samples.
+    The methods are named as in `Camera`, and return a row for each sample. Arguments are points of the N samples.
 
     Attributes:
         views: (B, 4, 4) camera-from-world, of each view.
@@ -31,12 +31,12 @@ class RowCameras:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], number: Array) -> RowCameras:
-        """The cameras of several views, for samples of which `number` (N,) says whose they are."""
+        """Cameras of samples (N,), from the cameras of all views and each sample's view `number`."""
         stacked = Camera.stack(cameras)
         return cls(stacked.view, stacked.projection, number)
 
     def of_rows(self, number: Array) -> RowCameras:
-        """These cameras, for other samples."""
+        """Cameras of other samples, from these views."""
         return RowCameras(self.views, self.projections, number)
 
     def toward(self, points: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Tables of indices: copied, fixed, and checked once, so that compiled code can rely on them."""
+"""Tables of indices: copied, made read-only, and checked once, so that compiled loops can rely on them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def index_table(name: str, table: Any, width: int) -> np.ndarray:
     """A copy (T, width) int32, read-only, of a table of indices that count from 0.
 
     Args:
-        name: what an error calls it.
+        name: the name in error messages.
         table: (T, width) integers, T at least 1: an array of any engine, or a list of lists.
         width: the number of columns.
 
@@ -52,19 +52,19 @@ def _known(name: str, table: Any) -> np.ndarray:
         except Exception as error:  # Such as a list of traced arrays.
             raise InputError(f"{name} is no table of known integers ({type(error).__name__})") from None
     try:
-        known = value_of(table)
+        values = value_of(table)
     except EngineError:
         raise InputError(f"{name} is {quoted(table)}; expected an array of integers") from None
-    if known is None or known.shape != shape_of(table):
+    if values is None or values.shape != shape_of(table):
         raise InputError(
             f"{name} is traced, and topology must be known while Python runs; make the surface outside of jit and "
             f"vmap, or give it NumPy indices"
         )
-    return known
+    return values
 
 
 def fixed(array: np.ndarray) -> np.ndarray:
-    """The array itself, from now on read-only. It must own its memory."""
+    """The array itself, made read-only. It must own its memory."""
     array.flags.writeable = False
     return array
 
@@ -73,12 +73,12 @@ _extent: dict[int, tuple[weakref.ref, tuple[int, int]]] = {}
 
 
 def table_extent(array: np.ndarray) -> tuple[int, int]:
-    """The least and the largest number in a table that is not empty; of a fixed one it is looked for but once."""
+    """Least and largest number in a non-empty table. A read-only table is searched only once."""
     kept = not array.flags.writeable and array.flags.owndata
     key = id(array)
     if kept and key in _extent and _extent[key][0]() is array:
         return _extent[key][1]
-    found = extent(array)
+    bounds = extent(array)
     if kept:
-        _extent[key] = weakref.ref(array, lambda _: _extent.pop(key, None)), found
-    return found
+        _extent[key] = weakref.ref(array, lambda _: _extent.pop(key, None)), bounds
+    return bounds

@@ -52,11 +52,11 @@ def perspective(
         principal_point: (2,) where the axis meets the image, NDC; (0, 0) is the middle.
 
     Raises:
-        InputError: an angle, ratio or planes that make no image.
+        InputError: the angle, the ratio or the planes make no image.
     """
     check_planes(near, far, positive=True)
-    known = check_numbers("fov_y", fov_y, ())
-    if known is not None and not 0 < known < 180:
+    value = check_numbers("fov_y", fov_y, ())
+    if value is not None and not 0 < value < 180:
         raise InputError(f"fov_y is {quoted(fov_y)}; expected degrees between 0 and 180")
     check_positive("aspect", aspect)
     check_numbers("principal_point", principal_point, (2,))
@@ -81,14 +81,14 @@ def orthographic(
     """(4, 4) orthographic projection.
 
     Args:
-        height: what the image shows from bottom to top, world units.
+        height: extent of the image from bottom to top, world units.
         aspect: width over height.
         near: depth of the near plane; may be negative.
         far: depth of the far plane.
         principal_point: (2,) where the axis meets the image, NDC.
 
     Raises:
-        InputError: a height, ratio or planes that make no image.
+        InputError: the height, the ratio or the planes make no image.
     """
     check_planes(near, far, positive=False)
     check_positive("height", height)
@@ -116,13 +116,13 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     Raises:
         InputError: eye and target coincide, or `up` is zero.
     """
-    known = [check_numbers(name, x, (3,)) for name, x in (("eye", eye), ("target", target), ("up", up))]
-    values = None if any(x is None for x in known) else [np.asarray(x, np.float64) for x in known]
+    checked = [check_numbers(name, x, (3,)) for name, x in (("eye", eye), ("target", target), ("up", up))]
+    values = None if any(x is None for x in checked) else [np.asarray(x, np.float64) for x in checked]
     if values is not None:
         _check_upright(*values)
     xp, (eye, target, up) = promote(eye, target, up)
     back = unit(eye - target)
-    # In most cases it is known that nothing is parallel, and takes no time.
+    # Known values are mostly not parallel, and then skip the array operations.
     if values is None or _is_parallel(values[2], unit(values[0] - values[1])):
         up = xp.where(_is_parallel(up, back), _level_up(up, back), up)
     right = unit(xp.linalg.cross(up, back))
@@ -139,14 +139,14 @@ def _check_upright(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
 
 
 def _is_parallel(up: Array, back: Array) -> Any:
-    """Whether two vectors (3,), the second of unit length, are parallel up to rounding."""
+    """True if two vectors (3,), the second of unit length, are parallel up to rounding."""
     xp = namespace(up, back)
     sideways, rounding = xp.linalg.cross(up, back), 4 * float(xp.finfo(up.dtype).eps)
     return xp.sum(sideways * sideways) <= rounding**2 * xp.sum(up * up)
 
 
 def _level_up(up: Array, back: Array) -> Array:
-    """(3,) upright of a camera that looks along `up` or against it, with +x to its right, or +y."""
+    """(3,) upright of a camera that looks along `up` or against it. To its right is +x, or +y if `up` is along x."""
     xp = namespace(up, back)
     x, y, zero = up * up, back[1:2] * 0 + 1, back[:1] * 0
     along_x = x[0] > 0.5 * xp.sum(x)
@@ -155,17 +155,17 @@ def _level_up(up: Array, back: Array) -> Array:
 
 
 PARALLEL = 1e-12
-"""Rays are parallel if w changes by less than this share over lengths in which x or y do by one."""
+"""Largest slope of w, relative to the slopes of x and y, of a projection with parallel rays."""
 ROUNDING = 1e-5
-"""Rounding allowed in entries of matrices that are to be zero or one."""
+"""Rounding allowed in matrix entries that should be zero or one."""
 RADIANS = 2.0
-"""A field of view below this is likely to be one in radians, given for degrees."""
+"""A field of view below this limit is probably in radians."""
 
 
 def warn_of_radians(fov_y: Any) -> None:
-    """Warn of a field of view that is likely not to be in degrees, where its value is known."""
-    known = value_of(fov_y)
-    if known is not None and (known < RADIANS).all():
+    """Warn of a known field of view that is probably in radians."""
+    value = value_of(fov_y)
+    if value is not None and (value < RADIANS).all():
         warn(
             f"fov_y is {quoted(fov_y)}, and is in degrees: of radians give math.degrees(fov_y); a telephoto lens is "
             f"seen as it is",
@@ -176,9 +176,9 @@ def warn_of_radians(fov_y: Any) -> None:
 def check_product(matrix: np.ndarray) -> None:
     """Refuse a matrix (4, 4) that seems to be another product than `projection @ view`.
 
-    In that product clip z and w grow along one axis, and both planes of a perspective one lie before the camera.
+    In `projection @ view` clip z and w grow along one axis, and both planes of a perspective lie before the camera.
     """
-    # A transposed projection alone may look like another one, but for its scale: views do not scale.
+    # A transposed projection alone may look like a product, but its view would scale.
     rows = _is_product(matrix.T) and _is_unscaled(matrix.T) and not _is_unscaled(matrix)
     if _is_product(matrix) and not rows:
         return
@@ -194,23 +194,23 @@ def check_product(matrix: np.ndarray) -> None:
 
 
 def is_parallel_product(matrix: np.ndarray) -> bool:
-    """Whether a matrix (4, 4) from the world to clip space has parallel rays."""
+    """True if a matrix (4, 4) from the world to clip space has parallel rays."""
     return bool(np.linalg.norm(matrix[3, :3]) <= PARALLEL * np.linalg.norm(matrix[:2, :3]))
 
 
 def _is_product(matrix: np.ndarray) -> bool:
-    """Whether a matrix may be `projection @ view`."""
+    """True if a matrix may be `projection @ view`."""
     return is_parallel_product(matrix) or min(_planes(matrix) or (0.0,)) > 0
 
 
 def _is_unscaled(matrix: np.ndarray) -> bool:
-    """Whether clip w grows as fast as depth, or is 1 everywhere."""
+    """True if clip w grows as fast as depth, or is 1 everywhere."""
     w = matrix[3, 3:] if is_parallel_product(matrix) else matrix[3, :3]
     return bool(abs(np.linalg.norm(w) - 1) < ROUNDING)
 
 
 def _planes(matrix: np.ndarray) -> tuple[float, float] | None:
-    """Depths at which clip z is −w and w, as multiples of w's; None where z and w do not grow along one axis."""
+    """Depths at which clip z is −w and w, in units of w's slope; None where z and w do not grow along one axis."""
     z, w = matrix[2], matrix[3]
     length = np.linalg.norm(w[:3])
     if not length or np.linalg.norm(np.cross(z[:3], w[:3])) > ROUNDING * np.linalg.norm(z[:3]) * length:
@@ -226,7 +226,7 @@ def _planes(matrix: np.ndarray) -> tuple[float, float] | None:
 
 
 def _is_other_order(matrix: np.ndarray) -> bool:
-    """Whether a matrix may be `view @ projection` of a perspective one."""
+    """True if a matrix may be `view @ projection` with a perspective projection."""
     columns = matrix[:, [0, 1, 3]]
     products = columns[:3].T @ columns[:3]
     lengths = np.sqrt(np.diag(products))

@@ -1,1 +1,1 @@
-"""The built-in shaders, textures, and what shaders read of samples."""
+"""The built-in shaders, textures, and the attributes and entries of θ that shaders read."""

@@ -1,6 +1,6 @@
 """The built-in shaders: from θ and the G-buffer in world space to premultiplied linear RGBA.
 
-A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. What it reads of θ is differentiable:
+A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. Entries of θ that it reads are differentiable:
 
     "color" (3,) or (4,)             factor on the base colour
     "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
@@ -9,7 +9,7 @@ A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. What it rea
                                      (L, 3); "ambient" (3,). Default: one white light from above the camera's left
                                      shoulder and an ambient 0.2.
     "specular" (3,), "shininess" ()  of `blinn_phong`
-    "depth_range" (2,)               of `depth`: what is black and what is white; default the near and far planes
+    "depth_range" (2,)               of `depth`: the depths of black and white; default the near and far planes
 
 The base colour is the texture where θ has one and the surface has uv, else the G-buffer's "color", else white.
 """
@@ -93,10 +93,10 @@ class Unlit(Shader):
     """The base colour.
 
     Attributes:
-        wrap: how the texture goes on outside [0, 1]: "repeat", "mirror" or "clamp".
+        wrap: continuation of the texture outside [0, 1]: "repeat", "mirror" or "clamp".
         opaque: whether to ignore the alpha of texture and colours.
-        mip: whether to average the texture over about what a sample covers of it, trilinearly in a pyramid (mipmaps),
-            so that texels smaller than samples do not alias. How much that is has no derivative.
+        mip: whether to average the texture over roughly the footprint of a sample, trilinearly in a pyramid (mipmaps),
+            so that texels smaller than samples do not alias. The footprint has no derivative.
     """
 
     wrap: str = "repeat"
@@ -123,7 +123,7 @@ class Unlit(Shader):
         xp = namespace(position)
         if "texture" in theta and "uv" in gbuffer:
             footprint, texture = gbuffer[FOOTPRINT] if self.mip else None, theta["texture"]
-            # What is averaged is what is seen: transparent texels count by their alpha.
+            # Averages are of visible colours: transparent texels count by their alpha.
             weighed = self.mip and not self.opaque and shape_of(texture)[-1] == 4
             texture = (
                 xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1) if weighed else texture
@@ -216,21 +216,21 @@ def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array
 
 
 def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
-    """(N, 1) whether the viewer is on the side of a sample that its normal faces away from."""
-    given = gbuffer["position"], gbuffer["normal"], camera
-    engine = engine_of(given)
-    position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), given)
+    """(N, 1) bool, true where a sample's normal points away from the viewer."""
+    arrays = gbuffer["position"], gbuffer["normal"], camera
+    engine = engine_of(arrays)
+    position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), arrays)
     return dot(normal, camera.toward(position)) < 0
 
 
 def _lit(
     theta: Mapping[str, Tree], camera: Camera | RowCameras
 ) -> tuple[Array | float, list[tuple[Array, Array | float]]]:
-    """The ambient light, and of each other the unit vector towards it, (3,) or (N, 3), and its colour."""
-    given = theta.get("light", {})
-    if not isinstance(given, Mapping):
-        raise InputError(f"theta['light'] is a {type(given).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
-    for name, value in given.items():
+    """The ambient light, and for each other light the unit vector towards it, (3,) or (N, 3), and its colour."""
+    light = theta.get("light", {})
+    if not isinstance(light, Mapping):
+        raise InputError(f"theta['light'] is a {type(light).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
+    for name, value in light.items():
         if name not in LIGHT_ENTRIES:
             raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(LIGHT_ENTRIES)}")
         shape = shape_of(value)
@@ -240,20 +240,20 @@ def _lit(
             ok = len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0
             _check(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
     colors = [DEFAULT_DIFFUSE]
-    if "color" in given:
-        colors = _listed(given["color"])
-    if "direction" in given:
-        known = value_of(given["direction"])
-        if known is not None and not known.any(axis=-1).all():
+    if "color" in light:
+        colors = _listed(light["color"])
+    if "direction" in light:
+        vectors = value_of(light["direction"])
+        if vectors is not None and not vectors.any(axis=-1).all():
             raise InputError("theta['light']['direction'] is zero; expected vectors towards the lights, of any length")
-        directions = _listed(unit(given["direction"]))
+        directions = _listed(unit(light["direction"]))
     else:
         directions = [camera.to_world(DEFAULT_LIGHT)]
     if len(colors) not in (1, len(directions)):
         raise InputError(f"theta['light'] has {len(directions)} directions but {len(colors)} colors")
     if len(colors) == 1:
         colors *= len(directions)
-    return given.get("ambient", DEFAULT_AMBIENT), list(zip(directions, colors, strict=True))
+    return light.get("ambient", DEFAULT_AMBIENT), list(zip(directions, colors, strict=True))
 
 
 def _listed(vectors: Array) -> list[Array]:
@@ -270,7 +270,7 @@ def _entry(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Ar
 
 
 def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
-    """Refuse what is not a number or a floating array of the expected shape, and what is infinite."""
+    """Refuse an entry of θ that is no finite number or floating array of the expected shape."""
     number = isinstance(value, (bool, int, float))
     if not ok or not (number or hasattr(value, "dtype")):
         raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
@@ -281,7 +281,7 @@ def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
 
 
 def _positive(x: Array) -> Array:
-    return namespace(x).where(x > 0, x, 0 * x)  # Of NaN, NaN.
+    return namespace(x).where(x > 0, x, 0 * x)  # NaN stays NaN.
 
 
 def _opaque(color: Array) -> Array:

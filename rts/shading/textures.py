@@ -12,7 +12,7 @@ from rts.arrays.trees import Array
 from rts.errors import InputError
 
 WRAPS = ("repeat", "mirror", "clamp")
-"""How a texture goes on outside [0, 1]."""
+"""Continuations of a texture outside [0, 1]."""
 
 
 def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: Array | None = None) -> Array:
@@ -22,8 +22,8 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
         texture: (h, w, C), row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w, v = 1 − (i + 0.5) / h.
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
         wrap: "repeat", "mirror" or "clamp" outside [0, 1].
-        footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one step from sample to sample: the texture is averaged over
-            about as much, by `mip_levels` and `level_of`. What is taken for it has no derivative. None for no average.
+        footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one step from sample to sample, without derivative. The
+            texture is averaged over roughly this area, by `mip_levels` and `level_of`. None for no average.
 
     Returns:
         (N, C).
@@ -56,10 +56,10 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
 
 
 def mip_levels(texture: Array) -> list[Array]:
-    """The texture (h, w, C) and its averages, each of half the height and width of the one before, to a single texel.
+    """The texture (h, w, C) and its averages, each of half the previous height and width, down to a single texel.
 
-    An odd number of lines n is halved to (n − 1) / 2, of which each averages n / ((n − 1) / 2) lines by the shares that
-    it covers: all levels have the mean of the texture. Differentiable.
+    An odd number of lines n is halved to (n − 1) / 2. Each of these averages n / ((n − 1) / 2) lines, by the shares
+    that it covers, so that all levels have the mean of the texture. Differentiable.
     """
     levels = [texture]
     while max(shape_of(levels[-1])[:2]) > 1:
@@ -70,9 +70,9 @@ def mip_levels(texture: Array) -> list[Array]:
 
 
 def level_of(footprint: Array, size: tuple[int, int]) -> Array:
-    """The level (N,) of a pyramid whose texels are as large as the longer side of the footprint: a real number.
+    """The level (N,), a real number, at which texels are as large as the longer side of the footprint.
 
-    0 is the texture itself, where a step from sample to sample is at most a texel; the last is a single texel.
+    Level 0 is the texture itself, for steps of at most a texel from sample to sample. The last is a single texel.
     Without derivative.
 
     Args:
@@ -101,15 +101,15 @@ def _halved(x: Array) -> Array:
 
 
 def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first: Array | None = None) -> Array:
-    """Bilinear lookup (N, C) in a table of the texels of one texture, line by line, or of several, one after the other.
+    """Bilinear lookup (N, C) in a table of texels: of one texture, line by line, or of several, one after the other.
 
     Args:
         flat: (M, C).
         uv: (N, 2).
         wrap: see `sample_texture`.
-        height: of the texture; where there are several, (N,) floats of uv's dtype.
-        width: as the height.
-        first: (N,) integers, the row of the table that is a texture's first; None for a single texture.
+        height: height of the texture; for several textures (N,) floats of uv's dtype.
+        width: width, in the same form.
+        first: (N,) integers, the table row of the texture's first texel; None for a single texture.
     """
     xp = namespace(flat, uv)
     columns = width if first is None else xp.astype(width, xp.int32)

@@ -1,4 +1,4 @@
-"""Entries of θ that nobody reads, such as a misspelt one: what an image lacks is not seen in it."""
+"""Entries of θ that nobody reads, such as misspelt ones; the image alone does not show the mistake."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from rts.shading.uv_footprints import FOOTPRINT
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
 SHADER_ENTRIES = ("color", "texture", "light", "specular", "shininess", "depth_range", "weights")
-"""Names that built-in surfaces and shaders give a meaning: files bring them, and not every shader reads them."""
+"""Names that built-in surfaces and shaders read. Files contain them, and not every shader reads them."""
 
 ATTRIBUTES = ("position", "normal", "uv", FOOTPRINT)
-"""What shaders read of the G-buffer alone, unlike "color"."""
+"""Names that are attributes of the G-buffer only; "color" may be an entry of θ, too."""
 
 ALIKE = 0.8
-"""The least ratio of `difflib` of two names that one may be meant by the other: "lights" and "light" have 0.9."""
+"""Similarity, by `difflib`, from which one name may be a misspelling of another: 0.9 for "lights" and "light"."""
 
 
 def shaded_by(part: CheckedPart) -> set[str] | None:
-    """The entries of θ that a part's shader says it reads; None if it does not say."""
+    """The entries of θ that a part's shader declares to read; None if it declares nothing."""
     return None if part.reads is None else set(part.reads).difference(ATTRIBUTES)
 
 
@@ -34,7 +34,7 @@ def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]
 
     Args:
         part: the part.
-        shaded: those that its shader reads; None where that is not known, so that none are found.
+        shaded: the entries that its shader reads; None if unknown, and then no entry counts as unread.
     """
     if shaded is None:
         return ()
@@ -43,17 +43,17 @@ def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]
 
 
 def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | None:
-    """The name that was likely to be meant by that of an entry that is not read, or None; arguments as in `unread`."""
+    """The name that an unread entry was probably meant to have, or None; arguments as in `unread`."""
     rest = dict(part.theta)
     value = rest.pop(name)
     shaped = (n for n in SURFACE_ENTRIES if n in part.surface.reads({**rest, n: value}))
-    # Who gives both means two things.
-    known = {*shaded, *shaped} - rest.keys()
-    return next(iter(difflib.get_close_matches(name.lower(), sorted(known), n=1, cutoff=ALIKE)), None)
+    # A name that θ has already is no candidate: the user means two things.
+    candidates = {*shaded, *shaped} - rest.keys()
+    return next(iter(difflib.get_close_matches(name.lower(), sorted(candidates), n=1, cutoff=ALIKE)), None)
 
 
 def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
-    """Warn of entries of θ that are not read, and whose names are almost those of others that would be."""
+    """Warn of unread entries of θ whose names almost match those of entries that would be read."""
     for index, part in enumerate(parts):
         shaded = shaded_by(part)
         for name in unread(part, shaded):
@@ -69,7 +69,7 @@ def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
 
 
 class Observed(Shader):
-    """A shader that notes which entries of θ another one reads.
+    """A wrapper of a shader that records the entries of θ that it reads.
 
     Attributes:
         read: the names so far.
@@ -80,12 +80,12 @@ class Observed(Shader):
         self.read: set[str] = set()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
-        """What the other gives."""
+        """The colours of the wrapped shader."""
         return self._shader(_Noting(theta, self.read), gbuffer, camera)
 
 
 class _Noting(dict):
-    """A dict that notes which names it is asked for, there or not; all of them, where it is gone through."""
+    """A dict that records every name looked up, present or not; iteration records all names."""
 
     def __init__(self, entries: Mapping[str, Any], read: set[str]):
         super().__init__(entries)

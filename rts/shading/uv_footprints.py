@@ -1,4 +1,4 @@
-"""How uv changes from sample to sample: the footprint of a cell on the texture, from the surface's own derivatives."""
+"""The footprint of a cell on the texture: changes of uv from sample to sample, by derivatives of the surface."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rts.operations.linear import affine_map
 from rts.scene.camera import Camera
 
 FOOTPRINT = "uv_footprint"
-"""The entry of the G-buffer."""
+"""Name of the attribute in the G-buffer."""
 LEAST = 1e-30
-"""What is less cannot be divided by."""
+"""Smallest divisor; smaller numbers are replaced by it."""
 
 
 def uv_footprint(
@@ -33,30 +33,30 @@ def uv_footprint(
 ) -> Array:
     """∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y (N, 4) for one cell to the right and one cell down; without derivative.
 
-    It is the derivative on the tangent plane of each sample, so that it looks at no other sample: outlines and seams of
-    uv have no effect. The surface is evaluated at parameters beside the sample's, `Surface.param_step` away; the
-    projection is differentiated exactly.
+    The derivative is taken on the tangent plane of each sample, without other samples: outlines and seams of uv have no
+    effect. The surface is evaluated at parameters `Surface.param_step` away from the sample's. The projection is
+    differentiated exactly.
 
     Args:
         surface: a surface of two parameters a sample.
-        theta: the entries that it reads.
+        theta: the entries that the surface reads.
         samples: the samples.
         gbuffer: "position" (N, 3), local space, and "uv" (N, 2) of the samples.
-        camera: of the grid, in the surface's local space.
-        grid: (height, width) of it.
+        camera: the camera of the grid, in the surface's local space.
+        grid: (height, width) of the grid of cells.
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants.
 
     Raises:
-        InputError: samples have not two parameters.
+        InputError: samples have another number of parameters than two.
     """
     if samples.params.shape[-1] != 2:
         raise InputError(
             f"{surface!r} has {samples.params.shape[-1]} parameters a sample; expected two: without them "
             f"{FOOTPRINT!r}, which mipmaps need, is not known"
         )
-    given = theta, camera, gbuffer["position"], gbuffer["uv"], samples.params
-    theta, camera, position, uv, params = (stopped(constants(x, engine, like)) for x in given)
+    arrays = theta, camera, gbuffer["position"], gbuffer["uv"], samples.params
+    theta, camera, position, uv, params = (stopped(constants(x, engine, like)) for x in arrays)
     xp = namespace(position)
     rows = camera.pixel_rows(grid)[:3, :]
     pixel = affine_map(rows, position)
@@ -64,7 +64,7 @@ def uv_footprint(
     moves, changes = [], []
     for i in range(2):
         axis = engine.constant(surface.param_step * np.eye(2)[i : i + 1], params)
-        # Towards the middle, so that the sample stays on its patch.
+        # A step towards the middle stays on the patch.
         steps = xp.where(params < 0.5, axis, -axis)
         beside = surface.evaluate(theta, replace(samples, params=params + steps))
         side = affine_map(linear, beside["position"] - position)
@@ -72,7 +72,7 @@ def uv_footprint(
         moves.append((side[:, :2] * pixel[:, 2:3] - pixel[:, :2] * side[:, 2:3]) / _safe(pixel[:, 2:3] ** 2))
         changes.append(beside["uv"] - uv)
     (ax, ay), (bx, by) = ((m[:, 0:1], m[:, 1:2]) for m in moves)
-    # Edge-on the determinant is zero: uv changes beyond all bounds.
+    # Where the surface is seen edge-on, the determinant is zero, and uv changes without bound.
     determinant = _safe(ax * by - ay * bx)
     along_x = changes[0] * by - changes[1] * ay
     along_y = changes[1] * ax - changes[0] * bx

@@ -1,6 +1,6 @@
 """The splatters in array-API code: the specification of the method, for any engine and device.
 
-The splatters registered by name (`rts_backends.fused`) inherit from these and run compiled code for arrays on the host.
+The splatters registered by name (`rts_backends.fused`) inherit from these and run compiled loops on the host.
 """
 
 from rts.splatting.kernel import Kernel, exact_calibration

@@ -1,4 +1,4 @@
-"""Images of any number of channels, by splatters that make images of three."""
+"""Images of any number of channels, from splatters that take three channels and alpha."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from rts.contracts.splatter import Splatter
 from rts.errors import InputError
 
 GROUP = 3
-"""Channels besides alpha that a splatter is given at once."""
+"""Number of channels, besides alpha, in one call of a splatter."""
 
 
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     """The image (h, w, C + 1) of splats without their border.
 
-    No channel has an effect on another, and alpha on all. So the splatter makes an image of each three channels and
-    alpha, filled up with zeros; alpha is that of the first.
+    Channels depend on alpha, but not on one another. So the splatter makes one image of every three channels and alpha,
+    filled up with zeros. The alpha of the first image is returned.
 
     Args:
         splatter: a splatter.
         splats: shaded samples; `rgba` is (N, C + 1), alpha last.
 
     Raises:
-        InputError: the splatter gave an image of another shape.
+        InputError: the splatter returned an image of another shape.
     """
     rgba = splats.rgba
     count = shape_of(rgba)[1] - 1

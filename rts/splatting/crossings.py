@@ -1,29 +1,29 @@
-"""How lines move where two surfaces pass through one another: there the derivative follows their depths.
+"""Motion of the lines where two surfaces pass through one another: the derivative follows their depths.
 
-On the line the depths of two sheets a and b are equal: g = z_a − z_b = 0. With ġ the difference of the rates at which
-their depths change at the fixed pixel, it moves as
+On such a line the depths of two sheets a and b are equal: g = z_a − z_b = 0. Let ġ be the difference of the rates at
+which their depths change at a fixed pixel. The line then moves as
 
     v̂ = −ġ ∇g / |∇g|²,    ż = dP_z − ∇z · dP_xy.
 
-Beside it the sheets are layers 0 and 1 of the cells, in one order on either side. With q a cell, m one of the eight
-steps to its neighbours and p = q + m, both with two layers z0 and z1 and gaps h = z1 − z0,
+Beside the line the sheets are layers 0 and 1 of the cells, in opposite orders on its two sides. Let q be a cell, m one
+of the eight steps to its neighbours and p = q + m. Both have two layers z0 and z1, with gaps h = z1 − z0. Then
 
-    R = |z0(q − m) − 2 z0(q) + z1(p)| + |z1(q − m) − 2 z1(q) + z0(p)| + the two of p, seen from the other side,
+    R = |z0(q − m) − 2 z0(q) + z1(p)| + |z1(q − m) − 2 z1(q) + z0(p)| + the two terms of p, from the other side,
     D = |z0(q − m) − 2 z0(q) + z0(p)| + |z1(q − m) − 2 z1(q) + z1(p)| + ...
 
-is by how much slopes change if the line runs between q and p, and if it does not. Of a side that lacks two layers the
-other's terms count twice. (q, p) is a pair where R < D / 2, R < (h(q) + h(p)) / 2, and R / (h(q) + h(p)) is least along
-m. On planes R is zero.
+are the changes of slope if the line runs between q and p (R), and if it does not (D). If one side lacks two layers, the
+terms of the other count twice. (q, p) is a pair where R < D / 2, R < (h(q) + h(p)) / 2, and R / (h(q) + h(p)) is least
+along m. On planes R is zero.
 
-The sources of a covered target q of a pair are of b where they form a pair with q, and else of a where they are paired
-front to front with it. ∇z_a and ∇z_b are differences over q's neighbours in its row and column. A source of neither, if
-it has two layers, is of the sheet whose plane is nearer. Where all nine are of a sheet the image's derivative in
-positions is that of
+Let q be a covered target of a pair. A source belongs to b if it forms a pair with q. Otherwise it belongs to a if it is
+paired front to front with q. ∇z_a and ∇z_b are differences over q's neighbours in its row and column. Any other source
+with two layers belongs to the sheet whose plane is nearer. Where all nine sources belong to a sheet, the image's
+derivative in positions is that of
 
     (Ŵ_a c_a + Ŵ_b c_b) / (Ŵ_a + Ŵ_b),    c = Σ w rgba / Σ w over the fronts of one sheet:
 
-coverage Ŵ moves with the line, mean colours with their samples. Its value, and its derivative in colours, are what they
-were.
+coverage Ŵ moves with the line, mean colours with their samples. The image's value, and its derivative in colours, stay
+as they are.
 """
 
 from __future__ import annotations
@@ -42,26 +42,26 @@ from rts.splatting.kernel import TIE, Kernel
 from rts.splatting.layers import AROUND, NEIGHBOURS, Layers, Steps, opposite
 
 LARGEST = 0.5
-"""R in terms of h(q) + h(p), below which the sheets are straight enough."""
+"""Bound of R / (h(q) + h(p)) for sheets that are straight enough."""
 DIRECT = 0.5
-"""R in terms of D, below which the sheets are in another order."""
+"""Bound of R / D below which the sheets change their order."""
 FIT = 0.5
-"""How far a source may be from the planes of both sheets, in terms of the change of g on the way."""
+"""Largest distance of a source from the planes of both sheets, relative to the change of g on the way."""
 KEPT = 2
-"""Cells around what may be a pair whose first two layers are kept."""
+"""Cells around a possible pair in which the first two layers are kept."""
 SLACK = 0.01
-"""Rounding of depths, in terms of the least sum of gaps of a pair."""
+"""Allowance for rounding of depths, relative to the least sum of gaps of a pair."""
 
 HALF = [(1, 0), (0, 1), (1, 1), (1, -1)]
 """Steps from one cell of each pair to the other."""
 
 
 class Lines(NamedTuple):
-    """Targets whose derivative in positions follows a line, and what is decided for them.
+    """Targets whose derivative in positions follows a line, with the sheets of their sources.
 
     Attributes:
-        target: (H, W) bool, which these are.
-        other: for each offset from source to target but (0, 0), where the source is of sheet b (H, W).
+        target: (H, W) bool, true for these targets.
+        other: for each offset from source to target but (0, 0), (H, W) bool, true where the source is of sheet b.
         slopes: (∂x, ∂y) of the sheets a and b, (H, W) each.
     """
 
@@ -70,21 +70,21 @@ class Lines(NamedTuple):
     slopes: list[tuple[Array, Array]]
 
     def sums(self, values: Callable[[int, int], Array]) -> list[Array]:
-        """The sum over each sheet of values (H, W, ·) of sources, which are given by the offset from them."""
-        found: list[Any] = [0.0, 0.0]
+        """The sums, over the sources of each sheet, of `values(u, v)` (H, W, ·) for offsets from source to target."""
+        totals: list[Any] = [0.0, 0.0]
         for n in NEIGHBOURS:
-            given, other = values(*n), self.other[n] if n in self.other else self.target & False
+            value, other = values(*n), self.other[n] if n in self.other else self.target & False
             for i, here in enumerate((self.target & ~other, self.target & other)):
-                found[i] = found[i] + namespace(given).where(here[..., None], given, 0.0)
-        return found
+                totals[i] = totals[i] + namespace(value).where(here[..., None], value, 0.0)
+        return totals
 
 
 def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
-    """How lines move the image: zeros (H, W, 4) with derivatives in positions.
+    """The change of the image as lines move: zeros (H, W, 4) with derivatives in positions.
 
     Args:
         kernel: the splatter.
-        layers: its samples, of at least two layers.
+        layers: the samples, of at least two layers.
         lines: see `targets`.
     """
     xp, target = layers.xp, lines.target
@@ -98,8 +98,8 @@ def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
     still = stopped(xp.stack(kernel.offsets(layers.position[0]), axis=-1))
 
     coverage = lines.sums(lambda u, v: kernel.weight(layers.at(still, u, v) + kernel.gamma * line, u, v)[..., None])
-    given = lines.sums(lambda u, v: stopped(layers.color(0, u, v)) * layers.weight(0, u, v)[..., None])
-    means = [g[..., :4] / xp.where(target[..., None], g[..., 4:], 1.0) for g in given]
+    weighted = lines.sums(lambda u, v: stopped(layers.color(0, u, v)) * layers.weight(0, u, v)[..., None])
+    means = [g[..., :4] / xp.where(target[..., None], g[..., 4:], 1.0) for g in weighted]
     total = xp.where(target[..., None], coverage[0] + coverage[1], 1.0)
     mixed = sum(w / total * mean for w, mean in zip(coverage, means, strict=True))
     return xp.where(target[..., None], mixed - stopped(mixed), 0.0)
@@ -117,14 +117,14 @@ def targets(layers: Layers, shift: dict[Steps, Array], crosses: dict[Steps, Arra
     # By the step from the target to the source.
     swapped = dict(crosses)
     same = {m: ~crosses[m] & (shift[opposite(m)] == 0) & layers.covers(*opposite(m)) for m in AROUND}
-    slopes, known = [], two & functools.reduce(operator.or_, crosses.values())
+    slopes, has_slope = [], two & functools.reduce(operator.or_, crosses.values())
     for first, second in (z, reversed(z)):
-        found = [_slope(first, second, m, two, same, swapped) for m in ((1, 0), (0, 1))]
-        slopes.append(tuple(s for s, _ in found))
-        known = known & found[0][1] & found[1][1]
+        along_x, along_y = (_slope(first, second, m, two, same, swapped) for m in ((1, 0), (0, 1)))
+        slopes.append((along_x[0], along_y[0]))
+        has_slope = has_slope & along_x[1] & along_y[1]
     (ax, ay), (bx, by) = slopes
     square = (ax - bx) * (ax - bx) + (ay - by) * (ay - by)
-    target = known & (square > 0)
+    target = has_slope & (square > 0)
     for m in AROUND:
         near, far = ahead(z[0], m, 0.0), ahead(z[1], m, 0.0)
         a, b = z[0] + ax * m[0] + ay * m[1], z[1] + bx * m[0] + by * m[1]
@@ -135,7 +135,7 @@ def targets(layers: Layers, shift: dict[Steps, Array], crosses: dict[Steps, Arra
         swapped[m] = swapped[m] | (free & (crossed < straight))
         target = target & (same[m] | swapped[m])
     lines = Lines(target, {opposite(m): b for m, b in swapped.items()}, slopes)
-    # Weights may vanish, of samples that are not where they were cast.
+    # Samples that moved far from their cells may have zero weights.
     a, b = lines.sums(lambda u, v: stopped(layers.color(0, u, v)[..., 4:] * layers.weight(0, u, v)[..., None]))
     return lines._replace(target=target & (a[..., 0] > 0) & (b[..., 0] > 0))
 
@@ -147,28 +147,28 @@ def pairs_of(layers: Layers) -> dict[Steps, Array]:
 
 
 def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps, Array]:
-    """Between which cells lines of crossing run: for each step m, cells q (H, W) of pairs (q, q + m).
+    """Pairs of cells between which lines of crossing run: for each step m, cells q (H, W) of pairs (q, q + m).
 
     Args:
         z0: depths of the first layer (H, W), finite.
-        z1: of the second.
-        two: where there are both.
-        extent: of the fronts' depths, the camera's included.
+        z1: depths of the second layer (H, W), finite.
+        two: (H, W) bool, true where both layers are covered.
+        extent: range of the fronts' depths, the camera's included.
     """
-    xp, found = namespace(two, z0), {}
+    xp, starts = namespace(two, z0), {}
     ratios = {m: _ratio(z0, z1, two, TIE * extent, m) for m in HALF}
     for m, ratio in ratios.items():
         back = opposite(m)
         least = (ratio < ahead(ratio, back, xp.inf)) & (ratio <= ahead(ratio, m, xp.inf))
-        found[m] = least & (ratio < LARGEST)
-        found[back] = ahead(found[m], back, False)
-    return {m: found[m] for m in AROUND}
+        starts[m] = least & (ratio < LARGEST)
+        starts[back] = ahead(starts[m], back, False)
+    return {m: starts[m] for m in AROUND}
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """The first two layers (K, H, W) near what may be pairs, of covered (K, H, W) bool and depth (K, H, W).
+    """The first two layers (K, H, W) near possible pairs, from covered (K, H, W) bool and depth (K, H, W).
 
-    Whatever other hidden layers are left out, `pairs` finds the same.
+    `pairs` gives the same result if other hidden layers are left out.
     """
     if len(covered) < 2 or not covered[1].any():
         return covered & False
@@ -178,15 +178,15 @@ def sheets(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
     first, second = np.where(two, depth[:2], 0)
     near = two & False
     for m in HALF:
-        found = _candidates(first, second, two, TIE * extent, m)
-        near = near | found | ahead(found, opposite(m), False)
+        starts = _candidates(first, second, two, TIE * extent, m)
+        near = near | starts | ahead(starts, opposite(m), False)
     for _ in range(KEPT):
         near = near | np.logical_or.reduce([ahead(near, m, False) for m in AROUND])
     return covered & near & (np.arange(len(covered)) < 2)[:, None, None]
 
 
 def ahead(cells: Array, steps: Steps, value: float) -> Array:
-    """For each cell of (H, W), the one that lies some steps (x, y) farther on; a value outside of the array."""
+    """For each cell of (H, W), the cell some steps (x, y) farther on; `value` outside of the array."""
     xp = namespace(cells)
     for axis, step in ((1, steps[0]), (0, steps[1])):
         if step:
@@ -200,21 +200,21 @@ def ahead(cells: Array, steps: Steps, value: float) -> Array:
 
 
 def _depths(layers: Layers) -> tuple[list[Array], Array]:
-    """Depths (H, W) of the first two layers without derivative, and where there are both."""
+    """Depths (H, W) of the first two layers without derivative, and a mask of the cells with both."""
     two = layers.at(layers.covered[1], 0, 0)
     return [stopped(layers.xp.where(two, layers.target[k], 0.0)) for k in (0, 1)], two
 
 
 class _Step(NamedTuple):
-    """Two cells of two layers each, q and the one p a step farther on, with what lies beyond them.
+    """Two cells of two layers each, q and p one step farther on, and the cells on either side of them.
 
     Attributes:
-        both: (H, W) bool, where these are.
+        both: (H, W) bool, true for q where q and p have two layers.
         gaps: h(q) + h(p), (H, W).
-        before: where the cell before q has two layers, too.
-        after: where the one after p does.
-        changes: q's share of R, and p's.
-        directs: q's share of D, and p's.
+        before: (H, W) bool, true where the cell before q has two layers, too.
+        after: (H, W) bool, true where the cell after p has two layers, too.
+        changes: the share of q in R, and that of p.
+        directs: the share of q in D, and that of p.
     """
 
     both: Array
@@ -226,7 +226,7 @@ class _Step(NamedTuple):
 
 
 def _step(z0: Array, z1: Array, two: Array, m: Steps) -> _Step:
-    """All cells and those a step m farther on."""
+    """The record of all cells q and the cells p = q + m."""
     xp, back, twice = namespace(two, z0), opposite(m), (2 * m[0], 2 * m[1])
     (b0, b1), (p0, p1), (f0, f1) = ((ahead(z0, n, 0.0), ahead(z1, n, 0.0)) for n in (back, m, twice))
     gap = z1 - z0
@@ -247,7 +247,7 @@ def _step(z0: Array, z1: Array, two: Array, m: Steps) -> _Step:
 
 
 def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> Array:
-    """R / (h(q) + h(p)) of cells and those a step m farther on; infinity where they are no pair."""
+    """R / (h(q) + h(p)) for all cells q and p = q + m; infinity where they are no pair."""
     xp, step = namespace(two, z0), _step(z0, z1, two, m)
     before, after = step.before, step.after
 
@@ -261,35 +261,36 @@ def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> 
 
 
 def _candidates(z0: np.ndarray, z1: np.ndarray, two: np.ndarray, least: float, m: Steps) -> np.ndarray:
-    """Cells q (H, W) that may form a pair with q + m, whichever of the cells beyond these two have two layers.
+    """Cells q (H, W) that may form a pair with q + m, whether or not the cells beyond these two have two layers.
 
-    Rounding decides nothing: pairs are found among depths of another precision.
+    `SLACK` allows for rounding, since pairs are computed from depths of another precision.
     """
     step, slack = _step(z0, z1, two, m), SLACK * least
     (change0, change1), (direct0, direct1) = step.changes, step.directs
-    found = two & False
-    for known, change, direct in (
+    candidates = two & False
+    for complete, change, direct in (
         (step.before, change0 + change0, direct0 + direct0),
         (step.after, change1 + change1, direct1 + direct1),
         (step.before & step.after, change0 + change1, direct0 + direct1),
     ):
-        found = found | (known & (change < DIRECT * direct + slack) & (change < LARGEST * step.gaps + slack))
-    return found & step.both & (step.gaps > least - slack)
+        straight = (change < DIRECT * direct + slack) & (change < LARGEST * step.gaps + slack)
+        candidates = candidates | (complete & straight)
+    return candidates & step.both & (step.gaps > least - slack)
 
 
 def _slope(
     first: Array, second: Array, m: Steps, two: Array, same: dict[Steps, Array], swapped: dict[Steps, Array]
 ) -> tuple[Array, Array]:
-    """Slope along a step of a sheet that is `first` at the target and `second` beyond the line; and where it is known.
+    """Slope along a step, of a sheet that is `first` at the target and `second` beyond the line; and a mask of slopes.
 
-    It is that of both sides' differences, or of the one there is.
+    The slope is the mean of the differences on both sides, or the one that exists.
     """
-    xp, changes, known = namespace(two, first), [], []
+    xp, changes, exists = namespace(two, first), [], []
     for sign in (1, -1):
         n = sign * m[0], sign * m[1]
         there = xp.where(swapped[n], ahead(second, n, 0.0), ahead(first, n, 0.0))
         changes.append(sign * (there - first))
-        known.append((same[n] | swapped[n]) & ahead(two, n, False))
+        exists.append((same[n] | swapped[n]) & ahead(two, n, False))
     mean = (changes[0] + changes[1]) / 2
-    slope = xp.where(known[0] & known[1], mean, xp.where(known[0], changes[0], changes[1]))
-    return slope, known[0] | known[1]
+    slope = xp.where(exists[0] & exists[1], mean, xp.where(exists[0], changes[0], changes[1]))
+    return slope, exists[0] | exists[1]

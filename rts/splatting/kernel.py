@@ -1,7 +1,7 @@
-"""The kernel of the splatters (paper §3.3): which cells a sample goes to, and with what weight.
+"""The kernel of the splatters (paper §3.3): the target cells of a sample, and its weights there.
 
 A splat belongs to the cell (y, x) that its sample was cast through; its targets are that cell's 3 × 3 neighbours,
-whatever its computed position. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
+for any computed position. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
 and (u, v) ∈ {−1, 0, 1}², the weight is
 
     w(u, v) = (1 + ε) / W · exp(−‖c + (u, v) − P‖² / 2σ²),    W = Σ exp(−‖(u, v)‖² / 2σ²).
@@ -32,20 +32,20 @@ from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, check_ro
 SIGMA, EPSILON = 0.5, 0.05
 LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e3
 TIE, LEAST_EPSILON = 1.5e-4, 1e-4
-"""Depths that differ by less, relative to the farthest, may be ordered by rounding, unless coordinates are larger than
-`rts.sampling.packing.FAR` says; the ε outweighs the rounding of weights."""
+"""TIE is the difference of depths, relative to the farthest, below which rounding may decide their order. It holds for
+coordinates up to `rts.sampling.packing.FAR`. LEAST_EPSILON is the least ε that outweighs the rounding of weights."""
 
 
 @dataclass(frozen=True)
 class Kernel(Splatter):
-    """What the splatters share: a Gaussian over 3 × 3 cells.
+    """Base class of the splatters with a Gaussian kernel over 3 × 3 cells.
 
     Attributes:
         sigma: standard deviation, cells (pixels without supersampling). Below 0.45 little of the kernel reaches the
             neighbouring cells, and most of the derivative at edges is lost.
         epsilon: excess of the weights' sum over one, so that the interior is always normalised.
         calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c). It leaves the image of
-            samples on pixel centres as it is, and multiplies its derivative. None for the γ of `exact_calibration`.
+            samples on pixel centres unchanged, and multiplies its derivative. None for the γ of `exact_calibration`.
     """
 
     sigma: float = SIGMA
@@ -70,7 +70,7 @@ class Kernel(Splatter):
 
     @staticmethod
     def check(row: Array, count: int, settled: Array | None = None, exits: Array | None = None) -> None:
-        """Refuse fields of `Splats` that name none of so many samples, before compiled code reads there."""
+        """Refuse fields of `Splats` that name no sample below `count`, before compiled loops read there."""
         check_rows(row, count)
         if exits is not None:
             check_rows(exits, count)
@@ -94,7 +94,7 @@ class Kernel(Splatter):
 
     @abc.abstractmethod
     def plain(self, depths: Depths, margin: float) -> Array:
-        """Targets (H, W) at which only front layers count, however depths are rounded within a margin."""
+        """Targets (H, W) at which only front layers count, for any rounding of depths within a margin."""
 
     @functools.cached_property
     def gamma(self) -> float:
@@ -102,7 +102,7 @@ class Kernel(Splatter):
         return exact_calibration(self.sigma) if self.calibration is None else self.calibration
 
     def offsets(self, position: Array) -> tuple[Array, Array]:
-        """Calibrated offsets (x, y) of samples from the centres of cells (h, w), of which the first is (−1, −1)."""
+        """Calibrated offsets (x, y) of samples from the centres of cells (h, w); the first cell is (−1, −1)."""
         height, width = position.shape[:2]
         constant = engine_of(position).constant
         return (
@@ -111,7 +111,7 @@ class Kernel(Splatter):
         )
 
     def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
-        """Factors (x, y) of the weights w(u, v) = x[u] · y[v] of cells (h, w), of which the first is (−1, −1)."""
+        """Factors (x, y) of the weights w(u, v) = x[u] · y[v] of cells (h, w); the first cell is (−1, −1)."""
         rx, ry = self.offsets(position)
         return {u: self._factor(u - rx) for u in OFFSETS}, {v: self._factor(v - ry) for v in OFFSETS}
 
@@ -120,14 +120,14 @@ class Kernel(Splatter):
         return self._factor(u - offset[..., 0]) * self._factor(v - offset[..., 1])
 
     def _factor(self, distance: Array) -> Array:
-        """A weight's factor for the distance along one axis."""
+        """The factor of a weight along one axis, for a distance."""
         scale = 1 / (2 * self.sigma**2)
         peak = math.sqrt(1 + self.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         return peak * namespace(distance).exp(-(distance**2) * scale)
 
 
 def settled(image: Array, splats: Splats) -> Array:
-    """The image of all cells (H, W, 4), with the colours of samples that settled cells show."""
+    """The image (H, W, 4), in which cells of `Splats.settled` show the colours of their samples."""
     if splats.settled is None:
         return image
     check_settled(splats.settled, image.shape[:2], splats.rgba.shape[0])
@@ -137,11 +137,11 @@ def settled(image: Array, splats: Splats) -> Array:
 
 
 def exact_calibration(sigma: float, reach: int = 1) -> float:
-    """The factor γ on splats' offsets with which a linear ramp of colour that moves has its true derivative.
+    """The factor γ on splats' offsets with which a moving linear ramp of colour has its true derivative.
 
-    For weights exp(−‖c + (u, v) − P‖² / 2σ²), normalised for samples on centres, of a splat at P in the cell with the
-    centre c, whose offset is to be multiplied: P' = c + γ (P − c). Without γ the first moment of the kernel's
-    derivative, 1/γ (0.852 for σ = 0.5), is the share that is delivered.
+    Weights are exp(−‖c + (u, v) − P‖² / 2σ²), normalised for samples on centres, for a splat at P in the cell with the
+    centre c. The calibrated offset is P' = c + γ (P − c). Without γ only a share of the derivative arrives: the first
+    moment of the kernel's derivative, 1/γ (0.852 for σ = 0.5).
 
     Args:
         sigma: σ, pixels.

@@ -1,4 +1,4 @@
-"""The layers of an image as its targets see them: depths, pairing, accumulation, compositing."""
+"""The layers around each target of an image: depths, pairing, accumulation, compositing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Steps = tuple[int, int]
 
 
 def check_rows(row: Array, count: int, name: str = "row") -> None:
-    """Raise an InputError where rows, on the host and not traced, refer to none of so many samples."""
+    """Raise an InputError if rows, on the host and not traced, name a sample that is not below `count`."""
     value = known_value(row)
     if value is None or not value.size:
         return
@@ -37,7 +37,7 @@ def check_rows(row: Array, count: int, name: str = "row") -> None:
 
 
 def check_settled(settled: Array, shape: tuple[int, ...], count: int) -> None:
-    """Raise an InputError where `Splats.settled` is not of a grid's shape, or names none of so many samples."""
+    """Raise an InputError if `Splats.settled` has not the grid's shape, or names a sample that is not below `count`."""
     if tuple(settled.shape) != tuple(shape):
         raise InputError(f"settled has shape {tuple(settled.shape)}; expected {tuple(shape)}, as row says")
     if not namespace(settled).isdtype(settled.dtype, "signed integer"):
@@ -48,13 +48,13 @@ def check_settled(settled: Array, shape: tuple[int, ...], count: int) -> None:
 
 
 class Depths:
-    """Depths of an image with a border of one empty cell, as seen from targets; (u, v) leads from source to target."""
+    """Depths of an image with a border of one empty cell, by target; (u, v) leads from source to target."""
 
     def __init__(self, depth: list[Array], covered: Array, facing: list[Array] | None = None):
-        """Depths of each layer (h, w), finite, where they are covered (K, h, w), and `Splats.facing`, with the border.
+        """Depths of each layer (h, w), finite, a mask of covered ones (K, h, w), and `Splats.facing`, with the border.
 
-        Without the last, any two layers may pair. `extent` is that of the fronts' depths, since hidden samples may have
-        been left out.
+        Without `facing`, any two layers may pair. `extent` is the range of the fronts' depths, since hidden samples may
+        have been left out.
         """
         self.xp = namespace(covered, depth[0])
         self.size = covered.shape[1] - 2, covered.shape[2] - 2
@@ -65,11 +65,11 @@ class Depths:
         self.target = self.source(0, 0)
 
     def behind(self, depth: Array) -> Array:
-        """How far depths (h, w), with the border, lie behind the fronts."""
+        """Distance of depths (h, w), with the border, behind the fronts."""
         return depth - self._depth[0]
 
     def front(self, u: int, v: int) -> tuple[Array, Array]:
-        """Depth of the front from whose cell (u, v) leads to each target, up to two cells away, and if there is one."""
+        """Depth, and a mask, of the fronts at offset (u, v) from each target; up to two cells away."""
         depth, covered = (self.at(x, u, v, border=2) for x in self._front)
         return depth, covered
 
@@ -78,14 +78,14 @@ class Depths:
         return [self.at(z, u, v) for z in self._depth]
 
     def covers(self, u: int, v: int) -> Array:
-        """Whether the sources have any layer."""
+        """True where the sources have any layer, (H, W)."""
         return self.at(self.covered[0], u, v)
 
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
-        """The number s of `Multi`, and the distance of the depths that it pairs, (H, W) both.
+        """The number s of `Multi`, and the distance of the paired depths, (H, W) both.
 
         A hidden layer does not pair with a front that is the other side of its piece. The last of K layers may stand
-        for what is not known behind it, but only towards fronts that lie behind it.
+        for unknown layers behind it, but only towards fronts that lie behind it.
         """
         source, xp = self.source(u, v), self.xp
         ahead, below = [xp.abs(z - self.target[0]) for z in source], [xp.abs(z - source[0]) for z in self.target]
@@ -100,7 +100,7 @@ class Depths:
         return xp.where(best_b < best_a, -b, a), xp.minimum(best_a, best_b)
 
     def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
-        """Whether the fronts are nearer, by a margin, than a front and a hidden layer; and the least such distance."""
+        """True where the fronts are nearer, by a margin, than a front and a hidden layer; also the least distance."""
         source, xp = self.source(u, v), self.xp
         front, hidden = xp.abs(source[0] - self.target[0]), xp.full_like(source[0], xp.inf)
         for p, q in zip(source[1:], self.target[1:], strict=True):
@@ -108,20 +108,20 @@ class Depths:
         return front + margin < hidden, xp.minimum(front, hidden)
 
     def continues(self, u: int, v: int, limit: Array) -> Array:
-        """Whether one front, the source's or the target's, lies on the line through the other and its next cell.
+        """True where one front, the source's or the target's, lies on the line through the other and its next cell.
 
-        It may be off the line by less than `limit`.
+        The distance from the line must be less than `limit`.
         """
         xp = self.xp
         source, target = self.at(self._depth[0], u, v), self.target[0]
-        found = xp.zeros_like(target, dtype=xp.bool)
+        continued = xp.zeros_like(target, dtype=xp.bool)
         for end, start, steps in ((source, target, -1), (target, source, 2)):
             before, covered = self.front(steps * u, steps * v)
-            found = found | (covered & (xp.abs(end - (2 * start - before)) < limit))
-        return found
+            continued = continued | (covered & (xp.abs(end - (2 * start - before)) < limit))
+        return continued
 
     def at(self, cells: Array, u: int, v: int, border: int = 1) -> Array:
-        """For each target, the cell from which (u, v) leads to it; (u, v) reaches as far as the border is wide."""
+        """For each target, the cell from which (u, v) leads to it; |u| and |v| are at most `border`."""
         top, left = border - v, border - u
         return cells[top : top + self.size[0], left : left + self.size[1], ...]
 
@@ -130,12 +130,12 @@ class Layers(Depths):
     """`Depths` with weights and colours.
 
     Attributes:
-        position: of each layer (h, w, 3), of any value where it is not covered.
-        exit: the cells with an exit (h, w), and its position (h, w, 3), see `Splats`; or None.
+        position: for each layer (h, w, 3); any value where the layer is not covered.
+        exit: a mask of the cells with an exit (h, w), and its position (h, w, 3), see `Splats`; or None.
     """
 
     def __init__(self, weights: Callable[[Array], Any], splats: Splats, facing: Array | None = None):
-        """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`, `facing` of the splats or None."""
+        """Layers of packed samples; `weights` is `Kernel.weights`, `facing` is `Splats.facing` or None."""
         check_rows(splats.row, splats.positions.shape[0])
         cells = bordered(splats.row)
         every = [cells[k] for k in range(splats.row.shape[0])]
@@ -145,32 +145,32 @@ class Layers(Depths):
             check_rows(splats.exit, splats.positions.shape[0])
             exits = bordered(splats.exit[None])[0]
             self.exit = exits >= 0, unpack(splats.positions, exits)
-        told = None if facing is None else list(bordered(facing, 0))
-        super().__init__([p[..., 2] for p in self.position], cells >= 0, told)
+        sides = None if facing is None else list(bordered(facing, 0))
+        super().__init__([p[..., 2] for p in self.position], cells >= 0, sides)
         self._color = [_weighted(unpack(splats.rgba, c), (c >= 0)[..., None]) for c in every]
         self._weights = [weights(p) for p in self.position]
 
     def splats(self, u: int, v: int, still: Array | None = None) -> list[Array]:
-        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight.
+        """Splats of the sources' layers, K times (H, W, 5): weighted colours and the weight.
 
         Args:
             u: along x.
             v: along y.
-            still: (H, W), targets at which no weight has a derivative; None for none.
+            still: (H, W) bool, targets at which weights have no derivative; None for none.
         """
-        found = []
+        splats = []
         for k in range(len(self._color)):
             weight = self.weight(k, u, v)
             weight = weight if still is None else self.xp.where(still, stopped(weight), weight)
-            found.append(self.color(k, u, v) * weight[..., None])
-        return found
+            splats.append(self.color(k, u, v) * weight[..., None])
+        return splats
 
     def color(self, k: int, u: int, v: int) -> Array:
-        """Colours of the sources' layer k, and one (H, W, 5); zeros where it is not covered."""
+        """Colours of the sources' layer k with a 1 appended, (H, W, 5); zeros where it is not covered."""
         return self.at(self._color[k], u, v)
 
     def weight(self, k: int, u: int, v: int) -> Array:
-        """Weights of the sources' layer k (H, W); of any value where it is not covered."""
+        """Weights of the sources' layer k (H, W); any value where it is not covered."""
         wx, wy = self._weights[k]
         return self.at(wx[u] * wy[v], u, v)
 
@@ -183,14 +183,14 @@ def nothing(rgba: Array, row: Array) -> Array:
 
 
 def unpack(values: Array, cells: Array) -> Array:
-    """(h, w, C) of packed values (N, C); an empty cell gets those of row 0, to be masked."""
+    """(h, w, C) of packed values (N, C). An empty cell gets values of row 0, to be masked."""
     xp = namespace(values, cells)
     index = xp.reshape(xp.where(cells >= 0, cells, 0), (-1,))
     return xp.reshape(xp.take(values, index, axis=0), (*cells.shape, values.shape[1]))
 
 
 def bordered(cells: Array, value: int = -1) -> Array:
-    """Cells (K, H, W) with a border of one cell of a value."""
+    """Cells (K, H, W) with a border, one cell wide, filled with `value`."""
     xp = namespace(cells)
     side = xp.full_like(cells[:, :, :1], value)
     cells = xp.concat([side, cells, side], axis=2)
@@ -205,15 +205,15 @@ def _weighted(rgba: Array, covered: Array) -> Array:
 
 
 def normalised(total: Array, xp: Any) -> Array:
-    """Accumulated colours over their weights, which are taken as at least one (paper eq. 3)."""
+    """Accumulated colours over their weights, or over one where weights are less (paper eq. 3)."""
     return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
 
 
 def _beyond(depth: list[Array], covered: Array) -> list[Array]:
     """Depths of each layer, finite where it is not covered.
 
-    An empty cell lies beyond everything, at a distance of the scene's own scale. It is at least as far from any layer
-    as two layers are from each other, so that none pairs with it for being near.
+    An empty cell lies beyond all layers, at a distance of the scene's own scale. It is at least as far from any layer
+    as two layers are from each other, so that no layer pairs with it.
     """
     xp = namespace(covered, depth[0])
     extent = _extent(xp.stack(depth), covered)
@@ -222,26 +222,26 @@ def _beyond(depth: list[Array], covered: Array) -> list[Array]:
 
 
 def _extent(depth: Array, covered: Array) -> Array:
-    """The extent of the depths that are covered, the camera's included."""
+    """The range of the covered depths, the camera's included."""
     xp = namespace(covered, depth)
     depth = xp.where(covered, depth, 0.0)
     return xp.clip(xp.max(depth), 0.0, None) - xp.clip(xp.min(depth), None, 0.0)
 
 
 def opposite(n: Steps) -> Steps:
-    """The steps that lead back."""
+    """The reversed steps."""
     return -n[0], -n[1]
 
 
 def dilated(cells: np.ndarray) -> np.ndarray:
-    """Cells (H, W), bool or uint8, and those beside them."""
+    """Cells (H, W), bool or uint8, and the eight cells around each."""
     wide = np.pad(cells, ((1, 1), (0, 0)))
     wide = np.pad(wide[:-2] | wide[1:-1] | wide[2:], ((0, 0), (1, 1)))
     return wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
 
 
 def all_of(conditions: list[Array]) -> Array:
-    """Where all of the conditions hold, of which there is at least one."""
+    """True where all conditions hold; at least one is given."""
     return functools.reduce(operator.and_, conditions)
 
 
@@ -251,14 +251,14 @@ def fronts(covered: np.ndarray) -> np.ndarray:
 
 
 def _opposite(hidden: Array, front: Array, behind: Array) -> Array:
-    """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
+    """True where a hidden layer is the other side of a front's piece, and stands for no unknown layers behind it."""
     xp, bit = namespace(front), Cells.MORE_BEHIND
     other = (front != 0) & (hidden == -front)
     return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, bit, -bit)))
 
 
 def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
-    """Index and value of the first smallest of some images."""
+    """Index and value of the smallest of several images, per cell; the first of equal ones."""
     best, index = values[0], xp.zeros_like(values[0], dtype=xp.int32)
     for k, value in enumerate(values[1:], start=1):
         smaller = value < best
@@ -267,7 +267,7 @@ def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
 
 
 def nearest(source: list[Array], depth: Array, s: Array, xp: Any) -> Array:
-    """Index of each source's layer beyond s that is nearest to a depth; K where it has none."""
+    """Index of each source's layer beyond s that is nearest to a depth; K where no layer is beyond s."""
     best, index = xp.full_like(depth, xp.inf), xp.full_like(s, len(source))
     for k, z in enumerate(source[1:], start=1):
         distance = xp.abs(z - depth)

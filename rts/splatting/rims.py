@@ -1,14 +1,15 @@
-"""How outlines move: coverage has a motion of its own, extrapolated from samples to the outline beside them.
+"""Motion of outlines: coverage moves by itself, extrapolated from samples to the outline beside them.
 
-A sample lies up to a pixel or two inside of the outline that its weights stand for. Where the surface turns, it moves
-faster than the outline: on a rim of radius R pixels, a sample δ pixels inside is nearer by √(2Rδ). So coverage moves as
+A sample lies up to a pixel or two inside of the outline that its weights represent. Where the surface turns, the sample
+moves faster than the outline: on a rim of radius R pixels, a sample δ pixels inside is nearer by √(2Rδ). So coverage
+moves as
 
     P̂ = P in value,    dP̂(p) = dP(p) + β (dP(p) − dP(partner)),
 
 in x and y, where β and the partner of each cell p are decisions without a derivative. Directions n lead from a cell to
-its eight neighbours. One is off where p + n is empty or not paired front to front with p; usable where n is off, −n is
-not, and p₁ = p − n is covered; deep where p₂ = p − 2n continues the surface, too, and the depths of the three fall off
-as those of a smooth rim do. In order:
+its eight neighbours. A direction is off if p + n is empty or not paired front to front with p. It is usable if n is
+off, −n is not, and p₁ = p − n is covered. It is deep if p₂ = p − 2n continues the surface, too, and the depths of all
+three fall off as on a smooth rim. The first rule that applies decides:
 
 - Chord: p has an exit, where the ray leaves the closed part that it met, or else a second layer of the same part; and
   the square of the gap behind its front runs to zero along a usable direction. The partner is that exit or layer,
@@ -17,7 +18,7 @@ as those of a smooth rim do. In order:
   steps of n; with r = (z(p) − z(p₁)) / (z(p₁) − z(p₂)) then √e / (√(1 + e) − √e) = (1 + 2r − r²) / 2r (r − 1) = β.
 - Line: there is a usable direction. The partner is p₁, β = ½: an edge lies half a pixel beyond its samples, on average.
 
-Of several directions the one is taken that points most along the sum of all that are off.
+If several directions qualify, the one that points most along the sum of all off directions is taken.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from rts.splatting.kernel import Kernel
 from rts.splatting.layers import AROUND, Layers, Steps, bordered, dilated, opposite
 
 LEAST, LARGEST = 1.23, 2.5
-"""The ratio r from which depths are those of a smooth rim, 1.5 pixels away; and the bound of β."""
+"""The least ratio r of depths on a smooth rim, 1.5 pixels away; and the bound of β."""
 FLAT = 1e-5
 """Differences of depth below this share of the farthest depth are rounding."""
 CONVERGING = 1.5
@@ -44,17 +45,17 @@ HALF = 0.5
 def gains(
     kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array | None, crossed: Array | None = None
 ) -> tuple[Array, Array]:
-    """What moving outlines add to the coverage by moving samples: zeros with derivatives (H, W).
+    """Changes of coverage as outlines move differently from their samples: zeros with derivatives (H, W).
 
-    Fronts of sources move as their outlines; at the surface of a covered target those of its part move as the target's.
-    Those of other parts, too, where the target lies beside a line of crossing: else there may be a gap between.
+    Fronts of sources move as their own outlines. At the surface of a covered target, fronts of its part move as the
+    target's outline. Beside a line of crossing so do fronts of other parts; otherwise a gap may open.
 
     Args:
         kernel: the splatter.
-        layers: its samples.
+        layers: the samples.
         shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
         part: (K, H, W), the part of each sample, or None where all may be of one.
-        crossed: (H, W), the cells beside lines where surfaces cross, or None where these are not known.
+        crossed: (H, W) bool, true for cells beside lines where surfaces cross; None if unknown.
 
     Returns:
         The gains in front, and at the surface.
@@ -80,11 +81,11 @@ def gains(
 
 
 def spread(total: Array, gain: Array) -> Array:
-    """What a buffer's colours (H, W, 4) gain with its coverage: their mean, where they do not fill the target.
+    """The change of a buffer's colours (H, W, 4) with its coverage: their mean, where they do not fill the target.
 
     Args:
         total: the buffer's sums (H, W, 5), colours and weight.
-        gain: of its coverage (H, W).
+        gain: the change of its coverage (H, W).
     """
     xp, weight = namespace(total), total[..., 4]
     partial = (weight > 0) & (weight < 1)
@@ -92,13 +93,13 @@ def spread(total: Array, gain: Array) -> Array:
 
 
 class Back(NamedTuple):
-    """What may be the other ends of chords.
+    """Possible far ends of chords.
 
     Attributes:
         own: (H, W) bool, cells whose chord may end there.
-        covered: (h, w) bool, cells that have one, with a border of one cell.
-        gap: (h, w), how far it lies behind the front, without derivative.
-        position: (h, w, 3).
+        covered: (h, w) bool, cells that have such an end, with a border of one cell.
+        gap: (h, w), distance of the end behind the front, without derivative.
+        position: (h, w, 3), position of the end.
     """
 
     own: Array
@@ -114,7 +115,7 @@ def outline_motion(layers: Layers, shift: dict[Steps, Array], part: Array | None
         layers: the samples.
         shift: see `gains`.
         part: see `gains`.
-        motion: of the fronts (h, w, 2), zeros with derivatives, with a border of one cell.
+        motion: motion of the fronts (h, w, 2), zeros with derivatives, with a border of one cell.
     """
     xp, own = layers.xp, layers.at(motion, 0, 0)
     chord, beta, inward = rules(layers, shift, part)
@@ -126,10 +127,10 @@ def outline_motion(layers: Layers, shift: dict[Steps, Array], part: Array | None
 
 
 def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tuple[Array, Array, Array]:
-    """Which end of a chord is a cell's partner, β, and the direction n from its partner's cell, (H, W) each.
+    """For each cell the end of its chord, β, and the direction n from its partner's cell, (H, W) each.
 
-    The first is a place among `_backs`, −1 where there is no chord. The direction is a place in AROUND, −1 where there
-    is no partner or it is in the cell itself.
+    The end is an index into `_backs`, −1 without a chord. The direction is an index into AROUND, −1 where there is no
+    partner, or where it is in the cell itself.
     """
     xp, (z, _) = layers.xp, layers.front(0, 0)
     z = stopped(z)
@@ -142,7 +143,7 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
         ratio = _ratio(layers, z, n, off)
         rim = usable[n] & (ratio > LEAST)
         along = n[0] * outward[0] + n[1] * outward[1]
-        # Ordered as n · outward / ‖n‖ is, in whole numbers.
+        # In the order of n · outward / ‖n‖, in whole numbers.
         score = along * xp.abs(along) * (3 - abs(n[0]) - abs(n[1]))
         take = usable[n] & ((rim & ~deep) | ((rim == deep) & (score > best)))
         best, inward, deep = xp.where(take, score, best), xp.where(take, i, inward), deep | (take & rim)
@@ -154,31 +155,31 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
 
 
 def chords(covered: np.ndarray) -> np.ndarray:
-    """The second layers (K, H, W) that lie beside the outlines of fronts before nothing."""
+    """The second layers (K, H, W) beside outlines of fronts with nothing behind them."""
     ring = covered[0] & dilated(~covered[0])
     return covered & dilated(ring) & (np.arange(len(covered)) == 1)[:, None, None]
 
 
 def _motion(layers: Layers, position: Array, covered: Array) -> Array:
-    """Positions (h, w, 3) in x and y less their value (h, w, 2), zero where nothing is covered (h, w)."""
+    """Zeros (h, w, 2) with the derivatives of positions (h, w, 3) in x and y, where covered (h, w)."""
     xy = position[..., :2]
     return layers.xp.where(covered[..., None], xy - stopped(xy), 0.0)
 
 
 def _off(layers: Layers, shift: dict[Steps, Array]) -> dict[Steps, Array]:
-    """Directions in which cells' fronts end; none leads out of the array."""
-    xp, there = layers.xp, layers.covers(0, 0)
+    """For each direction, (H, W) bool: true where a cell's front ends, and the direction stays in the array."""
+    xp, covered = layers.xp, layers.covers(0, 0)
     inside = bordered(xp.zeros_like(shift[0, 0])[None])[0] >= 0
-    found = {}
+    ends = {}
     for n in AROUND:
-        # Pairing is symmetric: what matters is whether p + n, as a source of p, is paired front to front.
+        # Pairing is symmetric, so p + n is tested as a source of p.
         back = opposite(n)
-        found[n] = there & layers.at(inside, *back) & (~layers.covers(*back) | (shift[back] != 0))
-    return found
+        ends[n] = covered & layers.at(inside, *back) & (~layers.covers(*back) | (shift[back] != 0))
+    return ends
 
 
 def _ratio(layers: Layers, z: Array, n: Steps, off: dict[Steps, Array]) -> Array:
-    """The ratio r along a direction; 0 where p₂ does not continue the surface, or does not fall off."""
+    """The ratio r along a direction; 0 where p₂ does not continue the surface, or its depth does not fall off."""
     xp, back = layers.xp, opposite(n)
     (z1, _), (z2, there) = layers.front(*n), layers.front(2 * n[0], 2 * n[1])
     z1, z2 = stopped(z1), stopped(z2)
@@ -189,28 +190,28 @@ def _ratio(layers: Layers, z: Array, n: Steps, off: dict[Steps, Array]) -> Array
 
 
 def _root(ratio: Array, xp: Any) -> Array:
-    """β of a smooth rim."""
+    """β of a smooth rim, from the ratio r."""
     return xp.clip((1 + 2 * ratio - ratio * ratio) / (2 * ratio * (ratio - 1)), 0.0, LARGEST)
 
 
 def _backs(layers: Layers, part: Array | None) -> list[Back]:
     """The ends of chords: exits, and in cells without one the second layer of the front's part."""
-    found = []
+    backs = []
     if layers.exit is not None:
         covered, position = layers.exit
-        found.append(Back(layers.at(covered, 0, 0), covered, stopped(layers.behind(position[..., 2])), position))
+        backs.append(Back(layers.at(covered, 0, 0), covered, stopped(layers.behind(position[..., 2])), position))
     if part is not None and len(layers.position) > 1:
         covered, position = layers.covered[1], layers.position[1]
         own = layers.at(covered, 0, 0) & (part[0] == part[1])
-        own = own & ~found[0].own if found else own
-        found.append(Back(own, covered, stopped(layers.behind(position[..., 2])), position))
-    return found
+        own = own & ~backs[0].own if backs else own
+        backs.append(Back(own, covered, stopped(layers.behind(position[..., 2])), position))
+    return backs
 
 
 def _closes(layers: Layers, usable: dict[Steps, Array], back: Back) -> Array:
-    """Where fronts and what lies behind them close along a usable direction."""
-    gap, found = layers.at(back.gap, 0, 0), False
+    """True where fronts and their far ends meet along a usable direction, (H, W)."""
+    gap, closing = layers.at(back.gap, 0, 0), False
     for n in AROUND:
         inner = layers.at(back.gap, *n)
-        found = found | (usable[n] & layers.at(back.covered, *n) & (CONVERGING * gap * gap <= inner * inner))
-    return found & back.own
+        closing = closing | (usable[n] & layers.at(back.covered, *n) & (CONVERGING * gap * gap <= inner * inner))
+    return closing & back.own

@@ -1,8 +1,8 @@
-"""Where several views lie side by side in one picture, so that one splat serves them all.
+"""The layout of several views in one picture, so that one splat serves all views.
 
-Each view keeps the apron that it was sampled with, so no splat of another reaches its image. What splatters decide by
-depths they decide in terms of the largest: where those of views differ much, they are brought between 1 and 2, by
-powers of two, which round nothing. So the depths that count as equal are up to twice as far apart as in a view alone.
+Each view keeps the apron that it was sampled with, so no splat of another view reaches its image. Splatters compare
+depths relative to the largest one. If the largest depths of views differ much, they are scaled to between 1 and 2 by
+powers of two, which is exact. The threshold for equal depths is then up to twice that of a single view.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rts.arrays.engines import namespace
 from rts.arrays.trees import Array
 
 SIDE = 1024
-"""Cells along each side of a picture, at most: float32 places samples there to 1/16000 of a cell."""
+"""Largest number of cells along each side of a picture: float32 places samples there to 1/16000 of a cell."""
 
 
 class Picture(NamedTuple):
-    """Places of views, line after line.
+    """Places of views in a picture, line after line.
 
     Attributes:
         views: B, the number of views.
@@ -36,7 +36,7 @@ class Picture(NamedTuple):
 
     @classmethod
     def of(cls, count: int, view: tuple[int, int]) -> Picture:
-        """A picture of so many views, about as high as wide, with few places left over."""
+        """A picture of `count` views, about as high as wide, with few empty places."""
         down, most = (max(1, SIDE // n) for n in view)
         even = math.sqrt(count * view[0] / view[1])
         # From half as wide to twice as wide as high.
@@ -57,11 +57,11 @@ class Picture(NamedTuple):
         return self.down * self.view[0], self.across * self.view[1]
 
     def places(self) -> list[tuple[slice, slice]]:
-        """Lines and columns of cells of each view."""
-        (height, width), found = self.view, []
+        """Lines and columns of the cells of each view."""
+        (height, width), places = self.view, []
         for y, x in np.ndindex(self.down, self.across):
-            found.append((slice(y * height, (y + 1) * height), slice(x * width, (x + 1) * width)))
-        return found[: self.views]
+            places.append((slice(y * height, (y + 1) * height), slice(x * width, (x + 1) * width)))
+        return places[: self.views]
 
     def corners(self) -> np.ndarray:
         """(B, 2) the column and the line of the first cell of each view."""
@@ -69,7 +69,7 @@ class Picture(NamedTuple):
         return np.stack([across * self.view[1], down * self.view[0]], axis=1)
 
     def inside(self, border: int) -> np.ndarray:
-        """(height, width) bool, the cells of views without a border of so many."""
+        """(height, width) bool, true for the cells of views inside of a border."""
         (height, width), inside = self.view, np.zeros((self.down, self.view[0], self.across, self.view[1]), bool)
         inside[:, border : height - border, :, border : width - border] = True
         for y, x in list(np.ndindex(self.down, self.across))[self.views :]:
@@ -77,7 +77,7 @@ class Picture(NamedTuple):
         return inside.reshape(self.size)
 
     def laid_out(self, views: Array, empty: int | bool) -> Array:
-        """The picture (K, height, width) of arrays (B, K, h, w) of the views; `empty` is where there is none."""
+        """The picture (K, height, width) of arrays (B, K, h, w) of the views; `empty` fills places without a view."""
         xp, (height, width), nowhere = namespace(views), self.view, self.down * self.across - self.views
         if nowhere:
             views = xp.concat([views, *[xp.full_like(views[:1, ...], empty)] * nowhere])
@@ -94,14 +94,17 @@ class Picture(NamedTuple):
 
 
 def depth_scales(largest: np.ndarray) -> np.ndarray:
-    """(B,) float32 factors that bring the largest depth (B,) of each view between 1 and 2; ones where one would do."""
-    known = np.isfinite(largest) & (largest > 0)
-    powers = np.frexp(np.where(known, largest, 1.0))[1]
-    if not known.any() or (powers[known] == powers[known][0]).all():
+    """(B,) float32 factors that scale the largest depth (B,) of each view to between 1 and 2.
+
+    All are one where the views need the same factor.
+    """
+    usable = np.isfinite(largest) & (largest > 0)
+    powers = np.frexp(np.where(usable, largest, 1.0))[1]
+    if not usable.any() or (powers[usable] == powers[usable][0]).all():
         return np.ones(len(largest), np.float32)
-    return np.where(known, np.ldexp(1.0, 1 - powers), 1.0).astype(np.float32)
+    return np.where(usable, np.ldexp(1.0, 1 - powers), 1.0).astype(np.float32)
 
 
 def at_once(view: tuple[int, int]) -> int:
-    """How many views of (height, width) cells, aprons included, go into one picture."""
+    """Number of views of (height, width) cells, aprons included, that fit into one picture."""
     return max(1, (SIDE // view[0]) * (SIDE // view[1]))

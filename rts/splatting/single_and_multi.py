@@ -1,4 +1,4 @@
-"""The splatters of the paper: one layer (`Single`), several in three buffers (`Multi`); and none (`Plain`)."""
+"""The splatters of the paper, `Single` for one layer and `Multi` for several; and `Plain`, which does not splat."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rts.splatting.layers import (
 
 
 class Plain(Splatter):
-    """No splatting: the layers composited front to back. Has no derivative at occlusion boundaries."""
+    """No splatting: layers are composited front to back, without derivative at occlusion boundaries."""
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
@@ -36,7 +36,7 @@ class Plain(Splatter):
             return nothing(rgba, row)
         check_rows(row, rgba.shape[0])
         xp = namespace(rgba)
-        # Adds zero. It keeps the image connected to the positions, so that their derivative is there, and zero.
+        # Zero, but connected to the positions, so that their derivative exists and is zero.
         image = 0 * xp.sum(positions)
         for k in reversed(range(row.shape[0])):
             layer = xp.where((row[k] >= 0)[..., None], unpack(rgba, row[k]), 0.0)
@@ -44,7 +44,7 @@ class Plain(Splatter):
         return image
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.Splatter`: what is opaque hides all that is behind it."""
+        """See `rts.Splatter`: the fronts, since an opaque front hides all layers behind it."""
         return fronts(covered)
 
 
@@ -77,7 +77,7 @@ class Multi(Kernel):
     Layers of the source p and the target q are paired on linear depth z: with A_l = |z_p[l] − z_q[0]| and
     B_l = |z_q[l] − z_p[0]|, s = −argmin B where min B < min A, else argmin A. Layer l of p is in front where l < s, at
     the surface where l = s, behind where l > s. The B test catches a source whose front layer continues a hidden layer
-    of the target. Back faces of a closed surface pair with what lies behind them: cull them (`Part.cull`).
+    of the target. Back faces of a closed surface pair with layers behind them: cull them (`Part.cull`).
     """
 
     def accumulate(self, splats: Splats) -> Array:
@@ -94,6 +94,6 @@ class Multi(Kernel):
         return over(front, over(surface, behind))
 
     def plain(self, depths: Depths, margin: float) -> Array:
-        """See `Kernel`: where the surface fills the target, all that is behind it is covered."""
+        """See `Kernel`: targets that the surface fills, so that it hides all layers behind it."""
         full = self.epsilon >= LEAST_EPSILON
         return full & all_of([depths.covers(*n) & depths.fronts_pair(*n, margin)[0] for n in NEIGHBOURS])

@@ -17,38 +17,39 @@ from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 
 CONTINUED = 0.8
-"""Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
+"""`Visible` continues a front along its line if the error is below this share of the error of plain pairing."""
 
 RIMS = rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF
 CROSSINGS = crossings.LARGEST, crossings.DIRECT, crossings.FIT, crossings.SLACK, crossings.KEPT
-"""Numbers of those modules, for compiled code."""
+"""Constants of `rims` and `crossings`, for compiled loops."""
 
 
 @dataclass(frozen=True)
 class Visible(Kernel):
     """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
 
-    Pairing is that of `Multi`, but front layers also pair (s = 0) where one lies on the line through the other and its
-    next cell, or off it by less than 0.8 of the smallest of A and B: depth that changes fast, as on the sides of a box
-    near its outline, is nearer to a back face than to itself. Where it is told which side of a surface layers show, a
-    hidden layer does not pair with a front that is the other side of the same sheet.
+    Pairing is that of `Multi`, with an addition. Front layers also pair (s = 0) if one lies on the line through the
+    other and its next cell, or off it by less than 0.8 of the smallest of A and B. Where depth changes fast, as on the
+    sides of a box near its outline, a front is nearer to a back face than to its own continuation. If samplers record
+    the sides of surfaces, a hidden layer does not pair with a front that is the other side of the same sheet.
 
     Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
-    covered target takes the source's front layer in front where s > 0, and layer s at the surface where s ≥ 0. Behind
-    is only what shows next door: with m the least −s over the covered sources of s < 0, those give their front layer
-    and the others the layer l > s whose depth is nearest to z_q[m]; where there is no m, nothing.
+    covered target takes the source's front layer in front where s > 0, and layer s at the surface where s ≥ 0. The
+    buffer behind holds only layers that a neighbouring cell shows. Let m be the least −s over the covered sources with
+    s < 0. These sources give their front layer, the others the layer l > s whose depth is nearest to z_q[m]. Without
+    such sources the buffer is empty.
 
-    Closed surfaces need no culling, if K reaches through their back faces to what lies behind.
+    Closed surfaces need no culling, if K reaches through their back faces to the layers behind.
 
     Attributes:
-        rims: whether coverage moves as outlines do, extrapolated from the samples inside of them (`rims.py`); otherwise
-            it moves as the samples, which on a smooth rim that turns move faster. The image is the same.
-        crossings: whether lines where two surfaces pass through one another move as their depths say (`crossings.py`);
-            otherwise as the samples beside them, which hardly do. The image is the same.
-        facing: whether layers that show opposite sides of one sheet are kept from pairing, where samplers tell
-            sides (`Splats.facing`); otherwise depths alone decide.
-        exits: whether outlines of culled parts move as the middles of their chords, where samplers tell where these end
-            (`Splats.exit`); otherwise fronts alone decide. The image is the same.
+        rims: whether coverage moves as outlines do, extrapolated from the samples inside of them (`rims.py`). Otherwise
+            it moves as the samples, which are faster than the smooth rim of a turning surface. The image is the same.
+        crossings: whether lines where two surfaces pass through one another move as their depths say (`crossings.py`).
+            Otherwise they move as the samples beside them, which is hardly at all. The image is the same.
+        facing: whether opposite sides of one sheet are kept from pairing, where samplers record sides
+            (`Splats.facing`). Otherwise depths alone decide.
+        exits: whether outlines of culled parts move as the middles of their chords, where samplers record the ends of
+            chords (`Splats.exit`). Otherwise fronts alone decide. The image is the same.
     """
 
     epsilon: float = 1e-3
@@ -65,8 +66,8 @@ class Visible(Kernel):
     @functools.cached_property
     def reads(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`."""
-        told = {"facing": self.facing, "exit": self.rims and self.exits}
-        return frozenset(name for name, read in told.items() if read)
+        switches = {"facing": self.facing, "exit": self.rims and self.exits}
+        return frozenset(name for name, read in switches.items() if read)
 
     @functools.cached_property
     def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
@@ -99,11 +100,11 @@ class Visible(Kernel):
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
             hidden = xp.where(m < count, hidden, count)
-            for k, given in enumerate(layers.splats(*n, still=still)):
+            for k, own in enumerate(layers.splats(*n, still=still)):
                 if k == 0:
-                    front = front + xp.where((s > 0)[..., None], given, 0.0)
-                surface = surface + xp.where((s == k)[..., None], given, 0.0)
-                behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
+                    front = front + xp.where((s > 0)[..., None], own, 0.0)
+                surface = surface + xp.where((s == k)[..., None], own, 0.0)
+                behind = behind + xp.where((hidden == k)[..., None], own, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
         if self.rims and differentiates:
             gains = rims.gains(self, layers, shift, splats.parts, crossed)
@@ -113,15 +114,15 @@ class Visible(Kernel):
         return image if lines is None else image + crossings.motion(self, layers, lines)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.Splatter`: those of `Kernel`, what may be chords' other ends, both layers near lines of crossing."""
+        """See `rts.Splatter`: as `Kernel`, and possible ends of chords, and two layers near lines of crossing."""
         kept = super().needed(covered, depth)
         kept = kept | rims.chords(covered) if self.rims else kept
         return kept | crossings.sheets(covered, depth) if self.crossings else kept
 
     def plain(self, depths: Depths, margin: float) -> Array:
-        """See `Kernel`: where no source has a hidden layer in play."""
-        found = []
+        """See `Kernel`: targets with no source whose hidden layers matter."""
+        conditions = []
         for n in NEIGHBOURS:
             pair, off = depths.fronts_pair(*n, margin)
-            found.append(~depths.covers(*n) | pair | depths.continues(*n, CONTINUED * off - margin))
-        return ~depths.covers(0, 0) | all_of(found)
+            conditions.append(~depths.covers(*n) | pair | depths.continues(*n, CONTINUED * off - margin))
+        return ~depths.covers(0, 0) | all_of(conditions)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +15,7 @@ from rts.arrays.engines import Engine, constants, engine_named, is_constant
 from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.checks import check_sampler, check_scene
 from rts.contracts.surface import RaySurface, TriangleSurface
-from rts.errors import EmptyImageWarning, RtsError
+from rts.errors import EmptyImageWarning, InputError, RtsError
 from rts.rendering.image import render
 from rts.rendering.settings import RenderSettings
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -31,6 +33,9 @@ CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
 
 DIFFERING, SHARE = 1e-3, 0.02
 """How far an image may be from the reference's, and in which share of the pixels farther."""
+
+WIDTH = 120
+"""How many characters tell an error that is not the library's."""
 
 
 class Pair(NamedTuple):
@@ -120,10 +125,24 @@ def single(x: Any) -> np.ndarray:
     return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
 
 
-def pairs() -> Iterator[Pair]:
-    """Every registered surface with every sampler, tried in every engine."""
-    engines = registry.plugins("rts.engines")
-    for surface in registry.plugins("rts.surfaces"):
+def pairs(only: Sequence[str] = ()) -> Iterator[Pair]:
+    """Every registered surface with every sampler, tried in every engine, one after the other.
+
+    Args:
+        only: names of surfaces, samplers and engines; of a kind that none is named of all are tried.
+
+    Raises:
+        InputError: nothing is registered by such a name.
+    """
+    kinds = {kind: registry.plugins(f"rts.{kind}") for kind in ("surfaces", "samplers", "engines")}
+    known = {name for names in kinds.values() for name in names}
+    if unknown := [name for name in only if name not in known]:
+        raise InputError(f"there is no surface, sampler or engine {unknown[0]!r}; expected {', '.join(sorted(known))}")
+    return _tried(*([n for n in names if n in only] or names for names in kinds.values()))
+
+
+def _tried(surfaces: Sequence[str], samplers: Sequence[str], engines: Sequence[str]) -> Iterator[Pair]:
+    for surface in surfaces:
         part, problem = None, "no example"
         try:
             part = example(surface)
@@ -132,8 +151,10 @@ def pairs() -> Iterator[Pair]:
         if part is None:
             yield Pair(surface, "", dict.fromkeys(engines, problem))
             continue
-        for sampler in registry.plugins("rts.samplers"):
-            yield Pair(surface, sampler, {engine: _problem(part, sampler, engine) for engine in engines})
+        for sampler in samplers:
+            found = {engine: _problem(part, sampler, engine) for engine in engines}
+            own = repr(part.surface)  # The row names it already.
+            yield Pair(surface, sampler, {e: p and p.replace(own, surface) for e, p in found.items()})
 
 
 def _problem(part: Part, sampler: str, engine: str) -> str | None:
@@ -147,5 +168,8 @@ def _problem(part: Part, sampler: str, engine: str) -> str | None:
 
 
 def _reason(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, RtsError) else f"{type(error).__name__}: {text}"
+    """The error in a line; of one that is not the library's, as much as tells what it is."""
+    text = re.sub(r"<([\w.]+)[^<>]* at 0x[0-9a-fA-F]+>", r"\1", " ".join(str(error).split()))
+    if isinstance(error, RtsError):
+        return text
+    return textwrap.shorten(f"{type(error).__name__}: {text}", WIDTH, placeholder=" …")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from rts.arrays.engines import Engine, floating_bits
+from rts.compiling.threads import read_only
 from rts.operations.operation import Operation
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_finite, no_error
 from rts.testing.conformance import Conformance
-from rts.threads import read_only
 
 TOLERANCES = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-9}
 """By how much results may differ, over the largest number of what is expected."""

@@ -6,14 +6,16 @@ import numpy as np
 
 from rts import registry
 from rts.arrays.trees import Tree, map_leaves
+from rts.contracts.records import Proxy
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
 from rts.sampling.packing import lift
 from rts.sampling.settling import refined
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
-from rts.testing import derivatives
+from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_finite
+from rts.testing.proxy_claims import inputs_of
 from rts.testing.sample_claims import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
 
@@ -26,18 +28,30 @@ BEYOND, NOWHERE = 6.0, 1e3
 SHORT = 2e-3
 """How far before a hit the second ray begins, in units of depth."""
 
+GROWN = 1.15
+"""How much larger triangles are than they should be, so that rays at outlines miss what is within."""
+
 MISSED = 0.01
 """The share of hits that may be missed by the second ray, where rays touch the surface."""
 
 
 def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: str) -> None:
     """Fail unless `refine` leaves each sample on its ray, at its depth, or drops it."""
-    sampler = registry.instance("rts.samplers", "reference")
     local = camera.within(part.transform).map(lambda m: np.asarray(m, np.float64))
-    inputs = map_leaves(np.asarray, surface.proxy_inputs(map_leaves(derivatives.single, part.theta)))
-    proxy = surface.proxy(inputs, local, GRID)
-    fragments = sampler.rasterize(proxy, local, GRID, LAYERS, part.cull)
-    lifted = lift(fragments, proxy)
+    inputs = inputs_of(part, surface)
+    off = _off_rays(part, surface, inputs, surface.proxy(inputs, local, GRID), local, view)
+    allowed = FEW if surface.centered else 1.0
+    claim(
+        off.max() <= RESIDUAL and np.mean(off > REPROJECTION) <= allowed,
+        f"{view}: refine leaves samples up to {off.max():.3g} px, {np.median(off):.3g} px in the middle, from "
+        f"the point of their ray at their depth; move params and depth together, or set rows to −1 where a ray misses",
+    )
+
+
+def _off_rays(part: Part, surface: TriangleSurface, inputs: Tree, proxy: Proxy, local: Camera, view: str) -> np.ndarray:
+    """How far samples that `refine` makes of those on triangles are off their rays, pixels."""
+    sampler = registry.instance("rts.samplers", "reference")
+    lifted = lift(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
     try:
         found, rays = refined(surface, inputs, lifted, local, surface.table_specs(len(lifted.ids), None))
     except InputError as error:
@@ -45,17 +59,25 @@ def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: st
     cells = found.row >= 0
     row, depth = found.row[cells], found.depth[cells].astype(np.float64)
     if not len(row):
-        return
+        return np.zeros(1)
     position = np.asarray(surface.evaluate(part.theta, found)["position"], np.float64)[row]
     claim_finite(position, f"{view}: the surface where refine has put samples")
     point = rays.origins[row] + depth[:, None] * rays.directions[row]
-    width = rays.spread[0] + rays.spread[1] * depth
-    off = np.linalg.norm(position - point, axis=1) / width
-    allowed = FEW if surface.centered else 1.0
+    return np.linalg.norm(position - point, axis=1) / (rays.spread[0] + rays.spread[1] * depth)
+
+
+def claim_misses_dropped(part: Part, surface: TriangleSurface) -> None:
+    """Fail unless `refine` drops samples whose rays pass beside the surface: those on triangles that are too large."""
+    local = scenes.CAMERA.within(part.transform).map(lambda m: np.asarray(m, np.float64))
+    inputs = inputs_of(part, surface)
+    proxy = surface.proxy(inputs, local, GRID)
+    middle = (proxy.vertices.max(axis=0) + proxy.vertices.min(axis=0)) / 2
+    grown = proxy._replace(vertices=np.asarray(middle + GROWN * (proxy.vertices - middle), np.float32))
+    off = _off_rays(part, surface, inputs, grown, local, "with triangles that are too large")
     claim(
-        off.max() <= RESIDUAL and np.mean(off > REPROJECTION) <= allowed,
-        f"{view}: refine leaves samples up to {off.max():.3g} px, {np.median(off):.3g} px in the middle, from the "
-        f"point of their ray at their depth; move params and depth together, or set rows to −1 where a ray misses",
+        off.max() <= RESIDUAL and np.mean(off > REPROJECTION) <= (FEW if surface.centered else 1.0),
+        f"refine keeps {np.sum(off > REPROJECTION)} of {len(off)} samples up to {off.max():.3g} px off their "
+        f"rays where triangles are {GROWN - 1:.0%} too large; set rows to -1 where a ray misses the surface",
     )
 
 

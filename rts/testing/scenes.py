@@ -31,8 +31,16 @@ def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: A
     return _rounded(Camera.look_at(eye, at, up, fov_y=options.pop("fov_y", 45), aspect=SIZE[1] / SIZE[0], **options))
 
 
+def shifted(camera: Camera, by: float, axis: int) -> Camera:
+    """A camera whose picture is shifted by a part of a pixel, along x (axis 0) or y."""
+    shift = np.eye(4)
+    shift[axis, 3] = 2 * by / SIZE[1 - axis]
+    return camera.replace(projection=shift @ camera.projection)
+
+
 CAMERA = _rounded(compatibility.CAMERA)
 AWAY = _look((0, 0, 5), (0, 0, 9))
+AFAR = _look((5, 9, 18))
 BESIDE = _look((0, 0, 5), (40, 0, 5.5))
 NEAR = _look((0.9, 1.6, 3.2), near=3.4, far=4.2)
 """Its near plane cuts through what is about the origin, and its far plane too."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,21 @@ class ShaderConformance(Conformance):
         claim_close(found, rgba[order], TOLERANCE, "the colour of permuted samples")
         half = _shaded(shader, theta, {name: value[: ROWS // 2] for name, value in gbuffer.items()})
         claim_close(half, rgba[: ROWS // 2], TOLERANCE, "the colour of samples shaded without the others")
+
+    def test_lengths_of_directions_have_no_effect(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """Normals, and the direction of θ["light"], may be of any length: colours are the same."""
+        rgba = _shaded(shader, theta, gbuffer)
+        if "normal" in gbuffer:
+            lengths = np.random.default_rng(2).uniform(0.25, 4, (ROWS, 1)).astype(np.float32)
+            found = _shaded(shader, theta, {**gbuffer, "normal": lengths * gbuffer["normal"]})
+            claim_close(
+                found, rgba, TOLERANCE, "the colour with normals of other lengths (see `unit` of rts.plugin_api.arrays)"
+            )
+        light = theta.get("light")
+        if isinstance(light, Mapping) and "direction" in light:
+            longer = {**theta, "light": {**light, "direction": 3 * np.asarray(light["direction"])}}
+            found = _shaded(shader, longer, gbuffer)
+            claim_close(found, rgba, TOLERANCE, "the colour with a light's direction three times as long")
 
     def test_opaque_is_true(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that promises to be opaque has alpha 1, exactly."""

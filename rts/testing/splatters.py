@@ -15,7 +15,7 @@ from rts.plugin_base import overrides, promised
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance
-from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
@@ -147,6 +147,16 @@ class SplatterConformance(Conformance):
             claim(image.shape == expected.shape, f"with border={border} it is {image.shape}; not {expected.shape}")
             claim_close(image, expected, TOLERANCE, f"the image with border={border}")
 
+    @pytest.mark.parametrize("engine", ENGINES)
+    def test_no_rows_give_an_empty_image(self, splatter: Any, engine: str) -> None:
+        """`splat` of no samples at all gives an image of zeros."""
+        chosen = engine_or_skip(engine)
+        row = np.full((LAYERS, HEIGHT, WIDTH), -1, np.int32)
+        given = derivatives.on(chosen, (np.zeros((0, 3)), np.zeros((0, 4)), row))
+        with no_error(f"splat in {engine} with no rows, where nothing can be taken by index"):
+            image = chosen.to_numpy(_instance(splatter).splat(*given))
+        claim_close(image, np.zeros((HEIGHT, WIDTH, 4)), 0, f"the image of no rows in {engine}")
+
     # -------------------------------------------------------------------------------------- derivatives
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
@@ -175,7 +185,7 @@ class SplatterConformance(Conformance):
 
     def test_engines_agree(self, splatter: Any) -> None:
         """Engines agree on image, gradient and derivative along a direction; both modes are one derivative."""
-        splats = scattered()
+        splats = scattered(LAYERS + 1)
         f, given = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
         derivatives.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
 
@@ -203,16 +213,16 @@ def everywhere(layers: int) -> Splats:
     return Splats(positions, np.ones((len(positions), 4), np.float32), Cells(_numbered(layers)))
 
 
-def scattered() -> Splats:
-    """Samples off the centres of some cells, of any colour and depth; a second layer only behind a first."""
-    rng = np.random.default_rng(5)
-    splats = everywhere(LAYERS)
-    off = rng.uniform(-0.2, 0.2, (CELLS, 3)) + np.linspace(0, 1, CELLS)[:, None] * [0, 0, 0.3]
-    alpha = rng.uniform(0.3, 1, (CELLS, 1))
-    rgba = np.concatenate([alpha * rng.random((CELLS, 3)), alpha], 1).astype(np.float32)
+def scattered(layers: int = LAYERS) -> Splats:
+    """Samples off the centres of some cells, of any colour and depth; a layer only behind another one."""
+    rng, count = np.random.default_rng(5), HEIGHT * WIDTH * layers
+    splats = everywhere(layers)
+    off = rng.uniform(-0.2, 0.2, (count, 3)) + np.linspace(0, 1, count)[:, None] * [0, 0, 0.3]
+    alpha = rng.uniform(0.3, 1, (count, 1))
+    rgba = np.concatenate([alpha * rng.random((count, 3)), alpha], 1).astype(np.float32)
     row = splats.row.copy()
-    row[0][rng.random((HEIGHT, WIDTH)) < 0.3] = -1
-    row[1][(rng.random((HEIGHT, WIDTH)) < 0.3) | (row[0] < 0)] = -1
+    for k in range(layers):
+        row[k][(rng.random((HEIGHT, WIDTH)) < 0.3) | (row[max(k - 1, 0)] < 0)] = -1
     return Splats((splats.positions + off).astype(np.float32), rgba, Cells(row))
 
 

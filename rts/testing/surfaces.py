@@ -10,17 +10,20 @@ import pytest
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
-from rts.contracts.records import Cells, Proxy, Samples
+from rts.contracts.records import Samples
 from rts.contracts.surface import RaySurface, TriangleSurface
-from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, differentiating, installed, joined, split
-from rts.testing.refine_claims import claim_found_again, claim_found_from_behind, claim_refined
+from rts.testing.motion_claims import claim_followed, claim_inputs_change
+from rts.testing.normal_claims import claim_upright
+from rts.testing.proxy_claims import claim_corners, claim_keys_tell_views, triangles_of
+from rts.testing.refine_claims import claim_found_again, claim_found_from_behind, claim_misses_dropped, claim_refined
 from rts.testing.sample_claims import claim_ordered, claim_reprojected
+from rts.testing.tessellation_claims import claim_rates, claim_tessellated
 
 STEP = 1e-5
 
@@ -61,6 +64,8 @@ class SurfaceConformance(Conformance):
             pytest.skip("the surface has no refine")
         for view, camera in scenes.VIEWS.items():
             claim_refined(part, surface, camera, view)
+        if surface.refine_moves:
+            claim_misses_dropped(part, surface)
 
     def test_rays_from_before_a_hit_find_it(self, part: Part) -> None:
         """`intersect` from just short of each hit gives that hit: a tracer that steps through the surface fails."""
@@ -112,27 +117,38 @@ class SurfaceConformance(Conformance):
                 claim_finite(value, f"{name!r} of {kind} samples")
 
     def test_triangles_have_their_corners_on_the_surface(self, part: Part) -> None:
-        """The `proxy`'s ids and parameters of a corner evaluate to that corner; normals face the triangles' outside."""
-        surface, proxy = scenes.checked(part).surface, _proxy(part, scenes.CAMERA)
-        first = _at_corner(proxy, 0)
-        widths = first.ids.shape[1], first.params.shape[1]
-        if surface.refines and (widths != tuple(surface.sample_widths) or surface.table_specs(1, 1)):
-            pytest.skip("refine makes samples of what the triangles carry")
-        corners = proxy.vertices[proxy.faces].astype(np.float64)
-        outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        for i in range(3):
-            gbuffer = _evaluated(part, part.theta, _at_corner(proxy, i))
-            off = 1e-5 * max(1, np.abs(proxy.vertices).max())
-            claim_close(gbuffer["position"], corners[:, i], off, f"the surface at corner {i} of its triangles")
-            inward = np.sum(gbuffer.get("normal", outward) * outward, axis=1) < 0
-            claim(inward.mean() < 0.05, f"{inward.mean():.0%} of the normals face the inside of the triangles")
+        """The `proxy`'s ids and parameters of a corner evaluate to that corner, also when θ has changed."""
+        surface = triangles_of(part)
+        values, join = split(part.theta)
+        for scale, when in ((1.0, ""), (0.9, ", asked again with another θ (is something kept on the object?)")):
+            theta = join([np.asarray(scale * v, v.dtype) for v in values])
+            claim_corners(part.replace(theta=theta), surface, when)
 
     def test_triangles_depend_on_the_view_only_with_a_key(self, part: Part) -> None:
-        """Triangles are the same in two views, unless `depends_on_view` says otherwise."""
-        one, other = (_proxy(part, camera).vertices for camera in (scenes.CAMERA, scenes.AXES[0]))
-        if scenes.checked(part).surface.depends_on_view:
-            pytest.skip("the surface says that its triangles depend on the view")
-        claim(np.array_equal(one, other), "the triangles differ from camera to camera, but there is no proxy_key")
+        """Triangles are the same in two views, unless `proxy_key` differs."""
+        claim_keys_tell_views(part, triangles_of(part))
+
+    def test_triangles_are_made_anew_for_every_array_that_moves_them(self, part: Part, sampler: Any) -> None:
+        """`proxy_inputs` holds all of θ that the surface depends on."""
+        claim_inputs_change(part, triangles_of(part), sampler)
+
+    def test_normals_stand_upright(self, part: Part, sampler: Any) -> None:
+        """Normals are not zero, and perpendicular to the surface where it is more than its triangles."""
+        claim_upright(part, sampler)
+
+    def test_the_surface_follows_theta(self, part: Part, sampler: Any) -> None:
+        """Points at kept samples stay on the surface while θ changes a little: `evaluate` moves as the surface does."""
+        claim_followed(part, sampler)
+
+    def test_tessellate_gives_a_mesh_on_the_surface(self, part: Part, sampler: Any) -> None:
+        """A mesh of the surface lies on it, has as many triangles as the rate says, and is nearer at a higher rate."""
+        claim_tessellated(part, triangles_of(part), sampler)
+
+    def test_rates_are_the_surface_coarser_or_finer(self, part: Part, sampler: Any) -> None:
+        """Each of `rates` has a setting and work, and shows the surface; more work shows it better."""
+        if not part.surface.rates(_single(part.theta)):
+            pytest.skip("the surface has no rates")
+        claim_rates(part, sampler)
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
@@ -172,6 +188,22 @@ class SurfaceConformance(Conformance):
                     ends.append(np.sum(_evaluated(part, join(moved), sampled)[name] * weights))
                 what = f"the derivative of {name!r} in {derivatives.names(part.theta)[i]}, in {engine},"
                 claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_forward_and_reverse_mode_agree(self, part: Part, sampler: Any, engine: str) -> None:
+        """Both modes of differentiation give one derivative of the whole G-buffer, weighted at random."""
+        chosen, (values, join) = differentiating(engine), split(part.theta)
+        samples = scenes.frozen(part, sampler=sampler).samples[0]
+        rows = _evaluated(part, part.theta, samples)
+        on_device, along = derivatives.on(chosen, samples), derivatives.directions(values)
+        weights = np.random.default_rng(0).standard_normal((len(samples.ids), sum(x.shape[1] for x in rows.values())))
+
+        def everything(x: list) -> Any:
+            gbuffer = part.surface.evaluate(joined(chosen, join, x), on_device)
+            return chosen.namespace.concat([gbuffer[name] for name in rows], axis=1)
+
+        found = derivatives.derivatives(chosen, everything, values, along, weights)
+        derivatives.claim_consistent(found, along, weights, f"the G-buffer ({', '.join(rows)}) in {engine}")
 
     def test_engines_agree(self, part: Part, sampler: Any) -> None:
         """Engines agree on image, gradient and derivative along a direction, at the same samples."""
@@ -235,25 +267,3 @@ def _evaluated(part: Part, theta: Tree, samples: Samples) -> dict[str, np.ndarra
     given = part.surface.evaluate(theta, samples)
     gbuffer = given if isinstance(given, GBuffer) else GBuffer(given)
     return {name: np.asarray(gbuffer[name]) for name in list(gbuffer)}
-
-
-def _proxy(part: Part, camera: Camera) -> Proxy:
-    """The surface's triangles, or a skip."""
-    surface = scenes.checked(part).surface
-    if not isinstance(surface, TriangleSurface):
-        pytest.skip("the surface has no triangles")
-    inputs = map_leaves(np.asarray, surface.proxy_inputs(_single(part.theta)))
-    return surface.proxy(inputs, camera, scenes.SIZE)
-
-
-def _at_corner(proxy: Proxy, i: int) -> Samples:
-    """One sample a triangle, at its corner i."""
-    count = len(proxy.faces)
-    weights = np.broadcast_to(np.eye(3, 2, dtype=np.float32)[i], (count, 2))
-    row = np.arange(count, dtype=np.int32).reshape(1, 1, -1)
-    return Samples(
-        proxy.faces if proxy.ids is None else proxy.ids,
-        weights if proxy.corner_params is None else proxy.corner_params[:, i],
-        Cells(row, np.ones_like(row, dtype=np.float32)),
-        np.int32(0),
-    )

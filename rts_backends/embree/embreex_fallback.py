@@ -20,7 +20,7 @@ from rts_backends.exact_hits import corner_lists, look, places
 from rts_backends.triangles import facing, pixel_matrix
 
 STEP = 1e-6
-"""How far beyond a hit the next ray starts, as a share of the object's size; float32 resolves about a tenth of it."""
+"""Distance from a hit to the next ray's start, a share of the object's size; float32 resolves a tenth of it."""
 REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 
@@ -80,7 +80,7 @@ class Scene:
         stop = np.minimum(middle + half, planes[1] + STEP * sphere[3])
 
         count = size[0] * size[1]
-        ids, found = np.full((count, layers), -1, np.int32), np.zeros((count, layers, 3))
+        ids, nearest = np.full((count, layers), -1, np.int32), np.zeros((count, layers, 3))
         last, step = np.full(count, -1, np.int32), np.zeros(count)
         scene = pixel_matrix(camera, size), -camera.view[2], facing(camera, cull), proxy.vertices, proxy.faces
         live = np.flatnonzero((square > 0) & (reach < stop))
@@ -91,28 +91,28 @@ class Scene:
             hit = hits["primID"] >= 0
             live = live[hit]
             depth = reach[live] + hits["tfar"][hit] / length[live]
-            args = live, owners[hits["primID"][hit]], size[1], *scene, self._places, *self._around, ids, found
+            args = live, owners[hits["primID"][hit]], size[1], *scene, self._places, *self._around, ids, nearest
             parallel(_take, len(live), *args)
             again = last[live] == hits["primID"][hit]
             last[live] = hits["primID"][hit]
             step[live] = np.where(again, 2 * step[live], STEP / length[live])
             reach[live] = np.maximum(depth, reach[live]) + step[live]
-            full = (ids[live, -1] >= 0) & (found[live, -1, 0] <= reach[live])
+            full = (ids[live, -1] >= 0) & (nearest[live, -1, 0] <= reach[live])
             live = live[~full & (reach[live] < stop[live])]
 
         def layered(x: np.ndarray, dtype: type) -> np.ndarray:
             return np.ascontiguousarray(np.moveaxis(x, 1, 0).reshape(layers, *size, *x.shape[2:]), dtype)
 
         return Fragments(
-            layered(ids, np.int32), layered(found[..., 1:], np.float32), layered(found[..., 0], np.float32)
+            layered(ids, np.int32), layered(nearest[..., 1:], np.float32), layered(nearest[..., 0], np.float32)
         )
 
 
 @loop
 def _take(
-    first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, found
+    first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, nearest
 ):  # fmt: skip
-    """Put the hit of each pixel, and those of all triangles around its corners, among the pixel's nearest."""
+    """Put the hit of each pixel, and hits of all triangles around its corners, among the pixel's nearest."""
     layers = ids.shape[1]
     corners = np.empty((3, 4))
     for n in range(first, last):
@@ -131,14 +131,14 @@ def _take(
                 at = layers
                 while at > 0 and (
                     ids[pixel, at - 1] < 0
-                    or z < found[pixel, at - 1, 0]
-                    or (z == found[pixel, at - 1, 0] and t < ids[pixel, at - 1])
+                    or z < nearest[pixel, at - 1, 0]
+                    or (z == nearest[pixel, at - 1, 0] and t < ids[pixel, at - 1])
                 ):
                     at -= 1
                 for k in range(layers - 1, at, -1):
                     ids[pixel, k] = ids[pixel, k - 1]
                     for i in range(3):
-                        found[pixel, k, i] = found[pixel, k - 1, i]
+                        nearest[pixel, k, i] = nearest[pixel, k - 1, i]
                 if at < layers:
                     ids[pixel, at] = t
-                    found[pixel, at, 0], found[pixel, at, 1], found[pixel, at, 2] = z, a, b
+                    nearest[pixel, at, 0], nearest[pixel, at, 1], nearest[pixel, at, 2] = z, a, b

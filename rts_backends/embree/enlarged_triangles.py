@@ -1,8 +1,9 @@
-"""What Embree is given in place of the triangles: larger ones, so that no hit is lost to float32.
+"""Covers: larger triangles that Embree intersects in place of the mesh's, so that no hit is lost to float32.
 
-Embree intersects in float32: where a ray passes an edge by less than that resolves, it may say either. So each triangle
-is covered by one whose edges lie `LEAST` or more farther out, and whoever finds a cover decides in float64 whether the
-triangle is hit. All lengths are in units of the object's bounding sphere, in which float32 resolves about 1e-7.
+Embree intersects in float32. Where a ray passes an edge by less than float32 resolves, Embree may report a hit or a
+miss. So each triangle is covered by one whose edges lie `LEAST` or more farther out. Where a ray hits a cover, a test
+in float64 decides whether it hits the triangle. All lengths are in units of the object's bounding sphere, in which
+float32 resolves about 1e-7.
 
 A triangle that is very thin, or very small, has no larger one of its shape. It is covered by two long ones that cross
 along its longest edge, and, if it is small, by a third across, so that one of them faces any ray.
@@ -18,7 +19,7 @@ from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 
 LEAST, MOST = 2e-6, 2e-5
-"""How far out edges are moved: a two-hundredth of the inscribed circle's radius, within these limits."""
+"""Limits of the distance by which edges move out; in between, a two-hundredth of the inscribed circle's radius."""
 
 SMALL = 100 * LEAST
 """The longest edge below which a thin triangle has a third cover."""
@@ -28,7 +29,7 @@ NEVER = 255
 
 
 class Covers(NamedTuple):
-    """Triangles that cover those of a proxy: first one for each, then further ones of the thin and the small.
+    """Triangles that cover a proxy's: first one for each, then further ones for thin and small triangles.
 
     Attributes:
         corners: (3 M + 1, 3) float32, three for each cover; the last row is padding, since Embree reads 16 bytes each.
@@ -74,11 +75,11 @@ class Covers(NamedTuple):
         self.corners[3 * len(faces) :] = 0
         self.owners[len(faces) :] = 0
         places = len(faces) + np.cumsum(wanted, dtype=np.int64) - wanted
-        given = vertices, faces, sphere, wanted, places
-        parallel(_cover, len(faces), *given, self.corners, self.owners, self.margins, work=100 * len(faces))
+        arguments = vertices, faces, sphere, wanted, places
+        parallel(_cover, len(faces), *arguments, self.corners, self.owners, self.margins, work=100 * len(faces))
 
 
-@compiled(error_model="numpy")
+@compiled
 def _shape(vertices, faces, t, sphere, points):
     """Fill corners (3, 3) in units of the sphere; lengths of the edges opposite to them, and twice the area."""
     for c in range(3):
@@ -92,9 +93,9 @@ def _shape(vertices, faces, t, sphere, points):
     return a, b, np.sqrt(ux * ux + uy * uy + uz * uz), np.sqrt(nx * nx + ny * ny + nz * nz)
 
 
-@loop(error_model="numpy")
+@loop
 def _count(start, stop, vertices, faces, sphere, wanted):
-    """How many further covers triangles need."""
+    """Count the further covers that triangles need."""
     points = np.empty((3, 3))
     for t in range(start, stop):
         a, b, c, area = _shape(vertices, faces, t, sphere, points)
@@ -103,7 +104,7 @@ def _count(start, stop, vertices, faces, sphere, wanted):
             wanted[t] = 2 if max(a, b, c) < SMALL else 1
 
 
-@loop(error_model="numpy")
+@loop
 def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners, margins):
     points, along, side, across = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for t in range(start, stop):
@@ -147,7 +148,7 @@ def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners
                 corners[3 * at + 2, r] = points[p, r] - wide * (0.9 * across[r] + 0.5 * side[r])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _perpendicular(points, p, s, along, height, side):
     """A unit vector across `along`, in the plane of the triangle if it has one."""
     if height > 1e-12:

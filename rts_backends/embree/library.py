@@ -60,12 +60,12 @@ def find() -> str | None:
         "darwin": [package / ".dylibs" / "libembree4*", package.parent / "embreex.dylibs" / "libembree4*"],
         "win32": [package.parent / "embreex.libs" / "embree4*.dll", package / "embree4*.dll"],
     }.get(sys.platform, [package.parent / "embreex.libs" / "libembree4*"])
-    found = [path for pattern in patterns for path in sorted(glob.glob(str(pattern)))]
-    return found[0] if found else ctypes.util.find_library("embree4")
+    paths = [path for pattern in patterns for path in sorted(glob.glob(str(pattern)))]
+    return paths[0] if paths else ctypes.util.find_library("embree4")
 
 
 def load() -> ctypes.CDLL | None:
-    """The library with its signatures, or None where it cannot be found."""
+    """The library with its signatures, or None if it is missing."""
     global _library, _device
     with _first_use:
         if _library is None:

@@ -70,9 +70,9 @@ def _pointer(typing_context, address):
     return types.voidptr(types.intp), generate
 
 
-@compiled(error_model="numpy")
+@compiled
 def _decide(t, state, work, vertices, faces):
-    """Whether a triangle is hit, and at which depth; see `cast` for `work`."""
+    """True if a triangle is hit, and the depth of the hit; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -175,7 +175,7 @@ def keep_nearest_address() -> int:
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
-@loop(error_model="numpy")
+@loop
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
     vertices, faces, owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
@@ -194,7 +194,7 @@ def cast(
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
         planes: (4,) depths outside of which near or far plane clips, and between which neither does.
         keep: sign of the determinants to keep, or 0.
-        left_out: 1 to leave out what is seen from behind, −1 what is seen from the front, or 0.
+        left_out: 1 to leave out triangles seen from behind, −1 from the front, 0 for none.
         vertices: (V, 3) of the proxy.
         faces: (T, 3).
         owners: (M,) of `Covers`.
@@ -288,7 +288,7 @@ def cast(
 
 @compiled
 def _pixels(tile, across, width, height, cells, at, columns, lines):
-    """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; how many there are."""
+    """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; and their number."""
     count = 0
     if len(cells) > 0:
         for m in range(tile * TILE * TILE, min(len(cells), (tile + 1) * TILE * TILE)):
@@ -305,7 +305,7 @@ def _pixels(tile, across, width, height, cells, at, columns, lines):
     return count
 
 
-@compiled(error_model="numpy")
+@compiled
 def _aim(space, sphere, planes, x, y, ray, state):
     """Write the ray through an NDC position, from where it meets the object's sphere; False if it misses.
 

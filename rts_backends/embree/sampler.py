@@ -62,8 +62,8 @@ class Embree(TriangleSampler):
         """See `TriangleSampler.rasterize`."""
         scene = prepared.scene
         if isinstance(scene, embreex_fallback.Scene):
-            given = prepared.proxy, prepared.covers.owners, prepared.sphere, _planes(camera.projection)
-            return scene.cast(*given, camera, size, layers, cull)
+            arguments = prepared.proxy, prepared.covers.owners, prepared.sphere, _planes(camera.projection)
+            return scene.cast(*arguments, camera, size, layers, cull)
         return _cast(prepared, camera, size, cull, np.empty(0, np.int32), (layers, *size))
 
     def rasterize_cells(
@@ -84,7 +84,7 @@ def _cast(
     (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(cells) // TILE**2) if len(cells) else -(-height // TILE) * -(-width // TILE)
     flat = np.empty((shape[0], count), np.int32), np.empty((shape[0], count, 2), np.float32)
-    found = *flat, np.empty((shape[0], count), np.float32)
+    arrays = *flat, np.empty((shape[0], count), np.float32)
     parallel(
         cast,
         tiles,
@@ -105,9 +105,9 @@ def _cast(
         width,
         height,
         cells,
-        *found,
+        *arrays,
     )
-    ids, barycentrics, depth = found
+    ids, barycentrics, depth = arrays
     return Fragments(ids.reshape(shape), barycentrics.reshape(*shape, 2), depth.reshape(shape))
 
 

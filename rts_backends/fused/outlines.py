@@ -114,7 +114,7 @@ def narrow(start, stop, ends, wanted, kept, counts):
             counts[y] += bits & LISTED != 0
 
 
-@compiled
+@compiled(inline="always")
 def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
@@ -147,7 +147,7 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     return beta, partner
 
 
-@compiled
+@compiled(inline="always")
 def _has_chord(row, part, one_part, y, x):
     """Whether the second layer of a cell that has a front is known to be of the front's part."""
     if one_part:
@@ -155,27 +155,27 @@ def _has_chord(row, part, one_part, y, x):
     return len(part) > 1 and part[0, y, x] == part[1, y, x]
 
 
-@compiled
+@compiled(inline="always")
 def _covered(row, y, x):
     """Whether there is a cell, and a sample in it."""
     _, height, width = row.shape
     return 0 <= y < height and 0 <= x < width and row[0, y, x] >= 0
 
 
-@compiled
+@compiled(inline="always")
 def _back(row, exits, leaves, y, x):
     """The sample at the other end of a cell's chord, or −1: where the ray leaves, or of the second layer."""
     return exits[y, x] if leaves else row[min(1, len(row) - 1), y, x]
 
 
-@compiled
+@compiled(inline="always")
 def _gap(positions, row, exits, leaves, y, x):
     """How far the other end of a chord lies behind the front of a cell; NaN, which compares as false, without one."""
     i, j = row[0, y, x], _back(row, exits, leaves, y, x)
     return positions[j, 2] - positions[i, 2] if j >= 0 else positions.dtype.type(np.nan)
 
 
-@compiled
+@compiled(inline="always")
 def _ratio(positions, row, ends, y, x, v, u, flat):
     """The ratio r of `rts.splatting.rims` along a usable direction; 0 where the surface does not go on, or not fall."""
     zero, py, px = positions.dtype.type(0), y - 2 * v, x - 2 * u
@@ -270,7 +270,7 @@ def fill(
                 d += 1
 
 
-@compiled
+@compiled(inline="always")
 def _any(ends):
     some = np.uint16(0)
     for x in range(len(ends)):
@@ -281,7 +281,7 @@ def _any(ends):
 # Not handed views of single targets, since to make these takes as long as the work.
 
 
-@compiled
+@compiled(inline="always")
 def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples):
     """List the slopes of the weights of the fronts around a target, and what each gives if none is mixed.
 
@@ -314,7 +314,7 @@ def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, w
     return red, green, blue, alpha, weight
 
 
-@compiled
+@compiled(inline="always")
 def _change(gives, changes, d, total):
     """How the colour of a target changes with its coverage, to which all fronts around it give."""
     zero, one = changes.dtype.type(0), changes.dtype.type(1)
@@ -326,13 +326,13 @@ def _change(gives, changes, d, total):
         _clear(gives, d)
 
 
-@compiled
+@compiled(inline="always")
 def _clear(gives, d):
     for n in range(9):
         gives[d, n] = NOTHING
 
 
-@compiled
+@compiled(inline="always")
 def _change_mixed(changes, d, sums, m):
     """How the colour of a mixed target changes with the coverage of its buffers, and whether these may change."""
     zero, one = sums.dtype.type(0), sums.dtype.type(1)
@@ -346,7 +346,7 @@ def _change_mixed(changes, d, sums, m):
     return front, surface
 
 
-@compiled
+@compiled(inline="always")
 def _list(gives, d, ranges, m, front, surface):
     """What the sources of a mixed target give, of which all those with a front are marked."""
     for n in range(9):
@@ -357,7 +357,7 @@ def _list(gives, d, ranges, m, front, surface):
                 gives[d, n] = NOTHING
 
 
-@compiled
+@compiled(inline="always")
 def _part(gives, d, part, ends, y, x):
     """Sources of other parts than the target's move as their own outlines, if any: there may be a gap between."""
     n = 0
@@ -368,7 +368,7 @@ def _part(gives, d, part, ends, y, x):
             n += 1
 
 
-@compiled
+@compiled(inline="always")
 def _outline(t_positions, row, beta, partner, y, x, axis):
     """The motion v̂ of the outline beside a cell, along an axis."""
     b, own = beta[y, x], t_positions[row[0, y, x], axis]
@@ -429,27 +429,28 @@ def _pull(start, stop, row, outlines, border, g, first, g_positions):
         _pull_rows(border + top, border + min(top + BAND, len(g)), row, outlines, border, g, width, zero, g_positions)
 
 
-@compiled
+@compiled(inline="always")
 def _pull_rows(top, bottom, row, outlines, border, g, width, zero, g_positions):
     """`pull` of some rows."""
+    _, _, offsets, columns, gives, slopes, changes = outlines
     for y in range(top, bottom):
-        for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
-            x = outlines.columns[d]
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d]
             if not 0 <= x - border < width:
                 continue
             front, surface = zero, zero
             for c in range(4):
-                front += g[y - border, x - border, c] * outlines.changes[d, 0, c]
-                surface += g[y - border, x - border, c] * outlines.changes[d, 1, c]
+                front += g[y - border, x - border, c] * changes[d, 0, c]
+                surface += g[y - border, x - border, c] * changes[d, 1, c]
             if front == zero and surface == zero:
                 continue
             joined_x, joined_y, n = zero, zero, 0
             for v in range(-1, 2):
                 for u in range(-1, 2):
-                    given = outlines.gives[d, n]
+                    given = gives[d, n]
                     if given != NOTHING:
                         h = front if given == FRONT else surface
-                        h_x, h_y = h * outlines.slopes[d, n, 0], h * outlines.slopes[d, n, 1]
+                        h_x, h_y = h * slopes[d, n, 0], h * slopes[d, n, 1]
                         if given == JOINED:
                             i = row[0, y - v, x - u]
                             g_positions[i, 0] -= h_x
@@ -465,7 +466,7 @@ def _pull_rows(top, bottom, row, outlines, border, g, width, zero, g_positions):
                 _lead(g_positions, row, outlines, y, x, joined_x, joined_y)
 
 
-@compiled
+@compiled(inline="always")
 def _lead(g_positions, row, outlines, y, x, g_x, g_y):
     """Hand on the gradient of what the outline beside a cell moves more than its front: to that, and to its partner."""
     b = outlines.beta[y, x]

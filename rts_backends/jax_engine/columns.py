@@ -19,53 +19,53 @@ SHORT = 4
 
 
 def summed_by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that computes what `f` does, with such sums by columns; arrays to trees of arrays."""
+    """`f` with its short sums (`_is_short`) computed column by column; arrays to trees of arrays."""
 
     def call(*arrays: Any) -> Any:
         traced, shapes = jax.make_jaxpr(f, return_shape=True)(*arrays)
-        found = _evaluated(traced.jaxpr, traced.consts, arrays)
-        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+        results = _evaluated(traced.jaxpr, traced.consts, arrays)
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return call
 
 
 def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-    """The results of a program: jax computes what is as it was, between equations that are not."""
+    """The results of a program: jax evaluates all equations but the short sums, which are computed by columns."""
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
     debug = jaxpr.debug_info.with_unknown_names()
     rest = list(jaxpr.eqns)
     while rest:
         count = next((i for i, equation in enumerate(rest) if _is_call(equation) or _is_short(equation)), len(rest))
         run, rest = rest[:count], rest[count:]
-        made = {x for equation in run for x in equation.outvars}
-        needed, given = [x for x in variables(rest, jaxpr.outvars) if x in made], [*known]
-        kept = jaxpr.replace(constvars=[], invars=given, outvars=needed, eqns=run, debug_info=debug)
+        outputs = {x for equation in run for x in equation.outvars}
+        needed, inputs = [x for x in variables(rest, jaxpr.outvars) if x in outputs], [*known]
+        kept = jaxpr.replace(constvars=[], invars=inputs, outvars=needed, eqns=run, debug_info=debug)
         known.update(zip(needed, eval_jaxpr(kept, [], *known.values()), strict=True))
         if rest:
             equation, *rest = rest
             values = [x.val if isinstance(x, Literal) else known[x] for x in equation.invars]
             if _is_call(equation):
                 inner = equation.params["jaxpr"]
-                found = _evaluated(inner.jaxpr, inner.consts, values)
+                results = _evaluated(inner.jaxpr, inner.consts, values)
             else:
-                found = [sum(values[0][..., i] for i in range(values[0].shape[-1]))]
-            known.update(zip(equation.outvars, found, strict=True))
+                results = [sum(values[0][..., i] for i in range(values[0].shape[-1]))]
+            known.update(zip(equation.outvars, results, strict=True))
     return [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
 
 
 def variables(equations: Sequence[JaxprEqn], more: Sequence[Any] = ()) -> dict[Any, None]:
-    """The variables that equations read, and those among others; in their order."""
+    """The variables that equations read, and the variables among `more`, in this order."""
     read = [*(x for equation in equations for x in equation.invars), *more]
     return dict.fromkeys(x for x in read if not isinstance(x, Literal))
 
 
 def _is_call(equation: JaxprEqn) -> bool:
-    """Whether an equation calls a function that was compiled by itself."""
+    """True if an equation calls a function that was compiled by itself."""
     return equation.primitive.name in ("jit", "pjit")
 
 
 def _is_short(equation: JaxprEqn) -> bool:
-    """Whether a sum is along the last axis alone, of few numbers, beside a longer one."""
+    """True for a sum over few numbers along the last axis alone, where the first axis is longer."""
     if equation.primitive.name != "reduce_sum":
         return False
     aval: Any = equation.invars[0].aval

@@ -48,7 +48,7 @@ class JaxEngine(Engine):
         self._used = UsedRows()
 
     def owns(self, x: Any) -> bool:
-        """Whether `x` is a jax array or a tracer."""
+        """True for a jax array or a tracer."""
         return isinstance(x, jax.Array)
 
     def constant(self, value: Any, like: jax.Array | None = None) -> jax.Array:
@@ -75,11 +75,11 @@ class JaxEngine(Engine):
 
         def noticed(*host_args: Any) -> Sequence[np.ndarray | np.generic]:
             try:
-                found = fn(*host_args)
+                results = fn(*host_args)
             except RtsError as error:
                 self._error = error
                 raise
-            return [*found, np.int32(max((len(found[i]) for i in packed), default=0))]
+            return [*results, np.int32(max((len(results[i]) for i in packed), default=0))]
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         *results, used = host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
@@ -88,11 +88,11 @@ class JaxEngine(Engine):
         return tuple(results)
 
     def traced(self, x: jax.Array) -> bool:
-        """Whether `x` is a tracer."""
+        """True for a tracer."""
         return isinstance(x, Tracer)
 
     def plain(self, x: jax.Array) -> bool:
-        """Whether it is of real numbers."""
+        """True for an array of real numbers."""
         return getattr(x.dtype, "kind", None) in _REAL_KINDS
 
     def admitted(self, x: jax.Array, name: str) -> jax.Array:
@@ -102,12 +102,12 @@ class JaxEngine(Engine):
         return x
 
     def known(self, x: jax.Array) -> np.ndarray | None:
-        """The value; under `grad` and `jvp` of what is eager, too."""
+        """The value, also under an eager `grad` or `jvp`."""
         x = jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
         return None if isinstance(x, Tracer) else np.asarray(x)
 
     def on_host(self, *arrays: jax.Array) -> bool:
-        """Whether all are on CPUs; of a tracer that is not known yet, and taken to be so."""
+        """True if all arrays are on CPUs. The device of a tracer is not known yet, and taken to be one."""
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
@@ -117,7 +117,7 @@ class JaxEngine(Engine):
         return super().by_host(f, otherwise, *arrays)
 
     def take_error(self) -> RtsError | None:
-        """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""
+        """The error of the latest host call under a trace, once; jax replaces it by an error of its own."""
         error, self._error = self._error, None
         return error
 
@@ -140,7 +140,7 @@ class JaxEngine(Engine):
         return True
 
     def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
-        """By selection, which XLA can fuse with what reads it; ones where no cell refers to any row."""
+        """Rows filled by selection, which XLA can fuse with later code; ones where no cell refers to any row."""
         used = jnp.max(row) + 1
         index = jnp.arange(x.shape[0]).reshape(-1, *[1] * (x.ndim - 1))
         return jnp.where(index < used, x, jnp.where(used > 0, x[:1], 1))
@@ -158,8 +158,8 @@ class JaxEngine(Engine):
             with operations.by_specification():
                 return f(dict(zip(rows, own, strict=True)))
 
-        found = row_blocks.apply(few, used, list(rows.values()))
-        return whole if found is None else found
+        result = row_blocks.apply(few, used, list(rows.values()))
+        return whole if result is None else result
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""
@@ -170,7 +170,7 @@ class JaxEngine(Engine):
         return np.asarray(x)
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int) -> Tree:
-        """A loop of Python's as long as values are known, which compiles nothing; else `jax.lax.while_loop`."""
+        """A Python loop while values are known, which compiles nothing; else `jax.lax.while_loop`."""
         state = jax.lax.stop_gradient(state)
         for count in range(most):
             on = going(state)
@@ -189,8 +189,8 @@ class JaxEngine(Engine):
         pieces = jnp.pad(rows, ((0, -count % size), *[(0, 0)] * (rows.ndim - 1))).reshape(-1, size, *rows.shape[1:])
         first = f(pieces[0])
         traced = isinstance(first, Tracer)
-        found = jax.lax.map(f, pieces) if traced else jnp.stack([first, *[f(piece) for piece in pieces[1:]]])
-        return found.reshape(-1, *found.shape[2:])[:count]
+        mapped = jax.lax.map(f, pieces) if traced else jnp.stack([first, *[f(piece) for piece in pieces[1:]]])
+        return mapped.reshape(-1, *mapped.shape[2:])[:count]
 
     @staticmethod
     def _looped(body: Callable, going: Callable, state: Tree, most: int) -> Tree:
@@ -215,16 +215,16 @@ class JaxEngine(Engine):
         return jax.value_and_grad(f)
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
-        """By `jax.checkpoint` of `f`. What `make` gave is kept: to trace `make` would fix the shapes of its arrays."""
-        made = make()
-        return jax.checkpoint(lambda: f(made))()
+        """`jax.checkpoint` of `f`. The result of `make` is kept: to trace `make` would fix the shapes of its arrays."""
+        operand = make()
+        return jax.checkpoint(lambda: f(operand))()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""
         return jax.jvp(f, (primal,), (tangent,))
 
     def jacobian(self, f: Callable) -> Callable:
-        """By forward-mode autodiff, all unknowns in one vectorised pass."""
+        """The Jacobian by forward-mode autodiff, all unknowns in one vectorised pass."""
 
         def call(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
             along = jnp.eye(vector.size, dtype=vector.dtype)

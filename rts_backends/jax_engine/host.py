@@ -45,8 +45,8 @@ def filled(
             dtype. XLA makes copies of such operands where something else reads them later.
     """
 
-    def fill(_: Any, results: Sequence[Any], *given: Any) -> None:
-        read = [np.asarray(x) for x in given]
+    def fill(_: Any, results: Sequence[Any], *operands: Any) -> None:
+        read = [np.asarray(x) for x in operands]
         for x in read:
             x.flags.writeable = False
         function(read, [np.asarray(x) for x in results])
@@ -84,12 +84,12 @@ def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, l
         it = iter(own)
         return _call.bind(*(x if d is None else next(it) for x, d in zip(operands, dims, strict=True)), **params)
 
-    found = jax.lax.map(item, mapped)
-    return found, [0] * len(found)
+    results = jax.lax.map(item, mapped)
+    return results, [0] * len(results)
 
 
 def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], Any]:
-    """The call with those of its results that are wanted."""
+    """The call with only the wanted results."""
     if not any(wanted):
         return [False] * len(equation.invars), None
     used = tuple(i for i, wish in zip(equation.params["used"], wanted, strict=True) if wish)
@@ -98,10 +98,10 @@ def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], 
 
 
 def _in_place(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
-    def fill(given: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        found = function(*given)
+    def fill(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        arrays = function(*operands)
         for i, result in zip(used, results, strict=True):
-            _write(result, found[i])
+            _write(result, arrays[i])
 
     return filled(fill, [shapes[i] for i in used], *operands)
 
@@ -109,10 +109,10 @@ def _in_place(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequ
 def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
     own = [shapes[i] for i in used]
 
-    def whole(*given: Any) -> list[np.ndarray]:
-        found, results = function(*map(np.asarray, given)), [np.empty(shape.shape, shape.dtype) for shape in own]
+    def whole(*operands: Any) -> list[np.ndarray]:
+        arrays, results = function(*map(np.asarray, operands)), [np.empty(shape.shape, shape.dtype) for shape in own]
         for i, result in zip(used, results, strict=True):
-            _write(result, found[i])
+            _write(result, arrays[i])
         return results
 
     return list(jax.pure_callback(whole, own, *operands))

@@ -1,4 +1,4 @@
-"""Operations as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and what is made of them.
+"""Operations as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and their combinations.
 
 Three primitives an operation: its value, its pushforward and its pullback. Each of the last two is linear in the
 tangents or the gradients, and the transpose of the other; their derivatives by the operands, which are second
@@ -33,10 +33,10 @@ from rts_backends.jax_engine.host import clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
-"""Which of the differentiable operands have a tangent or want a gradient."""
+"""Marks of the differentiable operands that have a tangent or want a gradient."""
 
 MOST_KEPT = 1 << 24
-"""The most bytes that are kept of what values leave to derivatives."""
+"""The most bytes that values keep for derivatives."""
 
 
 def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any], used: Any) -> jax.Array:
@@ -46,7 +46,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
         operation: the operation.
         operands: its operands.
         params: its parameters.
-        used: how many rows of packed operands are in use, () int32.
+        used: the number of rows of packed operands in use, () int32.
     """
     if operation not in _bound:
         _bound[operation] = _Differentiable(operation, _name(operation), params)
@@ -55,7 +55,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
 
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
-    """Whether loops may compute it: dtypes are theirs; on what device arrays are, a traced function cannot know."""
+    """True if loops may compute the operation, by its dtypes; a traced function cannot know the device of arrays."""
     return not _specifying.get() and operation.fits([x.dtype for x in operands])
 
 
@@ -64,7 +64,7 @@ _specifying = contextvars.ContextVar("rts_specifying", default=False)
 
 @contextlib.contextmanager
 def by_specification() -> Iterator[None]:
-    """Within it no operation `fits`."""
+    """A context within which no operation `fits`."""
     token = _specifying.set(True)
     try:
         yield
@@ -151,7 +151,7 @@ class _Differentiable:
 
     @staticmethod
     def told(operation: Operation) -> bool:
-        """Whether its functions are told how many rows are in use."""
+        """True if the operation's functions take the number of rows in use."""
         return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:
@@ -161,7 +161,7 @@ class _Differentiable:
     # ------------------------------------------------------------------------------------------ by compiled loops
 
     def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
-        """The operands, of packed ones the rows in use; their number; and what the value has kept."""
+        """The operands, packed ones without unused rows; the number of rows; and the arrays that the value has kept."""
         operands = [read_only(x) for x in given[: self._inputs]]
         operation, used = self.operation, 0
         if operation.packed:
@@ -318,7 +318,7 @@ def _whole(operation: HostPrimitive, params: tuple) -> Callable:
 
 
 def _spread(given: Sequence, wanted: Wanted) -> list:
-    """The given things in the places that are wanted, and None in the others."""
+    """A list with the items at wanted places, and None elsewhere."""
     it = iter(given)
     return [next(it) if wish else None for wish in wanted]
 
@@ -348,5 +348,5 @@ def _name(operation: Operation) -> str:
 
 
 def _summed(x: jax.Array, rank: int) -> jax.Array:
-    """The sum over items, for what they share."""
+    """The sum over items of a batch, for an operand that they share."""
     return x.sum(0) if x.ndim > rank else x

@@ -32,8 +32,8 @@ class HostPrimitive:
         host: fills the results for one item.
         specified: computes the results by specification.
         even: see `Operation`.
-        noted: whether the last result is a note.
-        some: whether of the operands after the samples there are only those that a parameter `wanted` says.
+        noted: True if the last result is a note.
+        some: True if the operands after the samples are only those that a parameter `wanted` marks.
         in_place: indices of operands whose gradients may take their places; the results are gradients of those of the
             first operands that the parameter `wanted` says, with an axis before. `host` finds then that they share
             memory.
@@ -76,14 +76,14 @@ class HostPrimitive:
         return (function if not any(a == 0 for a in axes) else jax.vmap(function, axes))(*operands)
 
     def _own_ranks(self, params: dict) -> list[int]:
-        """Ranks of those operands that there are: tangents may be of one alone."""
+        """Ranks of the operands that are present: tangents may be of one alone."""
         samples, rest = self.ranks[: self.samples], self.ranks[self.samples :]
         if self._some:
             rest = (r for r, wish in zip(rest, params["wanted"], strict=True) if wish)
         return [*samples, *rest]
 
     def _by_item(self, operands: Sequence[Any], params: dict) -> list[bool]:
-        """Which operands have the axis B."""
+        """Marks of the operands that have the axis B."""
         return [x.ndim > rank for x, rank in zip(operands, self._own_ranks(params), strict=True)]
 
     def _results(self, operands: Sequence[Any], params: dict) -> list[jax.ShapeDtypeStruct]:
@@ -122,9 +122,9 @@ class HostPrimitive:
         alike = set(places.values())
         own = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
 
-        def call(*given: jax.Array) -> list[jax.Array]:
-            found = host.filled(filler, own, *given, in_place=places)
-            return [x[None] if i in alike else x for i, x in enumerate(found)]
+        def call(*arrays: jax.Array) -> list[jax.Array]:
+            results = host.filled(filler, own, *arrays, in_place=places)
+            return [x[None] if i in alike else x for i, x in enumerate(results)]
 
         def filler(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
             self._on_host(operands, [x[None] if i in alike else x for i, x in enumerate(results)], params)
@@ -135,12 +135,12 @@ class HostPrimitive:
         device = _cpu_of(operands)
         if device is None:
             return _compiled(self.primitive, tuple(params.items()))(*operands)
-        found = [np.empty(result.shape, result.dtype) for result in self._results(operands, params)]
-        self._on_host([np.asarray(x) for x in operands], found, params)
+        results = [np.empty(result.shape, result.dtype) for result in self._results(operands, params)]
+        self._on_host([np.asarray(x) for x in operands], results, params)
         if any(x.committed for x in operands if isinstance(x, jax.Array)):
-            return jax.device_put(found, device)
+            return jax.device_put(results, device)
         with jax.default_device(device):
-            return jax.device_put(found)
+            return jax.device_put(results)
 
     def _batched(self, operands: Sequence[Any], dims: Sequence, **params: Any) -> tuple[list[jax.Array], list[int]]:
         mapped = [d is not None for d in dims]
@@ -159,8 +159,8 @@ class HostPrimitive:
                 x = jnp.moveaxis(x, 0, at)
                 x = x.reshape(*x.shape[:at], size * x.shape[at + 1], *x.shape[at + 2 :])
             folded.append(x)
-        found, at = self(*folded, **params), int(by_item)
-        return [x.reshape(*x.shape[:at], size, -1, *x.shape[at + 1 :]) for x in found], [at] * len(found)
+        results, at = self(*folded, **params), int(by_item)
+        return [x.reshape(*x.shape[:at], size, -1, *x.shape[at + 1 :]) for x in results], [at] * len(results)
 
     def _over_samples(
         self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
@@ -168,16 +168,16 @@ class HostPrimitive:
         """Compute a batch whose items have samples of their own, item by item."""
         inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
         if not inner:
-            found = self(*operands, **params)
-            return found, [0] * len(found)
+            results = self(*operands, **params)
+            return results, [0] * len(results)
         lead = size, inner[0]
         for i, (x, m, rank) in enumerate(zip(operands, mapped, ranks, strict=True)):
             if m or x.ndim > rank:
                 own = x.shape[x.ndim - rank :]
                 x = x[:, None] if m and x.ndim == rank + 1 else x
                 operands[i] = jnp.broadcast_to(x, (*lead, *own)).reshape(size * inner[0], *own)
-        found = self(*operands, **params)
-        return [x.reshape(*lead, *x.shape[1:]) for x in found], [0] * len(found)
+        results = self(*operands, **params)
+        return [x.reshape(*lead, *x.shape[1:]) for x in results], [0] * len(results)
 
 
 def _only_row(value: Any) -> Any:
@@ -199,7 +199,7 @@ def _only_row(value: Any) -> Any:
 
 
 def _read_once(value: Any) -> bool:
-    """Whether an array in a program that is about to be compiled is made there, and one operation reads it so far."""
+    """True for an array that a program about to be compiled makes, and only one operation reads so far."""
     name = getattr(value.owner, "name", "stablehlo.constant")  # An argument's owner has no name.
     return name != "stablehlo.constant" and sum(1 for _ in value.uses) == 1
 

@@ -23,14 +23,14 @@ from jax.interpreters import ad, batching, mlir
 from rts_backends.jax_engine.columns import summed_by_columns, variables
 
 PIECE = 1 << 11
-"""Rows that are taken at a time: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in
-caches, and that XLA does not wake its other threads for each."""
+"""Rows of a piece: enough to be worth XLA's calls, and few enough that intermediate arrays stay in caches, and that XLA
+does not wake its other threads for each."""
 
 LEAST = 1 << 15
-"""Rows, below which all are computed: a loop would take as long as it saves."""
+"""Below this number of rows all are computed: a loop would cost as much as it saves."""
 
 CLOSED = 1 << 16
-"""The most numbers that a function may close over: their gradients are as large as they are, for each piece."""
+"""The most numbers that a function may close over: each piece has a gradient of their size."""
 
 
 def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array]) -> jax.Array | None:
@@ -38,12 +38,12 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 
     Args:
         f: arrays (n, ·) → (n, ·), for any n.
-        used: how many rows are in use, () int32.
+        used: the number of rows in use, () int32.
         rows: arrays (N, ·).
 
     Returns:
-        The value, or None where the whole of it may as well be computed: of few rows; of a function that closes over
-        much, that does not read rows, or that has effects, which must happen once.
+        The value, or None where all rows may as well be computed: they are few, or the function closes over much, does
+        not read rows, or has effects, which must happen once.
     """
     if rows[0].shape[0] < max(LEAST, PIECE):
         return None
@@ -59,7 +59,7 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
-    """A function without what does not depend on its arguments, and the results of that, which it takes before them."""
+    """A function without the equations that its arguments do not enter; it takes their results, returned, first."""
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
         # Numbers spread over the rows of a piece are no less to keep than to make.
@@ -72,8 +72,8 @@ def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any
     known = [*jaxpr.constvars, *(x for equation in before for x in equation.outvars)]
     known = [x for x in known if x in read]
     names = jaxpr.debug_info.with_unknown_names()
-    found = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
-    return jaxpr.replace(constvars=[], invars=[*known, *jaxpr.invars], eqns=rest, debug_info=names), found
+    values = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
+    return jaxpr.replace(constvars=[], invars=[*known, *jaxpr.invars], eqns=rest, debug_info=names), values
 
 
 _SPREADING = {"broadcast_in_dim", "iota"}
@@ -82,14 +82,14 @@ _SPREADING = {"broadcast_in_dim", "iota"}
 
 
 class _Pieces:
-    """How a function of rows is computed.
+    """A function of rows, computed piece by piece.
 
     Args:
         jaxpr: the function of a piece: arrays that are the same for all pieces, and arrays (n, ·) → (n, ·).
         operands: its operands, the latter (N, ·).
-        fixed: how many are the same for all pieces.
-        most: how many rows are in use, at most; None to go through all.
-        used: how many rows are in use.
+        fixed: the number of operands that are the same for all pieces.
+        most: the largest number of rows in use; None to go through all.
+        used: the number of rows in use.
     """
 
     def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], fixed: int, most: Any, used: Any):
@@ -121,28 +121,28 @@ class _Pieces:
         """The rows of a piece."""
         return jax.lax.dynamic_slice_in_dim(x, start, self._size)
 
-    def among(self, x: Any, there: jax.Array, other: Any) -> Any:
-        """The rows of a piece that are there, and others."""
-        return jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, other)
+    def among(self, x: Any, in_use: jax.Array, other: Any) -> Any:
+        """The rows of a piece that are in use; `other` in place of the rest."""
+        return jnp.where(in_use.reshape(-1, *[1] * (x.ndim - 1)), x, other)
 
     def index(self, start: Any) -> jax.Array:
         """The number of each row of a piece."""
         return start + jnp.arange(self._size)
 
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
-        """The value of a piece as a function of those operands that are wanted, closed ones and pieces, and these."""
+        """The value of a piece as a function of the wanted operands, closed ones and pieces; and these operands."""
         operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
-        there = self.index(start) < self._used
+        in_use = self.index(start) < self._used
 
         def function(*varied: Any) -> jax.Array:
             it = iter(varied)
-            given = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
+            values = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
             own = []
-            for x, whole in zip(given[self.fixed :], self._rows, strict=True):
-                # What is not in use may hold values at which there are no derivatives.
+            for x, whole in zip(values[self.fixed :], self._rows, strict=True):
+                # Unused rows may hold values at which there are no derivatives.
                 other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
-                own.append(self.among(x, there, other))
-            return eval_jaxpr(self._jaxpr, [], *given[: self.fixed], *own)[0]
+                own.append(self.among(x, in_use, other))
+            return eval_jaxpr(self._jaxpr, [], *values[: self.fixed], *own)[0]
 
         return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
 
@@ -157,9 +157,9 @@ def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr, fixed: int) ->
     return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The derivative along tangents of those operands that are wanted, which follow the operands."""
-    operands, tangents = given[: len(wanted)], given[len(wanted) :]
+def _pushed(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
+    """The derivative along tangents of the wanted operands; tangents follow the operands."""
+    operands, tangents = arrays[: len(wanted)], arrays[len(wanted) :]
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
 
@@ -172,19 +172,19 @@ def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted:
     return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The gradients of those operands that are wanted; that of the value follows the operands."""
-    *operands, g = given
+def _pulled(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
+    """The gradients of the wanted operands; the gradient of the value follows the operands."""
+    *operands, g = arrays
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
 
-    def step(start: Any, first: Any, found: list[jax.Array]) -> list[jax.Array]:
+    def step(start: Any, first: Any, totals: list[jax.Array]) -> list[jax.Array]:
         function, varied = pieces.varying(start, wanted)
         # The last piece may begin with rows of the one before.
         own = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
         gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(own)
-        sums = [a + b for a, b in zip(found[:same], gradients[:same], strict=True)]
-        for whole, x in zip(found[same:], gradients[same:], strict=True):
+        sums = [a + b for a, b in zip(totals[:same], gradients[:same], strict=True)]
+        for whole, x in zip(totals[same:], gradients[same:], strict=True):
             sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
         return sums
 
@@ -196,24 +196,24 @@ def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted:
 
 
 def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
-    """A primitive of one of the functions, whose first operands say how many rows are in use: at most, and each item.
+    """A primitive of one of the functions; its first operands are the numbers of rows in use: at most, and of the item.
 
     Args:
         name: its name.
         function: computes it.
         results: shapes and dtypes of the operands after these, and parameters → those of the results.
     """
-    made = Primitive(f"rts_rows_in_use_{name}")
-    made.multiple_results = True
-    made.def_impl(function)
-    made.def_abstract_eval(lambda most, used, *avals, **params: results(*avals, **params))
-    mlir.register_lowering(made, mlir.lower_fun(function, multiple_results=True))
+    primitive = Primitive(f"rts_rows_in_use_{name}")
+    primitive.multiple_results = True
+    primitive.def_impl(function)
+    primitive.def_abstract_eval(lambda most, used, *avals, **params: results(*avals, **params))
+    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=True))
 
     def batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
         # One loop serves all items, as long as the longest.
         most = operands[0] if dims[0] is None else jnp.max(operands[0])
-        found = jax.vmap(functools.partial(function, most, **params), tuple(dims[1:]))(*operands[1:])
-        return found, [0] * len(found)
+        results = jax.vmap(functools.partial(function, most, **params), tuple(dims[1:]))(*operands[1:])
+        return results, [0] * len(results)
 
     def along(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
         present = _present(tangents)
@@ -224,15 +224,15 @@ def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
             _, *given = (next(it) if t else x for x, t in zip(primals, present, strict=True))
             return function(None, *given, **params)
 
-        return made.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
+        return primitive.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
 
-    batching.primitive_batchers[made] = batched
-    ad.primitive_jvps[made] = along
-    return made
+    batching.primitive_batchers[primitive] = batched
+    ad.primitive_jvps[primitive] = along
+    return primitive
 
 
 def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
-    """Which tangents there are; integers have none."""
+    """Marks of the tangents that are not zero; integers have none."""
     return tuple(type(t) is not ad.Zero and t.dtype != jax.dtypes.float0 for t in tangents)
 
 
@@ -251,11 +251,11 @@ _pull = _primitive("pull", _pulled, _like_operands)
 
 
 def _value_jvp(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
-    found, wanted = _value.bind(*primals, **params), _present(tangents[2:])
-    along = [t for t, there in zip(tangents[2:], wanted, strict=True) if there]
+    results, wanted = _value.bind(*primals, **params), _present(tangents[2:])
+    along = [t for t, wish in zip(tangents[2:], wanted, strict=True) if wish]
     if not along:
-        return found, [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in found]
-    return found, _push.bind(*primals, *along, wanted=wanted, **params)
+        return results, [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in results]
+    return results, _push.bind(*primals, *along, wanted=wanted, **params)
 
 
 def _push_transpose(gradients: Sequence, *given: Any, wanted: tuple[bool, ...], **params: Any) -> list:

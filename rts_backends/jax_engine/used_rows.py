@@ -1,4 +1,4 @@
-"""How many rows are in use of the packed arrays of a program that is being traced; the others are zero."""
+"""The number of rows in use of packed arrays while a program is traced; the other rows are zero."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class UsedRows:
         self._record: dict[int, tuple[weakref.ref, jax.Array | np.int32]] = {}
 
     def note(self, x: jax.Array, used: jax.Array | np.int32) -> None:
-        """Record how many rows are in use of an array of a program, () int32; those of known values are not needed."""
+        """Record the number () int32 of rows in use of a traced array; arrays of known values need no record."""
         if isinstance(x, Tracer):
             key = id(x)
             self._record[key] = weakref.ref(x, lambda _: self._record.pop(key, None)), used
 
     def used(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
-        """How many rows are in use of arrays (N, ·) that belong together, as far as that is known of any of them."""
+        """The number of rows in use of arrays (N, ·) that belong together; all rows where none has a record."""
         for x in packed:
             known = self._record.get(id(x))
             if known is not None and known[0]() is x:

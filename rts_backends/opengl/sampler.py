@@ -91,7 +91,7 @@ class Buffers:
 
 
 class OpenGL(TriangleSampler):
-    """Depth peeling on whatever device the system's EGL offers; Mesa's llvmpipe where there is none."""
+    """Depth peeling on a device that the system's EGL offers, or on Mesa's llvmpipe."""
 
     def __init__(self) -> None:
         self._worker = Worker()
@@ -152,7 +152,7 @@ def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
 
 
 def _ratio(camera: Camera, near: float, far: float) -> float:
-    """How many times as wide a pixel is at one depth as at another; infinity where it is a point there."""
+    """The width of a pixel at depth `far` over that at `near`; infinity where the pixel is a point at `near`."""
     first, last = (camera.projection[3, 3] - camera.projection[3, 2] * z for z in (near, far))
     return float(last / first) if first > 0 else np.inf
 
@@ -238,15 +238,15 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
         while len(kept) >= TARGETS:
             for framebuffer, texture, depth in kept.pop(next(iter(kept))):
                 _release(context, [framebuffer, texture, depth])
-        pairs, made = [], []
+        pairs, objects = [], []
         try:
             for _ in range(2):
-                made.append(texture := context.texture((size[1], size[0]), 2, dtype="i4"))
-                made.append(depth := context.depth_renderbuffer((size[1], size[0])))
-                made.append(framebuffer := context.framebuffer([texture], depth))
+                objects.append(texture := context.texture((size[1], size[0]), 2, dtype="i4"))
+                objects.append(depth := context.depth_renderbuffer((size[1], size[0])))
+                objects.append(framebuffer := context.framebuffer([texture], depth))
                 pairs.append((framebuffer, texture, depth))
         except BaseException:
-            _release(context, made[::-1])
+            _release(context, objects[::-1])
             raise
         kept[size] = pairs
     kept[size] = kept.pop(size)  # The least recently used is first.
@@ -277,6 +277,6 @@ def _peel(
             array.render(moderngl.TRIANGLES)
         if query.samples == 0:
             break
-        found = np.frombuffer(framebuffer.read(components=2, dtype="i4"), np.int32)
-        ids[k] = found.reshape(*size, 2)[..., 0]
+        pixels = np.frombuffer(framebuffer.read(components=2, dtype="i4"), np.int32)
+        ids[k] = pixels.reshape(*size, 2)[..., 0]
     return ids

@@ -122,10 +122,10 @@ def _forked() -> bool:
 
 def _errors(context: moderngl.Context) -> list[str]:
     """The errors that the context has recorded; it then has none."""
-    found: list[str] = []
-    while len(found) < MOST_ERRORS and (error := context.error) != "GL_NO_ERROR":
-        found.append(error)
-    return found
+    errors: list[str] = []
+    while len(errors) < MOST_ERRORS and (error := context.error) != "GL_NO_ERROR":
+        errors.append(error)
+    return errors
 
 
 def _create() -> moderngl.Context:

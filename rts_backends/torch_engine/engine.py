@@ -45,12 +45,12 @@ class _HostCall(torch.autograd.Function):
 
     @staticmethod
     def forward(fn, specs, *args):
-        device, given = None, []
+        device, values = None, []
         for a in args:
             tensor = isinstance(a, torch.Tensor)
             device = a.device if tensor and device is None else device
-            given.append(_to_host(a) if tensor else a)
-        return tuple([_tensor(r, device) for r in fn(*given)])
+            values.append(_to_host(a) if tensor else a)
+        return tuple([_tensor(r, device) for r in fn(*values)])
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -88,7 +88,7 @@ class TorchEngine(Engine):
     namespace = array_api
 
     def owns(self, x: Any) -> bool:
-        """Whether `x` is a tensor."""
+        """True for a tensor."""
         return isinstance(x, torch.Tensor)
 
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
@@ -96,7 +96,7 @@ class TorchEngine(Engine):
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
         if array.dtype != dtype and array.dtype.kind == "f":
-            # What is too large becomes infinite. torch takes longer for a matrix.
+            # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
                 array = array.astype(dtype)
         return _tensor(array, None if like is None else like.device)
@@ -121,7 +121,7 @@ class TorchEngine(Engine):
         return operations.apply(operation, operands, params)
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
-        """Whether all are in the memory of the host."""
+        """True if all tensors are in the memory of the host."""
         return all([x.is_cpu for x in arrays])
 
     def exact_products(self, *arrays: torch.Tensor) -> bool:
@@ -130,7 +130,7 @@ class TorchEngine(Engine):
         return a.is_cpu and b.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
     def plain(self, x: torch.Tensor) -> bool:
-        """Whether it is dense, of real numbers, has values, and no tangent."""
+        """True for a dense tensor of real numbers that has values, and no tangent."""
         return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and private.forward_level() < 0
 
     def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
@@ -211,7 +211,7 @@ class TorchEngine(Engine):
         return x
 
     def concurrent(self) -> bool:
-        """Whether neither a transform nor inference mode is on: these belong to a thread."""
+        """True unless a transform or inference mode is on: these belong to one thread."""
         return not transformed() and not torch.is_inference_mode_enabled()
 
     def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:

@@ -23,13 +23,13 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
     if private.transforms_active():
         return function.apply(*args)
     # What torch does with all arguments, in one loop.
-    given = [private.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
+    arguments = [private.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
     # Torch's stubs leave out the class above `Function`.
-    return super(torch.autograd.Function, function).apply(*given)  # pyright: ignore[reportAttributeAccessIssue]
+    return super(torch.autograd.Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def transformed() -> bool:
-    """Whether a transform of torch, forward mode or a compilation looks at what is computed now."""
+    """True while a transform of torch, forward mode or a compilation traces the computation."""
     if torch.compiler.is_compiling() or private.forward_level() >= 0:
         return True
     return private.maybe_current_level() is not None
@@ -39,7 +39,7 @@ _loaded: list[bool] = []
 
 
 def quiet_forward_mode() -> None:
-    """Have torch load what its forward mode needs, which makes it warn of its own `torch.jit.script`; once."""
+    """Have torch load the modules of its forward mode once; the loading warns of torch's own `torch.jit.script`."""
     if not _loaded:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
@@ -48,7 +48,7 @@ def quiet_forward_mode() -> None:
 
 
 def foreign(*tensors: Tensor | None) -> bool:
-    """Whether any is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
+    """True if a tensor is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which hides its values."""
     for t in tensors:
         if t is not None and private.is_legacy_batchedtensor(t):
             return True

@@ -32,9 +32,9 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
 
 class _Specifying(threading.local):
-    """Whether a specification is being differentiated.
+    """True, as `on`, while a specification is differentiated.
 
-    Operations in it are array code, too: torch does not nest its transforms in functions of one another.
+    Operations in the specification run as array code then, too: torch cannot nest its transforms in such functions.
     """
 
     on = False
@@ -44,7 +44,7 @@ _specifying = _Specifying()
 
 
 def _fits(operands: Sequence[Tensor]) -> bool:
-    """Whether compiled code takes these operands: on the host, all floats float32 or all float64."""
+    """True if compiled code takes these operands: on the host, all floats float32 or all float64."""
     real = operands[0].dtype
     if real not in _DTYPES:
         return False
@@ -55,7 +55,7 @@ def _fits(operands: Sequence[Tensor]) -> bool:
 
 
 class _Call:
-    """What is to be computed, and what its value leaves to the derivatives.
+    """A call of an operation, and the arrays that its value keeps for the derivatives.
 
     The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`. Under `vmap` each item has a
     call of its own.
@@ -100,7 +100,7 @@ class _Call:
         return pull
 
     def pushed(self, present: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., Tensor]:
-        """The specification's pushforward as a function of the differentiable operands and those tangents (T, ·)."""
+        """The specification's pushforward as a function of the differentiable operands and their tangents (T, ·)."""
 
         def push(*given: Tensor) -> Tensor:
             varied, tangents = self.split(given)
@@ -223,7 +223,7 @@ class _Pull(torch.autograd.Function):
 
 
 class _Push(torch.autograd.Function):
-    """Tangents (T, ·) of the result along those of the differentiable operands that are present."""
+    """Tangents (T, ·) of the result along the present tangents of the differentiable operands."""
 
     @staticmethod
     def forward(call, present, *given):

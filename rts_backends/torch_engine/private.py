@@ -1,4 +1,4 @@
-"""Private names of torch, where it has no public ones, and what stands in for them in a torch without them.
+"""Private names of torch, where it has no public ones, and substitutes for a torch without them.
 
 Then all goes as if a transform looked on: more slowly, through public names alone. Values inside of `torch.func`
 transforms are not known then.
@@ -43,7 +43,7 @@ except ImportError:
 
 
 is_zero = getattr(Tensor, "_is_zerotensor", lambda x: False)
-"""Whether a tensor stands for zeros, without memory."""
+"""True for a tensor that stands for zeros, without memory."""
 
 
 def forward_level() -> int:

@@ -1,4 +1,4 @@
-"""Where rays meet a field's surface: steps that bracket changes of sign, then roots in the brackets."""
+"""Ray casting of a field's surface: steps that bracket changes of sign, then roots in the brackets."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import RayHits
 
 STEPS, WITH_BOUND = 256, 512
-"""How many of the shortest steps there are across the region, without and with a Lipschitz constant."""
+"""The number of shortest steps across the region, without and with a Lipschitz constant."""
 
 SECANT, NEWTON = 5, 2
-"""How often the methods of Illinois and of Newton are applied in a bracket."""
+"""Steps of the methods of Illinois and of Newton in a bracket."""
 
 CROWDED = 0.75
-"""The share of rays that still go on at which the others are taken out."""
+"""Finished rays are removed when less than this share of the rays goes on."""
 
 FLATTEST = 1e-6
-"""The least square of a slope that points are moved by, as a share of the usual one; flatter places move less."""
+"""Least squared slope by which points are moved, as a share of the usual one; flatter places move less."""
 
 
 class Region(NamedTuple):
-    """Where surfaces are looked for: a `ball` or a `box`.
+    """The region in which rays are followed: a `ball` or a `box`.
 
     Attributes:
-        span: origins and directions (R, 3) → (R,) where rays enter, or 0 where they begin within, and (R,) where they
-            leave, in units of their directions; both are 0 for rays that miss it.
-        across: the length of the longest ray within it.
+        span: origins and directions (R, 3) → distances (R,) at which rays enter, 0 if they begin within, and (R,) at
+            which they leave, in units of their directions; both are 0 for rays that miss the region.
+        across: the length of the longest ray within the region.
     """
 
     span: Callable[[Array, Array], tuple[Array, Array]]
@@ -193,23 +193,23 @@ def _cast_some(
     """Hits of eager arrays: only rays that are not done go on, and roots are sought only where there are any."""
     xp, count = engine_of(enter).namespace, enter.shape[0]
     index = xp.arange(count, dtype=xp.int64, device=enter.device)
-    going, found, t, value = rays, xp.zeros_like(index), xp.zeros_like(enter), free(rays.starts)
+    going, hits, t, value = rays, xp.zeros_like(index), xp.zeros_like(enter), free(rays.starts)
     # The first is of no hit, so that no function is called without points.
     cells, brackets = [index[:1]], [_Bracket(*[t[:1]] * 4)]
     for _ in range(most):
-        on = (t < going.last) & (found < layers)
+        on = (t < going.last) & (hits < layers)
         left = int(xp.sum(xp.astype(on, xp.int64)))
         if not left:
             break
         if left < CROWDED * on.shape[0]:
-            going, index, found, t, value, on = _rows((going, index, found, t, value, on), xp.nonzero(on)[0])
+            going, index, hits, t, value, on = _rows((going, index, hits, t, value, on), xp.nonzero(on)[0])
         further = going.further(t, value)
         after = free(going.at(further))
         crossed = on & _change_sign(value, after)
-        cell, bracket = _rows((found * count + index, _Bracket(t, further, value, after)), xp.nonzero(crossed)[0])
+        cell, bracket = _rows((hits * count + index, _Bracket(t, further, value, after)), xp.nonzero(crossed)[0])
         cells.append(cell)
         brackets.append(bracket)
-        found = found + xp.astype(crossed, xp.int64)
+        hits = hits + xp.astype(crossed, xp.int64)
         t, value = further, after
     cell, bracket = xp.concat(cells), _Bracket(*(xp.concat(x) for x in zip(*brackets, strict=True)))
     met = _rows(rays, cell % count)
@@ -235,23 +235,23 @@ def _cast_all(
     none = xp.stack([zero] * layers)
 
     def on(state: dict[str, Array]) -> Array:
-        return (state["t"] < rays.last) & (state["found"] < layers)
+        return (state["t"] < rays.last) & (state["hits"] < layers)
 
     def body(state: dict[str, Array]) -> dict[str, Array]:
-        going, t, value, found = on(state), state["t"], state["value"], state["found"]
+        going, t, value, hits = on(state), state["t"], state["value"], state["hits"]
         further = xp.where(going, rays.further(t, value), t)
         after = free(rays.at(further))
         crossed = going & _change_sign(value, after)
-        layer = xp.stack([crossed & (found == k) for k in range(layers)])
+        layer = xp.stack([crossed & (hits == k) for k in range(layers)])
         new = _Bracket(t, further, value, after)
         brackets = {n: xp.where(layer, getattr(new, n)[None], state[n]) for n in _Bracket._fields}
-        return {"t": further, "value": after, "found": found + xp.astype(crossed, found.dtype), **brackets}
+        return {"t": further, "value": after, "hits": hits + xp.astype(crossed, hits.dtype), **brackets}
 
-    state = {"t": zero, "value": free(rays.starts), "found": xp.zeros_like(zero, dtype=xp.int32)}
+    state = {"t": zero, "value": free(rays.starts), "hits": xp.zeros_like(zero, dtype=xp.int32)}
     state |= dict.fromkeys(_Bracket._fields, none)
     state = engine.repeat(body, lambda state: xp.any(on(state)), state, most)
 
-    hit = xp.stack([state["found"] > k for k in range(layers)])
+    hit = xp.stack([state["hits"] > k for k in range(layers)])
     flat = [xp.reshape(state[n], (-1,)) for n in _Bracket._fields]
     met = map_leaves(lambda x: xp.concat([x] * layers), rays)
     t = _roots(level, free, met, _Bracket(*flat))
@@ -262,7 +262,7 @@ def _cast_all(
 
 
 def _roots(level: Callable, free: Callable, rays: _Rays, bracket: _Bracket) -> Array:
-    """Where a function has its zero along rays (M,), each within its own bracket, which it never leaves."""
+    """Zeros (M,) of a function along rays, each within its own bracket, which no step leaves."""
     engine = engine_of(bracket.low)
     xp, (low, high, below, above) = engine.namespace, bracket
     t = low
@@ -290,7 +290,7 @@ def _rows(tree: Any, index: Array) -> Any:
 
 
 def _change_sign(before: Array, after: Array) -> Array:
-    """Whether one is inside and the other outside; what is not a number is neither."""
+    """True where one value is inside and the other outside; NaN is neither."""
     return ((before < 0) & (after >= 0)) | ((before >= 0) & (after < 0))
 
 
@@ -299,7 +299,7 @@ def _without_derivative(level: Callable[[Array], Array], points: Array) -> Array
 
 
 def _ahead(enter: Array, leave: Array) -> tuple[Array, Array]:
-    """The part of a span that is not behind the origin of a ray; 0 and 0 where there is none."""
+    """The part of a span ahead of the origin of a ray; 0 and 0 if it is empty."""
     xp = engine_of(enter).namespace
     enter = xp.clip(enter, 0, None)
     met = leave > enter

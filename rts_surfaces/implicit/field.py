@@ -1,4 +1,4 @@
-"""Functions of space, as surfaces use them: those that are negative inside, and what surfaces of fields share."""
+"""Scalar fields of space, negative inside, and the base class of surfaces of fields."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from rts.plugin_api.records import Samples
 from rts_surfaces.parameter_checks import RESERVED
 
 LARGEST = 1e38
-"""What is larger is no number of single precision."""
+"""Larger values count as no number of single precision."""
 
 Function = Callable[[Mapping[str, Tree], Array], Array]
 """A function of θ and points (M, 3)."""
 
 SIDES = {"below": 1.0, "above": -1.0}
-"""Which values are inside, and what turns these negative."""
+"""The sides of the isovalue that may be the inside, and the sign that makes the values there negative."""
 
 
 class ScalarField(abc.ABC):
-    """A number at every point of space, as surfaces use it: negative inside.
+    """A scalar field as surfaces use it: a number at every point of space, negative inside.
 
     Attributes:
-        name: what errors call it.
+        name: its name in errors.
     """
 
     name: str
@@ -42,11 +42,11 @@ class ScalarField(abc.ABC):
 
     @abc.abstractmethod
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ without them."""
+        """Refuse θ that lacks such an entry."""
 
     @abc.abstractmethod
     def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """How far the field is from the isovalue, negative inside; what has the isovalue itself counts as outside.
+        """The field minus the isovalue, with the sign that makes it negative inside; zero counts as outside.
 
         Args:
             theta: θ.
@@ -98,7 +98,7 @@ class Field(ScalarField):
         return tuple(theta) if self._reads is None else self._reads
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ that lacks an entry which `f` reads. What `f` makes of it is checked when it is called."""
+        """Refuse θ that lacks an entry which `f` reads. The result of `f` is checked when it is called."""
         for name in self.names(theta):
             if name not in theta:
                 raise InputError(f"theta has no {name!r}, which {self.name} reads; it has {sorted(theta)}")
@@ -124,14 +124,14 @@ class Field(ScalarField):
 
     def _why(self, error: Exception, engine: Engine) -> str:
         """The message for an error of `f`."""
-        told = " ".join(str(error).split())[:120] or type(error).__name__
+        text = " ".join(str(error).split())[:120] or type(error).__name__
         if isinstance(error, (AttributeError, TypeError)) and not engine.differentiates:
             return (
-                f"{self.name} cannot work with arrays of NumPy ({told}); it gets these where theta has no others: put "
+                f"{self.name} cannot work with arrays of NumPy ({text}); it gets these where theta has no others: put "
                 f"the weights that it reads into theta"
             )
         return (
-            f"{self.name} fails on points (M, 3) of {engine.name} ({told}); write it in array code, with the functions "
+            f"{self.name} fails on points (M, 3) of {engine.name} ({text}); write it in array code, with the functions "
             f"of rts.namespace(points) alone"
         )
 
@@ -140,7 +140,7 @@ class Field(ScalarField):
         return gradient(partial(self.level, theta), points)
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The points in the widest floating dtype of what `f` reads, float32 at least."""
+        """The points in the widest floating dtype among the entries that `f` reads, float32 at least."""
         xp, bits = namespace(points), 0
         for x in leaves({name: theta[name] for name in self.names(theta)}):
             if hasattr(x, "dtype") and namespace(x).isdtype(x.dtype, "real floating"):
@@ -151,7 +151,7 @@ class Field(ScalarField):
 
 
 class Implicit(Surface):
-    """What surfaces of a field share: which entries of θ they read, and their G-buffer.
+    """Base class of surfaces of a field: the entries of θ that they read, and their G-buffer.
 
     Args:
         field: the field.
@@ -172,11 +172,11 @@ class Implicit(Surface):
         self.field, self.attributes = field, dict(attributes or {})
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """What the field reads; all entries where there are attributes."""
+        """The entries that the field reads; all entries if there are attributes."""
         return tuple(theta) if self.attributes else self.field.names(theta)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ without what the field reads."""
+        """Refuse θ that lacks an entry which the field reads."""
         self.field.check(theta)
 
     def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
@@ -184,7 +184,7 @@ class Implicit(Surface):
 
         Args:
             theta: θ.
-            samples: those of `rts_surfaces.implicit.casting.moving`.
+            samples: samples with the parameters of `rts_surfaces.implicit.casting.moving`.
             level: f, points (M, 3) → (M,), differentiable in θ.
         """
         params = self.field.suited(theta, samples.params)
@@ -192,8 +192,8 @@ class Implicit(Surface):
         # At the origin, where rows that only pad would lie, many a function has no derivative: they do as the first.
         used = xp.any(params != 0, axis=1, keepdims=True)
         params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
-        found, along = params[:, :3], params[:, 3:6]
-        return self.gbuffer(theta, found - level(found)[:, None] * along)
+        points, along = params[:, :3], params[:, 3:6]
+        return self.gbuffer(theta, points - level(points)[:, None] * along)
 
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
         """Normals (N, 3) of unit length, outwards, at positions on the surface; zero where the field has no slope."""
@@ -232,7 +232,7 @@ def known_number(name: str, value: np.ndarray | None) -> float:
 
 
 def check_function(name: str, f: Any) -> None:
-    """Refuse what is no function of θ and points; a class is none, its objects may be."""
+    """Refuse anything but a function of θ and points; a class is none, its objects may be."""
     if not callable(f) or isinstance(f, type):
         raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
     try:
@@ -249,7 +249,7 @@ def check_function(name: str, f: Any) -> None:
 
 
 def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:
-    """Refuse what a function gave for points (M, 3), if it is not (M,), or (M, C), in their engine and dtype."""
+    """Refuse a function's result for points (M, 3) that is not (M,), or (M, C), in their engine and dtype."""
     engine, count = engine_of(points), points.shape[0]
     expected = f"({count}, C)" if columns else f"({count},)"
     try:

@@ -129,9 +129,9 @@ def _nearest(points: Array, centers: Array, radii: Array) -> Array:
 def _entry(theta: Mapping[str, Tree], name: str, shape: tuple[int | str, ...]) -> Array:
     """An entry of θ, refused where it is missing or of another shape; a letter stands for any length but 0."""
 
-    def expected(given: tuple[int, ...]) -> str | None:
-        pairs = zip(given, shape, strict=False)
-        fits = len(given) == len(shape) and all(g == s or (isinstance(s, str) and g > 0) for g, s in pairs)
+    def expected(actual: tuple[int, ...]) -> str | None:
+        pairs = zip(actual, shape, strict=False)
+        fits = len(actual) == len(shape) and all(g == s or (isinstance(s, str) and g > 0) for g, s in pairs)
         return None if fits else f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
 
     check_entry("the field", theta, name, expected)

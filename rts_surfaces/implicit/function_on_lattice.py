@@ -1,4 +1,4 @@
-"""Functions of space, looked at on a lattice: everywhere, or in a narrow band."""
+"""Functions of space evaluated on a lattice: everywhere, or in a narrow band."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ CHUNK = 2**15
 
 
 class Looked(NamedTuple):
-    """What is known of a field at lattice points.
+    """Values of a field at lattice points.
 
     Attributes:
-        inputs: what `TriangleSurface.proxy_inputs` gives: "values" (X, Y, Z); or "values" (M,), "numbers" (M,),
+        inputs: the result of `TriangleSurface.proxy_inputs`: "values" (X, Y, Z); or "values" (M,), "numbers" (M,),
             "corners" (C, 8) and "cells" (C, 3) of a `Band`.
-        evaluations: how many points a function was evaluated at.
+        evaluations: the number of points at which a function was evaluated.
     """
 
     inputs: dict[str, Array]
@@ -49,10 +49,10 @@ class Resampled(NamedTuple):
 
 
 class FunctionOnLattice(Field):
-    """A field that is looked at on a lattice; see `Field`, and `Isosurface` for the arguments.
+    """A field that is evaluated at the points of a lattice; see `Field`, and `Isosurface` for the arguments.
 
     Attributes:
-        level_of_values: isovalue and sign of what `look` gives: the level itself.
+        level_of_values: isovalue and sign of the values that `look` gives, which are levels already.
     """
 
     level_of_values = (0.0, 1.0)
@@ -92,7 +92,7 @@ class FunctionOnLattice(Field):
         return self.level(theta, self.suited(theta, places))
 
     def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """The level at all lattice points, or at those of the band; without derivative."""
+        """The level at all lattice points, or at the band's; without derivative."""
         read = {name: theta[name] for name in self.names(theta)}
         engine, like, count = engine_of(read), exemplar(read), self._lattice.count
         if self.band is None:
@@ -115,8 +115,8 @@ class FunctionOnLattice(Field):
             points = self.suited(theta, engine.constant(places.astype(np.float32), like))
             return np.asarray(engine.known(engine.stop_gradient(self.level(theta, points))))[:count]
 
-        found = self.band.find(level, self._lattice, closed)
-        return Looked({k: v for k, v in found._asdict().items() if k != "evaluations"}, found.evaluations)
+        band = self.band.find(level, self._lattice, closed)
+        return Looked({k: v for k, v in band._asdict().items() if k != "evaluations"}, band.evaluations)
 
     def _in_planes(self, theta: Mapping[str, Tree], planes: Array) -> Array:
         """The level (P, Y, Z) in planes of the lattice across its first axis, (P,) int32."""

@@ -47,7 +47,7 @@ def _cells(
 
 
 def _corners(shape: Sequence[int], lowest: Sequence[Array], shares: Sequence[Array]) -> tuple[Array, Array]:
-    """Numbers and weights (M, 8) of the corners of cells, for what is interpolated linearly along each axis."""
+    """Numbers and weights (M, 8) of the corners of cells, for interpolation that is linear along each axis."""
     xp = namespace(lowest[0])
     first = (lowest[0] * shape[1] + lowest[1]) * shape[2] + lowest[2]
     ids, weights = [], []
@@ -106,8 +106,8 @@ def _push(
     if t_values is not None:
         _forward((read_only(t_values), points), out, low=low, step=step)
     if t_points is not None:
-        given = values, points, read_only(t_points), low, step, out
-        parallel(interpolation_loops.push_points, len(points), *given, work=300 * len(points))
+        arguments = values, points, read_only(t_points), low, step, out
+        parallel(interpolation_loops.push_points, len(points), *arguments, work=300 * len(points))
 
 
 def _pull(
@@ -119,8 +119,8 @@ def _pull(
     if g_values is not None:
         interpolation_loops.pull_values(points, g, low, step, g_values)
     if g_points is not None:
-        given = values, points, g, low, step, g_points
-        parallel(interpolation_loops.pull_points, len(points), *given, work=300 * len(points))
+        arguments = values, points, g, low, step, g_points
+        parallel(interpolation_loops.pull_points, len(points), *arguments, work=300 * len(points))
 
 
 _PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
@@ -135,4 +135,4 @@ DIFFERENCES = Operation(
     differentiable=2,
     **_PACKED,
 )
-"""The operation of `differences`, on values and points; low and step are those of the lattice."""
+"""The operation of `differences`, on values and points; low and step are the lattice's."""

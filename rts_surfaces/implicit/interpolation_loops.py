@@ -88,7 +88,7 @@ def push_points(start, stop, values, points, tangents, low, step, out):
 
 @loop
 def pull_points(start, stop, values, points, g, low, step, results):
-    """Fill the gradients (N, 3) of the points, of those of the differences."""
+    """Fill the gradients (N, 3) of the points, from the gradients of the differences."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
     for n in range(start, stop):
@@ -108,7 +108,7 @@ def pull_points(start, stop, values, points, g, low, step, results):
 
 @loop
 def pull_values(points, g, low, step, results):
-    """Add the gradients (X, Y, Z) of the values, of those of the differences."""
+    """Add the gradients (X, Y, Z) of the values, from the gradients of the differences."""
     shape = results.shape
     lowest, near, slopes = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3)
     at, up, down = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)

@@ -34,13 +34,13 @@ NEAR_SINGULAR = 1e-3
 """An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
 
 BESIDE = 1e-3
-"""How far before the bounds rays begin where the surface is capped, as a share of the bounds: they meet the caps."""
+"""Distance before the bounds at which rays begin, if the surface is capped, to meet the caps; a share of the bounds."""
 
 STEPS_PER_CELL = 2
 """Steps of rays across the narrowest side of a cell, where there is no Lipschitz bound."""
 
 ON_SIDE = 1e-6
-"""How near to the bounds' side points of a cap are, as a share of the bounds."""
+"""Largest distance of a cap's points from the bounds' side, as a share of the bounds."""
 
 KEPT = 4
 """Fields whose usual differences are remembered."""
@@ -49,13 +49,13 @@ MOTIONS, ENDS, SINGULAR = ("normal", "edge"), ("capped", "open"), ("bound", "dro
 
 
 class Extracted(NamedTuple):
-    """An isosurface as triangles, and what it took to find them.
+    """An isosurface as triangles, and the cost of their extraction.
 
     Attributes:
         vertices: (V, 3) float32, on edges of the lattice.
         faces: (T, 3) int32, counter-clockwise seen from outside.
-        near_singular: how many of the edges that are crossed are near-singular.
-        evaluations: at how many points the function was evaluated; 0 where values are given.
+        near_singular: the number of crossed edges that are near-singular.
+        evaluations: the number of points at which the function was evaluated; 0 where values are given.
     """
 
     vertices: np.ndarray
@@ -65,7 +65,7 @@ class Extracted(NamedTuple):
 
 
 class Isosurface(Implicit, TriangleSurface, RaySurface):
-    """Where a field has one value: θ["values"] (X, Y, Z) at the points of a lattice, or a function of θ and points.
+    """The isosurface of a field: θ["values"] (X, Y, Z) at the points of a lattice, or a function of θ and points.
 
     A sample's ids are the numbers of six lattice points, the ends of three edges; point (x, y, z) has the number
     (x Y + y) Z + z. The first three of its parameters are the barycentrics in the triangle between these edges.
@@ -83,7 +83,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             triangle's corners slide along the edges of the lattice, as in the paper.
         inside: "below" or "above" the isovalue.
         at_bounds: "capped": where the inside reaches the bounds, it is closed there; or "open".
-        near_singular: what is done where an edge's ends are so much alike that its corner would move without bound.
+        near_singular: the rule where an edge's ends are so much alike that its corner would move without bound.
             "bound": derivatives are bounded. "drop": there is no surface, as in the paper. "keep": nothing.
         table: for a costly `f`. It is called once for each lattice point, not once for each sample that has it. A
             number says for how many to allot room where shapes must be known, as in `jax.jit`; else there is room for
@@ -118,14 +118,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         reads: Sequence[str] | None = None,
         attributes: Mapping[str, Callable[[Any, Array], Array]] | None = None,
     ):
-        for name, given, names in (
+        for name, value, names in (
             ("motion", motion, MOTIONS),
             ("inside", inside, tuple(SIDES)),
             ("at_bounds", at_bounds, ENDS),
             ("near_singular", near_singular, SINGULAR),
         ):
-            if not isinstance(given, str) or given not in names:
-                raise InputError(f"{name} is {quoted(given)}; expected {' or '.join(map(repr, names))}")
+            if not isinstance(value, str) or value not in names:
+                raise InputError(f"{name} is {quoted(value)}; expected {' or '.join(map(repr, names))}")
         self.bounds, self.isovalue, self.motion = check_bounds(bounds), check_isovalue(isovalue), motion
         self.closed, self.near_singular = at_bounds == "capped", near_singular
         self.lipschitz = (
@@ -138,10 +138,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
                 raise InputError("shape is None; expected (X, Y, Z), how finely to look at f")
             field = FunctionOnLattice(f, isovalue, inside, reads, Lattice(self.bounds, shape), table, band)
         else:
-            for name, given, none in (("table", table, False), ("band", band, None), ("reads", reads, None)):
-                if given is not none:
+            for name, value, none in (("table", table, False), ("band", band, None), ("reads", reads, None)):
+                if value is not none:
                     raise InputError(
-                        f"{name} is {quoted(given)} without a function f; expected {none}: θ has the values"
+                        f"{name} is {quoted(value)} without a function f; expected {none}: θ has the values"
                     )
             field = LatticeField(self.bounds, self.isovalue, SIDES[inside], shape)
         super().__init__(field, attributes)
@@ -160,21 +160,21 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Coarser lattices, and of functions a finer one."""
-        count, found = self.field.lattice(theta).count, []
+        count, rates = self.field.lattice(theta).count, []
         for shape, field, change in self.field.resampled(theta):
             other = copy.copy(self)
             other.field, other._usual = field, {}
-            found.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
-        return found
+            rates.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
+        return rates
 
     # ----------------------------------------------------------------------------------- triangles and samples
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """Values at lattice points: those of θ, or levels of the function, everywhere or in its band."""
+        """Values at lattice points: θ's, or levels of the function, everywhere or in its band."""
         return self.field.look(theta, self.closed).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
-        """The triangles of marching cubes, dropped ones included, and what they cost.
+        """The triangles of marching cubes, dropped ones included, and their cost.
 
         Args:
             theta: θ, with values that are known.
@@ -185,8 +185,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         theta = map_leaves(lambda x: engine_of(x).stop_gradient(x), from_numbers(theta, "theta"))
         self.check(theta)
         looked = self.field.look(theta, self.closed)
-        found = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
-        return Extracted(found.vertices, found.faces, int(_singular(found).sum()), looked.evaluations)
+        triangles = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
+        return Extracted(triangles.vertices, triangles.faces, int(_singular(triangles).sum()), looked.evaluations)
 
     def _triangles(self, inputs: Mapping[str, np.ndarray]) -> Triangles:
         lattice = self.field.lattice(inputs)
@@ -206,7 +206,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         raise InputError(f"{self.field.name} is {value} at lattice point [{at}]; expected finite numbers")
 
     def why_no_triangles(self, inputs: Mapping[str, np.ndarray]) -> str:
-        """Where the field lies beside the isovalue; one text for all values, so that a loop warns once."""
+        """The side of the isovalue on which the whole field lies; one text for all values: a loop warns only once."""
         values, (isovalue, sign) = inputs["values"], self.field.level_of_values
         if "corners" in inputs:
             return f"has no surface: its band found no place where the field crosses the isovalue {self.isovalue:g}"
@@ -217,24 +217,24 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         """The triangles of marching cubes, each with the ends of its edges, its cell, and where it is capped."""
         from rts_surfaces.implicit import lattice_samples_loops
 
-        found = self._triangles(inputs)
+        triangles = self._triangles(inputs)
         if len(self._usual) >= KEPT:
             self._usual.clear()
-        self._usual[fingerprint(inputs["values"])] = _usual(found)
-        faces, cells, caps = found.faces, found.cells, found.caps
+        self._usual[fingerprint(inputs["values"])] = _usual(triangles)
+        faces, cells, caps = triangles.faces, triangles.cells, triangles.caps
         if self.near_singular == "drop":
-            kept = ~_singular(found)[faces].any(axis=1)
+            kept = ~_singular(triangles)[faces].any(axis=1)
             faces, cells, caps = faces[kept], cells[kept], caps[kept]
         ids = np.empty((len(faces), 8), np.int32)
-        parallel(lattice_samples_loops.hand_on, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
-        return Proxy(found.vertices, faces, ids)
+        parallel(lattice_samples_loops.hand_on, len(ids), faces, triangles.ends, cells, caps, ids, work=10 * len(ids))
+        return Proxy(triangles.vertices, faces, ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """One: marching cubes wind all triangles by which side is inside."""
+        """One piece: marching cubes wind all triangles by which side is inside."""
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
-        """What samples carry: weights of the six values, their place, and how they move; and lattice points merged."""
+        """Samples with their parameters: weights of the six values, place and motion; and merged lattice points."""
         from rts_surfaces.implicit import lattice_samples_loops
 
         lattice = self.field.lattice(inputs)
@@ -246,17 +246,17 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         if self.motion == "edge":
             params[:, 3] = least if self.near_singular == "bound" else 0.0
         isovalue, sign = self.field.level_of_values
-        given = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
+        arguments = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
         # Where no cell is covered there is a row nevertheless, of nothing.
         count = int(samples.row.max()) + 1
-        made = points, params, least / lattice.step.max()
-        parallel(lattice_samples_loops.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
+        results = points, params, least / lattice.step.max()
+        parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *results, work=300 * count)
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
-        """The median, over all edges that are crossed, of the difference of their ends; kept since the triangles."""
-        found = self._usual.get(fingerprint(inputs["values"]))
-        return _usual(self._triangles(inputs)) if found is None else found
+        """The median difference of the ends of crossed edges, kept from when the triangles were made."""
+        difference = self._usual.get(fingerprint(inputs["values"]))
+        return _usual(self._triangles(inputs)) if difference is None else difference
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
         """The lattice points that samples share."""
@@ -265,7 +265,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ------------------------------------------------------------------------------------ evaluation and rays
 
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
-        """Where rays meet the field itself within the bounds, and the caps; see `rts.RaySurface`."""
+        """Hits of rays with the field itself within the bounds, and with the caps; see `rts.RaySurface`."""
         lattice, (low, high) = self.field.lattice(theta), self.bounds
         values, margin = theta.get("values"), BESIDE * (high - low) if self.closed else 0.0
         known = engine_of(values).known(values) if isinstance(self.field, LatticeField) else None
@@ -320,12 +320,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         """See `rts.Surface`: with near-singular edges as they are."""
         if self.near_singular != "bound":
             return None
-        found = copy.copy(self)
-        found.near_singular = "keep"
-        return found
+        surface = copy.copy(self)
+        surface.near_singular = "keep"
+        return surface
 
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
-        """The field's, and in caps that of the bounds' side."""
+        """The normal of the field; in caps that of the bounds' side."""
         xp, caps = namespace(position), self._caps(engine_of(position).stop_gradient(position))
         capped = xp.max(xp.abs(caps), axis=-1, keepdims=True) > 0
         return xp.where(capped, unit(caps), super().normal(theta, position))
@@ -345,12 +345,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.gbuffer(theta, position)
 
 
-def _singular(found: Triangles) -> np.ndarray:
-    """Which vertices lie on near-singular edges (V,) bool."""
-    return (found.differences > 0) & (found.differences < NEAR_SINGULAR * _usual(found))
+def _singular(triangles: Triangles) -> np.ndarray:
+    """Marks (V,) bool of vertices on near-singular edges."""
+    return (triangles.differences > 0) & (triangles.differences < NEAR_SINGULAR * _usual(triangles))
 
 
-def _usual(found: Triangles) -> float:
+def _usual(triangles: Triangles) -> float:
     """The median difference of the ends of edges that are crossed."""
-    crossed = found.differences[found.differences > 0]
+    crossed = triangles.differences[triangles.differences > 0]
     return float(np.median(crossed)) if len(crossed) else 0.0

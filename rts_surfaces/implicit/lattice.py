@@ -85,14 +85,14 @@ def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 def check_shape(shape: Any) -> tuple[int, int, int]:
     """(X, Y, Z) as integers, refused where there is no such lattice."""
     try:
-        given = () if isinstance(shape, (str, bytes)) else tuple(shape)
+        counts = () if isinstance(shape, (str, bytes)) else tuple(shape)
     except TypeError:
-        given = ()
-    if len(given) != 3 or not all(is_count(n) and n >= 2 for n in given):
+        counts = ()
+    if len(counts) != 3 or not all(is_count(n) and n >= 2 for n in counts):
         raise InputError(
             f"the lattice has shape {quoted(shape)}; expected (X, Y, Z), at least 2 points along each axis"
         )
-    x, y, z = (int(n) for n in given)
+    x, y, z = (int(n) for n in counts)
     if x * y * z > MOST_POINTS:
         raise InputError(f"a lattice has {x} × {y} × {z} points; expected at most 2**31 − 1, 1290 along each axis")
     return x, y, z

@@ -22,11 +22,11 @@ class LatticeField(ScalarField):
     Args:
         bounds: the corners of the lattice.
         isovalue: where the level is zero.
-        sign: 1 where values below the isovalue are inside, −1 where those above it are.
+        sign: 1 if values below the isovalue are inside, −1 if values above it are.
         shape: (X, Y, Z) that the values must have, or None for any.
 
     Attributes:
-        level_of_values: isovalue and sign of what `look` gives.
+        level_of_values: isovalue and sign of the values that `look` gives.
     """
 
     name = "theta['values']"
@@ -95,8 +95,8 @@ class LatticeField(ScalarField):
 
         Differentiable in the values and in the points.
         """
-        found = interpolated(theta["values"], points, self.lattice(theta))
-        return self.sign * (found - self.isovalue)
+        value = interpolated(theta["values"], points, self.lattice(theta))
+        return self.sign * (value - self.isovalue)
 
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The gradient (M, 3) of the level: central differences at lattice points, interpolated as the values are."""

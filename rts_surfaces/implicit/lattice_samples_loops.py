@@ -1,4 +1,4 @@
-"""What samples of an isosurface carry, compiled."""
+"""Parameters of an isosurface's samples, compiled."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 
 LARGEST = 1e38
-"""What is larger is no number of single precision: fields that are flat to the last digit move nothing."""
+"""Larger values count as no number of single precision: fields that are flat to the last digit move nothing."""
 
 
 @compiled(inline="always")
@@ -45,7 +45,7 @@ def _slope(values, band, cell, base, at, shape, low, step, caps, out):
 
 @loop
 def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near, points, params, least):
-    """Fill what samples `start` to `stop` carry.
+    """Fill the lattice points and parameters of samples [start, stop).
 
     Args:
         start: the first sample.
@@ -97,13 +97,13 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
             params[n, 9 + i] = at[i]
             moved = sign * slope[i] / divisor if divisor > 0 else 0.0
             params[n, 12 + i] = moved if abs(moved) < LARGEST else 0.0
-        # Zero on the isosurface; within a cap samples move with what the field is there.
+        # Zero on the isosurface; within a cap samples move with the field's value there.
         params[n, 15] = level
 
 
 @loop
 def hand_on(start, stop, faces, ends, cells, caps, ids):
-    """Fill what triangles hand on to samples, (T, 8): the ends of three edges, the cell, and where it is capped."""
+    """Fill the ids (T, 8) that triangles hand on to samples: the ends of three edges, the cell, and its caps."""
     for t in range(start, stop):
         for k in range(3):
             for i in range(2):

@@ -1,6 +1,6 @@
-"""Marching cubes: which edges of a cell each of its triangles has its corners on, by the signs at the cell's corners.
+"""Marching cubes: the edges of a cell on which its triangles' corners lie, by the signs at the cell's corners.
 
-The table of the 256 cases is that of PyMCubes, asked once, by 256 single cells. Values at lattice points only say where
+The table of the 256 cases is read off PyMCubes once, from 256 single cells. Values at lattice points only decide where
 on an edge a corner lies.
 """
 
@@ -46,7 +46,7 @@ class Triangles(NamedTuple):
 
 @functools.cache
 def cases() -> tuple[np.ndarray, np.ndarray]:
-    """How many triangles (256,) uint8 cells have, and the edges (256, 5, 3) int8 that their corners lie on.
+    """The number of triangles (256,) uint8 of a cell, and the edges (256, 5, 3) int8 that their corners lie on.
 
     Bit i of the number of a case says whether corner i is inside.
 
@@ -80,7 +80,7 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
         lattice: the lattice.
         isovalue: points are inside where `sign * (value - isovalue)` is below zero.
         sign: 1 or −1.
-        closed: whether to cap what is inside at the bounds.
+        closed: True to cap the inside at the bounds.
     """
     from rts_surfaces.implicit import marching_cubes_loops as loops
 
@@ -89,8 +89,8 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
     layers = lattice.shape[0] + closed
     tally = np.zeros((layers, 3), np.int64)
     level = values.dtype.type(isovalue), values.dtype.type(sign)
-    given = values, *level, closed
-    parallel(loops.count, layers, *given, counts, tally, work=layers * values[0].size)
+    field_arguments = values, *level, closed
+    parallel(loops.count, layers, *field_arguments, counts, tally, work=layers * values[0].size)
     offsets = np.cumsum(tally, axis=0) - tally
     mixed, vertices, triangles = (int(n) for n in tally.sum(axis=0))
     cells, codes = np.empty(mixed, np.int64), np.empty(mixed, np.uint8)
@@ -98,13 +98,24 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
     first = np.empty((layers, lattice.shape[1] + closed, lattice.shape[2] + closed), np.int32)
     ends, places = np.empty((vertices, 2), np.int32), np.empty((vertices, 3), np.float32)
     differences = np.empty(vertices, np.float32)
-    found = cells, codes, first, ends, places, differences
-    parallel(loops.vertices, layers, *given, lattice.low, lattice.step, offsets, *found, work=layers * values[0].size)
+    vertex_arrays = cells, codes, first, ends, places, differences
+    parallel(
+        loops.vertices,
+        layers,
+        *field_arguments,
+        lattice.low,
+        lattice.step,
+        offsets,
+        *vertex_arrays,
+        work=layers * values[0].size,
+    )
     faces = np.empty((triangles, 3), np.int32)
     owners, caps = np.empty(triangles, np.int32), np.empty(triangles, np.int8)
-    made = faces, owners, caps
+    face_arrays = faces, owners, caps
     table = counts, edges, EDGES
-    parallel(loops.faces, layers, values.shape, closed, offsets, cells, codes, first, *table, *made, work=50 * mixed)
+    parallel(
+        loops.faces, layers, values.shape, closed, offsets, cells, codes, first, *table, *face_arrays, work=50 * mixed
+    )
     return Triangles(places, faces, ends, owners, caps, differences)
 
 
@@ -136,7 +147,7 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
 
 
 def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray, ...]:
-    """The band's cells, and where the surface is closed those around the lattice, whose outer corners are outside.
+    """The band's cells, and for a closed surface the cells around the lattice, whose outer corners are outside.
 
     Returns:
         For each cell its row of the band (C,) int32; the rows of its corners (C, 8) int32, in place of outer ones those
@@ -144,16 +155,16 @@ def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray
     """
     count = len(band.corners)
     own = np.arange(count, dtype=np.int32)
-    found = [(own, band.corners, np.zeros(count, np.uint8), np.zeros(count, np.int8))]
+    groups = [(own, band.corners, np.zeros(count, np.uint8), np.zeros(count, np.int8))]
     last = np.array(lattice.shape) - 2
     for side in np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) if closed else ():
-        there = np.flatnonzero(((side == 0) | (band.cells == np.where(side < 0, 0, last))).all(axis=1))
-        if not side.any() or not len(there):
+        at_side = np.flatnonzero(((side == 0) | (band.cells == np.where(side < 0, 0, last))).all(axis=1))
+        if not side.any() or not len(at_side):
             continue
         # Along an axis of the border, both corners are the lattice's last ones.
         beside = np.where(side == 0, CORNERS, side > 0).astype(np.int64) @ np.array([1, 2, 4])
         outer = ((side != 0) & (CORNERS == (side > 0))).any(axis=1) @ (1 << np.arange(8))
         cap = (side != 0) @ (1, 2, 4)
-        of_all = np.full(len(there), outer, np.uint8), np.full(len(there), cap, np.int8)
-        found.append((own[there], band.corners[there][:, beside], *of_all))
-    return tuple(np.concatenate(x) for x in zip(*found, strict=True))
+        of_all = np.full(len(at_side), outer, np.uint8), np.full(len(at_side), cap, np.int8)
+        groups.append((own[at_side], band.corners[at_side][:, beside], *of_all))
+    return tuple(np.concatenate(x) for x in zip(*groups, strict=True))

@@ -48,7 +48,7 @@ def _codes(low, high, y, count, out):
 
 @compiled(inline="always")
 def _is_real(x, y, z, shape, closed):
-    """Whether a cell, counted with the border, has triangles."""
+    """True if a cell, counted with the border, has triangles."""
     return closed or (x < shape[0] - 1 and y < shape[1] - 1 and z < shape[2] - 1)
 
 

@@ -1,4 +1,4 @@
-"""How samples of an isosurface move with the field: along its gradient, or along the edges of the lattice; operations.
+"""Operations that move an isosurface's samples with the field: along its gradient, or along the lattice's edges.
 
 Both take values (M,), params (N, P) in their dtype, and rows (N, 6) int32: the six values of each sample.
 """
@@ -19,7 +19,7 @@ Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
 """Shape, first point and step of a lattice."""
 
 _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
-"""Which parameters of a sample are the weights of the six values, its place, and by how much it moves for a unit."""
+"""Parameters of a sample: the weights of the six values, its place, and its motion for a unit of level."""
 
 
 def _by_level(values: Array, params: Array, rows: Array, *, isovalue: float, sign: float) -> Array:
@@ -62,8 +62,8 @@ def _push(
     from rts_surfaces.implicit import motion_loops
 
     values, params, rows = _checked(operands, 16)
-    given = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
-    parallel(motion_loops.push, len(rows), *given, work=30 * len(rows))
+    arguments = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
+    parallel(motion_loops.push, len(rows), *arguments, work=30 * len(rows))
 
 
 def _pull(
@@ -88,7 +88,7 @@ ALONG_NORMAL = Operation(
     packed_result=True,
 )
 """(N, 3): where samples are, less their vector times the change of the level `sign * (value - isovalue)`, by weights
-of six values. A sample's params (16) are barycentrics, these weights, place, vector, and what they summed up to."""
+of six values. A sample's params (16) are barycentrics, these weights, place, vector, and the sum at sampling."""
 
 
 # ------------------------------------------------------------------------------------------------ along edges
@@ -108,7 +108,7 @@ def _by_crossings(
 
 
 def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """How far along an edge the level is zero (N,); its derivative as if the ends differed by `least` or more."""
+    """The place (N,) along an edge where the level is zero; its derivative as if the ends differed by `least`."""
     engine = engine_of(f_a)
     xp, apart = engine.namespace, f_b - f_a
     same = apart == 0
@@ -127,8 +127,8 @@ def _forward_edges(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue:
     from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
-    given = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_loops.cross, len(rows), *given, work=60 * len(rows))
+    arguments = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
+    parallel(motion_loops.cross, len(rows), *arguments, work=60 * len(rows))
 
 
 def _push_edges(
@@ -137,8 +137,8 @@ def _push_edges(
     from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
-    given = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_loops.push_crossings, len(rows), *given, work=60 * len(rows))
+    arguments = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
+    parallel(motion_loops.push_crossings, len(rows), *arguments, work=60 * len(rows))
 
 
 def _pull_edges(
@@ -153,8 +153,8 @@ def _pull_edges(
 
     values, params, rows, numbers = _checked(operands, 4)
     if results[0] is not None:
-        given = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
-        motion_loops.pull_crossings(*given)
+        arguments = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
+        motion_loops.pull_crossings(*arguments)
 
 
 ALONG_EDGES = Operation(

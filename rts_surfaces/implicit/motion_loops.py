@@ -41,7 +41,7 @@ def pull(g, params, rows, sign, results):
 
 @compiled(inline="always")
 def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
-    """The axis along which edge k goes, its length, and how far along it the isovalue is crossed.
+    """The axis and length of edge k, and the place along it where the isovalue is crossed.
 
     Then the number that the derivative divides by; zero for an edge whose ends are one point.
     """

@@ -21,7 +21,7 @@ Level = Callable[[np.ndarray], np.ndarray]
 WORK = 5
 """Nanoseconds that a place takes."""
 ROUNDING = 4
-"""How many times the last digit of its scale, Lipschitz bound times coordinates, a level may be off."""
+"""Rounding error of a level, in last digits of its scale: the Lipschitz bound times coordinates."""
 
 
 class Band(NamedTuple):
@@ -33,7 +33,7 @@ class Band(NamedTuple):
         corners: (C, 8) int32, the rows of `numbers` of the corners of each cell. Corner i has the offsets (i & 1,
             i >> 1 & 1, i >> 2 & 1) along x, y and z.
         cells: (C, 3) int32, the coordinates of the lowest corner of each cell; each cell once, in no special order.
-        evaluations: how many points the level was evaluated at.
+        evaluations: the number of points at which the level was evaluated.
     """
 
     numbers: np.ndarray
@@ -53,17 +53,17 @@ class NarrowBand:
     Without one, coarse cells whose corners differ in sign are halved, with those around them; after that, only those
     of the halves whose corners differ in sign. At every fineness the surface is then followed across the sides of cells
     that it crosses. So each coarse cell whose corners differ in sign has cells in the band, and none of them ends in a
-    hole: the neighbour is in the band, too, wherever four corners that both have differ in sign. What lies between
-    coarse corners of one sign, and does not hang together with what they see, is found only where it shows at the
-    corners of half as coarse cells, within the margin.
+    hole: the neighbour is in the band, too, wherever four corners that both have differ in sign. A part of the
+    surface between coarse corners of one sign, apart from the rest, is found only where it shows at the corners of half
+    as coarse cells, within the margin.
 
     Args:
         lipschitz: how fast the level changes at most, per unit of length; None where this is not known.
         coarse: cells along each side of the blocks to begin with, a power of two; None for 16 with a Lipschitz bound
             and 8 without one.
-        margin: how many coarse cells around those whose corners differ in sign are halved with them. With a Lipschitz
+        margin: width, in coarse cells, of the border around these cells that is halved with them. With a Lipschitz
             bound it does not count.
-        chunk: how many points the level is evaluated at together, at most.
+        chunk: the largest number of points at which the level is evaluated together.
 
     Raises:
         InputError: an argument is of the wrong kind.
@@ -93,7 +93,7 @@ class NarrowBand:
         Args:
             level: see `Level`; called for at most `chunk` places at a time.
             lattice: the lattice.
-            closed: whether the surface is capped at the lattice's boundary. Cells are in the band, too, if one of their
+            closed: True if the surface is capped at the lattice's boundary. Cells are in the band, too, if one of their
                 corners is inside and on the boundary.
 
         Returns:
@@ -124,7 +124,7 @@ class _Unknown(Exception):
 
 
 class _Evaluate:
-    """The level at points of a lattice, in chunks, counted; while it `refuses` NaN, `_Unknown` where there is one."""
+    """The level at points of a lattice, in chunks, counted. While it `refuses` NaN, a NaN raises `_Unknown`."""
 
     def __init__(self, level: Level, lattice: Lattice, chunk: int):
         self.level, self.chunk, self.count, self.refuses = level, chunk, 0, True
@@ -133,7 +133,7 @@ class _Evaluate:
         self.low, self.step = tuple(lattice.low.tolist()), tuple(lattice.step.tolist())
 
     def counts(self, side: int) -> tuple[int, ...]:
-        """How many blocks of such a side there are along each axis."""
+        """The number of blocks of such a side along each axis."""
         return tuple(-(-(n - 1) // side) for n in self.shape)
 
     def all_blocks(self, side: int) -> np.ndarray:
@@ -150,12 +150,12 @@ class _Evaluate:
         return numbers, self._levels(loops.centres, numbers, blocks, side, self.shape, self.low, self.step)
 
     def slack(self, values: np.ndarray, lipschitz: float) -> float:
-        """How far levels may be off by rounding."""
+        """The largest rounding error of levels."""
         far = max(max(abs(x), abs(x + s * (n - 1))) for x, s, n in zip(self.low, self.step, self.shape, strict=True))
         return ROUNDING * float(np.finfo(values.dtype).eps) * lipschitz * far
 
     def _levels(self, loop: Callable, numbers: np.ndarray, items: np.ndarray, *args: Any) -> np.ndarray:
-        found = np.empty(0, self.dtype)
+        all_levels = np.empty(0, self.dtype)
         for first in range(0, len(items), self.chunk):
             some = items[first : first + self.chunk]
             places = np.empty((len(some), 3))
@@ -163,16 +163,16 @@ class _Evaluate:
             levels = np.asarray(self.level(places))
             self.count += len(some)
             if first == 0:
-                found, self.dtype = np.empty(len(items), levels.dtype), levels.dtype
-            found[first : first + len(some)] = levels
+                all_levels, self.dtype = np.empty(len(items), levels.dtype), levels.dtype
+            all_levels[first : first + len(some)] = levels
             wrong = np.isnan(levels) & (numbers[first : first + len(some)] >= 0)
             if self.refuses and wrong.any():
                 raise _Unknown(int(numbers[first + wrong.argmax()]))
-        return found
+        return all_levels
 
 
 class _Grid:
-    """Corners of blocks of one side, and the levels at those that are known.
+    """Corners of blocks of one side, and the levels at corners where they are known.
 
     Attributes:
         numbers: (M,) int64, their numbers in the lattice.
@@ -253,7 +253,7 @@ def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> 
 
 
 def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tuple[_Grid, np.ndarray, np.ndarray]:
-    """Find cells whose corners differ in sign, and follow the surface from them; returns what `_bounded` does."""
+    """Find cells whose corners differ in sign, and follow the surface from them; results as of `_bounded`."""
     grid = _Grid(evaluate, side)
     blocks = evaluate.all_blocks(side)
     rows = grid.corners(blocks)
@@ -272,13 +272,13 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
 
 
 def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the blocks whose corners differ in sign, and add those that the surface goes on in."""
+    """Choose the blocks whose corners differ in sign, and add blocks into which the surface goes on."""
     directory, bricks = _bricks(grid.counts, np.uint8)
     bricks, used = loops.marked(blocks, grid.counts, directory, bricks, 0)
     rows = grid.corners(blocks)
-    found = [loops.crossed(blocks, rows, grid.values, grid.counts, closed)]
-    while len(found[-1][0]):
-        blocks, bricks, used = loops.beyond(*found[-1], grid.values, grid.counts, closed, directory, bricks, used)
+    fronts = [loops.crossed(blocks, rows, grid.values, grid.counts, closed)]
+    while len(fronts[-1][0]):
+        blocks, bricks, used = loops.beyond(*fronts[-1], grid.values, grid.counts, closed, directory, bricks, used)
         rows = grid.corners(blocks)
-        found.append((blocks, rows))
-    return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+        fronts.append((blocks, rows))
+    return np.concatenate([f[0] for f in fronts]), np.concatenate([f[1] for f in fronts])

@@ -40,7 +40,7 @@ def halved(blocks, counts):
 
     Args:
         blocks: (B, 3) int32.
-        counts: how many of the smaller blocks there are along each axis.
+        counts: the number of smaller blocks along each axis.
     """
     total = 0
     for b in range(len(blocks)):
@@ -94,7 +94,7 @@ def near(blocks, values, side, shape, step, lipschitz, slack, closed):
         step: their distances.
         lipschitz: how fast the level changes at most.
         slack: how far a level may be off by rounding.
-        closed: whether the surface is capped at the lattice's boundary.
+        closed: True if the surface is capped at the lattice's boundary.
 
     Returns:
         (B,) bool.
@@ -136,7 +136,7 @@ def widened(blocks, margin, counts):
 
 @compiled
 def _grown(array, count):
-    """A longer copy of which the first rows are those of an array."""
+    """A longer copy of an array, whose first rows are the array's."""
     longer = np.empty((2 * count + 64, *array.shape[1:]), array.dtype)
     longer[:count] = array[:count]
     return longer
@@ -157,12 +157,12 @@ def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, coun
         blocks: (B, 3) int32.
         side: cells.
         shape: the points of the lattice along each axis.
-        counts: how many blocks there are along each axis.
+        counts: the number of blocks along each axis.
         directory: (D,) int32, written to.
         bricks: (·, 64) int32, written to.
-        used: how many bricks there are.
+        used: the number of bricks.
         numbers: (·,) int64, the numbers in the lattice of the corners that have rows, written to.
-        count: how many these are.
+        count: their number.
 
     Returns:
         The rows (B, 8) int32; then `bricks`, `used`, `numbers` and `count`, as they are now.
@@ -269,11 +269,11 @@ def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step,
         centre_values: (B,) the levels at centres.
         rows: (B, 8) int32, of `values`.
         values: the levels at corners of blocks.
-        counts: how many cells there are along each axis.
+        counts: the number of cells along each axis.
         step: the distances of neighbours along each axis.
         lipschitz: how fast the level changes at most.
         slack: how far a level may be off by rounding.
-        closed: whether the surface is capped at the lattice's boundary.
+        closed: True if the surface is capped at the lattice's boundary.
 
     Returns:
         Cells (K, 3) int32.
@@ -309,14 +309,14 @@ def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step,
 
 @loop
 def crossed(blocks, rows, values, counts, closed):
-    """Choose the blocks whose corners differ in sign; where closed, too, those with a corner inside on the boundary.
+    """Choose the blocks whose corners differ in sign; if closed, also blocks with a corner inside on the boundary.
 
     Args:
         blocks: (B, 3) int32.
         rows: (B, 8) int32, of `values`.
         values: the levels.
-        counts: how many blocks there are along each axis.
-        closed: whether the surface is capped at the lattice's boundary.
+        counts: the number of blocks along each axis.
+        closed: True if the surface is capped at the lattice's boundary.
 
     Returns:
         The chosen ones of `blocks` and of `rows`.
@@ -333,7 +333,7 @@ def crossed(blocks, rows, values, counts, closed):
 
 @compiled
 def _mark(x, y, z, counts, directory, bricks, used):
-    """Mark a block where there is room for one brick more: whether it was not marked, and `used` as it is now."""
+    """Mark a block; there is room for one brick more. Returns True if it was not marked, and the new `used`."""
     place, at = _brick(x, y, z, counts)
     brick = directory[place]
     if brick < 0:
@@ -347,7 +347,7 @@ def _mark(x, y, z, counts, directory, bricks, used):
 
 @loop
 def marked(blocks, counts, directory, bricks, used):
-    """Mark blocks (B, 3), by ones in bricks of bytes (·, 64); returns `bricks` and `used` as they are now."""
+    """Mark blocks (B, 3), by ones in bricks of bytes (·, 64). Returns the new `bricks` and `used`."""
     for b in range(len(blocks)):
         if used == len(bricks):
             bricks = _grown(bricks, used)
@@ -357,17 +357,17 @@ def marked(blocks, counts, directory, bricks, used):
 
 @loop
 def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
-    """Find the unmarked blocks across sides of blocks that the surface crosses: those it goes on in. They are marked.
+    """Find and mark the unmarked blocks into which the surface goes on, across sides that it crosses.
 
     Args:
         blocks: (B, 3) int32.
         rows: (B, 8) int32, of `values`.
         values: the levels.
-        counts: how many blocks there are along each axis.
-        closed: whether the surface is capped at the lattice's boundary.
+        counts: the number of blocks along each axis.
+        closed: True if the surface is capped at the lattice's boundary.
         directory: (D,) int32, of `marked`.
         bricks: (·, 64) uint8, of `marked`.
-        used: how many bricks there are.
+        used: the number of bricks.
 
     Returns:
         Blocks (K, 3) int32; then `bricks` and `used`, as they are now.
@@ -395,7 +395,7 @@ def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
 
 @loop
 def compact(rows, numbers, values):
-    """Drop the points that no cell has; rows (C, 8) are changed to those of the points that stay.
+    """Drop the points that no cell has, and renumber rows (C, 8) accordingly.
 
     Returns:
         Numbers (M,) int64 and values (M,), in order of first appearance in `rows`.

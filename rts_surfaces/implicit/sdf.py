@@ -36,7 +36,7 @@ class Sdf(Implicit, RaySurface):
             of the surface. None if there is none: rays then take steps of one length, and cost more.
         reads: the names of the entries of θ that `f` reads; None for all.
         attributes: name → g(θ, positions (N, 3)) → (N, C), further entries of the G-buffer; see `Implicit`.
-        steps: how many of the shortest steps there are across the ball: what is thinner than one may be missed. None
+        steps: the number of shortest steps across the ball: parts thinner than one step may be missed. None
             for 256 without `lipschitz`, 512 with it.
 
     Raises:

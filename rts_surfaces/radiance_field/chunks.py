@@ -1,4 +1,4 @@
-"""Functions of many rows, called on some at a time so that memory stays bounded; and how far they have come."""
+"""Functions of many rows, called on some at a time so that memory stays bounded; and their progress bar."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
     count = arrays[0].shape[0]
     if count <= rows:
         return f(*arrays)
-    engine, found = engine_of(arrays), []
+    engine, results = engine_of(arrays), []
     for start in range(0, count, rows):
         some = [x[start : start + rows, ...] for x in arrays]
-        found.append(engine.checkpoint(lambda: None, lambda _, some=some: f(*some)))
-    return engine.namespace.concat(found)
+        results.append(engine.checkpoint(lambda: None, lambda _, some=some: f(*some)))
+    return engine.namespace.concat(results)
 
 
 def fast_engine() -> Engine:
@@ -48,8 +48,8 @@ def progress_bar(wanted: bool | None, what: str, total: int) -> Iterator[Callabl
     """A progress bar on standard error, and the function that moves it on by a number.
 
     Args:
-        wanted: whether to show it; None to do so in a terminal.
-        what: what is being done.
+        wanted: True to show it; None to do so in a terminal.
+        what: the work's name, for the bar.
         total: the number that makes it full.
     """
     if wanted is False or (wanted is None and not sys.stderr.isatty()):

@@ -16,7 +16,7 @@ from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_ne
 
 NETWORKS = ("coarse", "fine")
 LARGEST = 2**30
-"""Bytes of weights; what claims to be more is no network of this kind."""
+"""The most bytes of weights; a larger file holds no network of this kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class RadianceField:
         return f"RadianceField({', '.join(f'{name}: {self.architecture(name)}' for name in NETWORKS)})"
 
     def architecture(self, network: str = "fine") -> Architecture:
-        """What the network "coarse" or "fine" is like."""
+        """The architecture of the network "coarse" or "fine"."""
         return check_network(self.weights[network])
 
     def save(self, path: Any) -> None:
@@ -78,7 +78,7 @@ class RadianceField:
             shape: (X, Y, Z), at least 2 each.
             network: "fine" or "coarse".
             keep: True to keep them in the user's cache and to find them there; a folder for that; False for neither.
-            progress: whether to show a progress bar; None to do so in a terminal.
+            progress: True to show a progress bar; None to do so in a terminal.
 
         Raises:
             InputError: there is no such lattice or network.
@@ -94,7 +94,7 @@ def load_radiance_field(path: Path) -> RadianceField:
     """The field whose weights an .npz holds, as float32; see `rts.load_radiance_field`."""
     if not path.is_file():
         raise InputError(f"there is no file {path} of weights; check the path (relative paths start at {Path.cwd()})")
-    found: dict[str, Any] = {}
+    networks: dict[str, Any] = {}
     for key, array in _arrays(path).items():
         network, _, rest = key.partition(".")
         *place, kind = rest.split(".")
@@ -104,28 +104,28 @@ def load_radiance_field(path: Path) -> RadianceField:
             raise InputError(
                 f"{path} has an array {key[:60]!r}, of no layer that is known; expected such as 'fine.layer1.weight'"
             )
-        layers = found.setdefault(network, {})
+        layers = networks.setdefault(network, {})
         if number is None:
             layers.setdefault(layer, {})[kind] = array
         else:
             layers.setdefault(layer, {}).setdefault(int(number), {})[kind] = array
     for network in NETWORKS:
-        if network not in found:
+        if network not in networks:
             raise InputError(f"{path} lacks the layer '{network}.layer1'; expected the networks coarse and fine")
         for name in REPEATED:
-            numbered = found[network].get(name, {})
+            numbered = networks[network].get(name, {})
             gap = next((i for i in range(len(numbered)) if i not in numbered), None)
             if gap is not None:
                 raise InputError(f"{path} lacks the layer '{network}.{name}.{gap}', though it has later ones")
             if numbered:
-                found[network][name] = [numbered[i] for i in range(len(numbered))]
-        check_network(found[network], f"{path}: the network {network!r}")
-    return RadianceField(found)
+                networks[network][name] = [numbered[i] for i in range(len(numbered))]
+        check_network(networks[network], f"{path}: the network {network!r}")
+    return RadianceField(networks)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an .npz, as float32."""
-    found = {}
+    arrays = {}
     try:
         # NumPy leaves files open that are damaged, if it opens them.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -133,15 +133,15 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             if total > LARGEST:
                 raise ValueError(f"it holds {total / 2**30:.1f} GB")
             for key in file.files:
-                found[key] = np.asarray(file[key])
+                arrays[key] = np.asarray(file[key])
     except Exception as error:  # NumPy and zipfile raise many kinds.
         what = " ".join(str(error).split())[:80]
         raise InputError(f"{path} is no .npz of weights ({what}); expected numpy.savez's, without pickles") from error
-    for key, array in found.items():
+    for key, array in arrays.items():
         if array.dtype.kind != "f":
             raise InputError(f"{path} has {key[:60]!r} of dtype {array.dtype}; expected floating numbers")
         with np.errstate(over="ignore"):
-            found[key] = array.astype(np.float32)
-        if not np.isfinite(found[key]).all():
+            arrays[key] = array.astype(np.float32)
+        if not np.isfinite(arrays[key]).all():
             raise InputError(f"{path} has NaN, infinity or too large numbers in {key[:60]!r}; repair the file")
-    return found
+    return arrays

@@ -42,7 +42,7 @@ def lattice(
         network: "fine" or "coarse".
         keep: where to keep the lattice, and to look for it: True for the user's cache, a folder, or False for nowhere.
             It goes by weights, bounds and shape. What is damaged there is computed anew.
-        progress: whether to show a progress bar; None to do so in a terminal.
+        progress: True to show a progress bar; None to do so in a terminal.
 
     Returns:
         (X, Y, Z) float32, per unit of length in the field's space; [i, j, k] is at step i of x, j of y, k of z.
@@ -72,22 +72,22 @@ def _computed(weights: Any, points: Lattice, progress: bool | None) -> np.ndarra
     with progress_bar(progress, "density", len(values)) as advance:
         for start in range(0, len(values), CHUNK):
             numbers = np.arange(start, min(start + CHUNK, len(values)))
-            found = density(weights, engine.constant(points.points(numbers).astype(np.float32)))
-            values[numbers] = engine.to_numpy(found)
+            densities = density(weights, engine.constant(points.points(numbers).astype(np.float32)))
+            values[numbers] = engine.to_numpy(densities)
             advance(len(numbers))
     return values.reshape(points.shape)
 
 
 def _key(weights: Any, points: Lattice) -> str:
     """A name that changes with weights and points."""
-    found = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
+    digest = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
     for place, array in placed(weights):
-        found.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()[:32]
+        digest.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
 
 
 def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
-    """The lattice in a file; None where there is none, or it is damaged (zip files hold checksums)."""
+    """The lattice in a file; None if the file is missing or damaged (zip files hold checksums)."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             values = file["density"]

@@ -27,14 +27,14 @@ REPEATED = ("layers_xyz", "layers_dir")
 
 
 class Architecture(NamedTuple):
-    """What the shapes of weights tell of a network.
+    """The architecture of a network, from the shapes of its weights.
 
     Attributes:
         position_levels: frequencies that encode positions: 2⁰ to 2^(levels − 1).
         direction_levels: frequencies that encode directions.
         width: units of the layers that density is computed from.
-        layers: how many these are, the first included.
-        parameters: how many numbers the weights are.
+        layers: the number of these layers, the first included.
+        parameters: the number of weights.
     """
 
     position_levels: int
@@ -45,12 +45,12 @@ class Architecture(NamedTuple):
 
 
 def check_network(weights: Any, name: str = "the network") -> Architecture:
-    """What a network is like; refused where layers are missing, or their shapes do not fit together.
+    """The architecture of a network, refused where layers are missing, or their shapes do not fit together.
 
     Args:
         weights: {"layer1": layer, "layers_xyz": [layer, …], "fc_alpha", "fc_feat", "layers_dir": [layer, …],
             "fc_rgb"}, each layer a dict of "weight" and "bias".
-        name: what an error calls the network.
+        name: the network's name in errors.
 
     Raises:
         InputError: it is none; the message names the layer.
@@ -65,11 +65,11 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
             raise InputError(f"{name} has no list of layers {n!r}; expected at least one layer")
     count = 0
 
-    def layer(place: str, given: Any, outputs: int | None, inputs: int | None) -> tuple[int, int]:
+    def layer(place: str, arrays: Any, outputs: int | None, inputs: int | None) -> tuple[int, int]:
         nonlocal count
-        if not isinstance(given, Mapping) or not {"weight", "bias"} <= set(given):
+        if not isinstance(arrays, Mapping) or not {"weight", "bias"} <= set(arrays):
             raise InputError(f"{name} has no 'weight' and 'bias' of the layer {place!r}; expected both")
-        shape, bias = shape_of(given["weight"]), shape_of(given["bias"])
+        shape, bias = shape_of(arrays["weight"]), shape_of(arrays["bias"])
         fits = len(shape) == 2 and 0 not in shape and bias == shape[:1]
         if not fits or (outputs or shape[0], inputs or shape[1]) != shape:
             expected = f"({outputs or 'n'}, {inputs or 'm'}) and ({outputs or 'n'},)"
@@ -90,14 +90,14 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
 
     width, encoded = layer("layer1", weights["layer1"], None, None)
     position_levels = levels("layer1", encoded)
-    for i, given in enumerate(weights["layers_xyz"]):
-        layer(f"layers_xyz.{i}", given, width, width)
+    for i, arrays in enumerate(weights["layers_xyz"]):
+        layer(f"layers_xyz.{i}", arrays, width, width)
     layer("fc_alpha", weights["fc_alpha"], 1, width)
     features, _ = layer("fc_feat", weights["fc_feat"], None, width)
     narrow, joined = layer("layers_dir.0", weights["layers_dir"][0], None, None)
     direction_levels = levels("layers_dir.0", joined - features)
-    for i, given in enumerate(weights["layers_dir"][1:], 1):
-        layer(f"layers_dir.{i}", given, narrow, narrow)
+    for i, arrays in enumerate(weights["layers_dir"][1:], 1):
+        layer(f"layers_dir.{i}", arrays, narrow, narrow)
     layer("fc_rgb", weights["fc_rgb"], 3, narrow)
     return Architecture(position_levels, direction_levels, width, 1 + len(weights["layers_xyz"]), count)
 
@@ -122,7 +122,7 @@ def encoding(vectors: Array, levels: int) -> Array:
 
 
 def density(weights: Mapping[str, Tree], points: Array) -> Array:
-    """Volume density σ at points: what a ray loses of its light, per unit of length in the field's space.
+    """Volume density σ at points: the share of its light that a ray loses per unit of length in the field's space.
 
     Args:
         weights: a network, see `check_network`.
@@ -157,9 +157,9 @@ def density_and_radiance(weights: Mapping[str, Tree], points: Array, directions:
     return _density(weights, hidden), _radiance(weights, hidden, directions)
 
 
-def _alike(*given: Tree) -> tuple[Any, ...]:
+def _alike(*trees: Tree) -> tuple[Any, ...]:
     """Weights, points and directions as arrays of one engine and dtype, if not all are NumPy's."""
-    return constants(given, engine_of(given), exemplar(given))
+    return constants(trees, engine_of(trees), exemplar(trees))
 
 
 def _trunk(weights: Mapping[str, Any], points: Array) -> Array:
@@ -178,11 +178,11 @@ def _radiance(weights: Mapping[str, Any], hidden: Array, directions: Array) -> A
     first: Sequence[Any] = weights["layers_dir"]
     features = _relu(_layer(weights["fc_feat"], hidden))
     inputs = first[0]["weight"].shape[1] - features.shape[1]
-    found = namespace(features).concat([features, encoding(directions, (inputs - 3) // 6)], axis=1)
+    layer_values = namespace(features).concat([features, encoding(directions, (inputs - 3) // 6)], axis=1)
     for layer in first:
-        found = _relu(_layer(layer, found))
-    found = _layer(weights["fc_rgb"], found)
-    return 0.5 * namespace(found).tanh(0.5 * found) + 0.5  # The sigmoid, without overflow.
+        layer_values = _relu(_layer(layer, layer_values))
+    layer_values = _layer(weights["fc_rgb"], layer_values)
+    return 0.5 * namespace(layer_values).tanh(0.5 * layer_values) + 0.5  # The sigmoid, without overflow.
 
 
 def _layer(layer: Mapping[str, Array], x: Array) -> Array:

@@ -1,7 +1,8 @@
-"""Surfaces in NDC, brought to the world: where a forward-facing radiance field is to be drawn by a camera.
+"""Surfaces in NDC, brought to the world: by these a camera draws a forward-facing radiance field.
 
-Between NDC and the world planes and straight lines stay what they are, so that triangles do, too; but the middle of a
-side does not stay in its middle. What is λ_k in the world, of a corner at depth d_k, is λ_k d_k over the sum in NDC.
+Between NDC and the world planes and straight lines stay planes and lines, so triangles stay triangles; but the middle
+of a side does not stay in its middle. The barycentric λ_k in the world, of a corner at depth d_k, is λ_k d_k over the
+sum of these in NDC.
 """
 
 from __future__ import annotations
@@ -68,36 +69,36 @@ class Projected(TriangleSurface):
         return Part(cls(surface, ndc), theta, "normals", transform=move)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """As the surface itself does."""
+        """Refuse θ that the surface in NDC refuses."""
         self.surface.check(theta)
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """What the surface itself reads."""
+        """The entries that the surface in NDC reads."""
         return self.surface.reads(theta)
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """What the surface itself needs."""
+        """The inputs of the surface in NDC."""
         return self.surface.proxy_inputs(theta)
 
     def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
         """The surface's triangles, seen from the world; they carry the depths of their corners, as bits of floats."""
-        found = self.surface.proxy(inputs, camera, size)
-        vertices = np.asarray(found.vertices, np.float64)
+        inner = self.surface.proxy(inputs, camera, size)
+        vertices = np.asarray(inner.vertices, np.float64)
         world = self.ndc.to_world(vertices)
         # NDC are a mirror image of the world: z grows with depth.
-        faces = np.ascontiguousarray(found.faces[:, ::-1])
-        depths = (-world[:, 2]).astype(np.float32)[found.faces]
-        assert found.ids is not None, "surfaces that refine samples say what these carry"
+        faces = np.ascontiguousarray(inner.faces[:, ::-1])
+        depths = (-world[:, 2]).astype(np.float32)[inner.faces]
+        assert inner.ids is not None, "surfaces that refine samples say what these carry"
         kept = (depths < DEEPEST * self.ndc.near).all(axis=1)
-        ids = np.concatenate([found.ids, depths.view(np.int32)], axis=1)
+        ids = np.concatenate([inner.ids, depths.view(np.int32)], axis=1)
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """One, as those of the surface itself, which refines samples without moving them: an isosurface."""
+        """One piece, as of any surface that refines samples without moving them: an isosurface."""
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
-        """Barycentrics as they are in NDC; then what the surface itself does with samples there."""
+        """Samples with their barycentrics in NDC, refined by the surface there."""
         depths = np.ascontiguousarray(samples.ids[:, -3:]).view(np.float32).astype(np.float64)
         second, third = samples.params[:, 1].astype(np.float64), samples.params[:, 0].astype(np.float64)
         shares = np.stack([1 - second - third, second, third], axis=1) * np.maximum(depths, 1e-30)
@@ -110,11 +111,11 @@ class Projected(TriangleSurface):
         return self.surface.refine(inputs, within, rays)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """Those of the surface itself."""
+        """The tables of the surface in NDC."""
         return self.surface.table_specs(rows, capacity)
 
     def why_no_triangles(self, inputs: Tree) -> str:
-        """What the surface itself says."""
+        """The reason that the surface in NDC gives."""
         return self.surface.why_no_triangles(inputs)
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
@@ -130,7 +131,7 @@ class Projected(TriangleSurface):
         return gbuffer
 
     def _normals(self, position: Array, normals: Array) -> Array:
-        """Unit normals (N, 3) in the world, of those in NDC: times the transposed Jacobian of world to NDC."""
+        """Unit normals (N, 3) in the world: normals in NDC times the transposed Jacobian of world to NDC."""
         xp, (x_scale, y_scale) = namespace(position), self.ndc.scale
         x, y, depth = position[:, 0], position[:, 1], -position[:, 2]
         a, b = x_scale * normals[:, 0], y_scale * normals[:, 1]

@@ -18,7 +18,7 @@ from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
 
 @dataclass(frozen=True)
 class RadianceShader(Shader):
-    """What a network θ["weights"] sees at a sample along the ray that meets it (Miller et al. 1998, NeRF's colours).
+    """The colour that a network θ["weights"] gives a sample, seen along its ray (Miller et al. 1998, NeRF).
 
     Colours are as the network gives them, in the encoding of the images that it was trained on: sRGB, as a rule. For
     linear ones, decode the image.
@@ -51,8 +51,8 @@ class RadianceShader(Shader):
         weights = theta["weights"]
         check_network(weights, "theta['weights']")
         position = gbuffer["position"]
-        given = weights, position, -unit(camera.toward(position))
-        weights, position, direction = constants(given, engine_of(given), exemplar(given))
+        trees = weights, position, -unit(camera.toward(position))
+        weights, position, direction = constants(trees, engine_of(trees), exemplar(trees))
         points = position if self.ndc is None else self.ndc.from_world(position)
         color = in_chunks(lambda p, d: radiance(weights, p, d), self.chunk, points, direction)
         xp = namespace(color)

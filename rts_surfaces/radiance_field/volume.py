@@ -1,4 +1,4 @@
-"""Radiance fields drawn by volume rendering: what surface light fields are compared with."""
+"""Volume rendering of radiance fields, with which surface light fields are compared."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LAST = 1e10
 
 
 class VolumeImage(NamedTuple):
-    """A picture of a volume, and what it took.
+    """A picture of a volume, and its cost.
 
     Attributes:
         image: (H, W, 3) RGB on the background, or (H, W, 4) premultiplied RGBA, in the encoding of the network.
@@ -55,7 +55,7 @@ def volume_render(
         samples: of the coarse and the fine network, along each ray.
         background: a colour (3,), or None for transparency.
         ndc: the map to the field's space, or None.
-        progress: whether to show a progress bar.
+        progress: True to show a progress bar.
     """
     if not isinstance(field, RadianceField):
         raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")
@@ -110,20 +110,20 @@ def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
     def call(o: np.ndarray, d: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.ndarray:
         points = (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)
         directions = np.repeat(v, t.shape[1], axis=0)
-        found = in_chunks(rows, CHUNK, engine.constant(points), engine.constant(directions))
-        return engine.to_numpy(found).reshape(*t.shape, 4)
+        radiance = in_chunks(rows, CHUNK, engine.constant(points), engine.constant(directions))
+        return engine.to_numpy(radiance).reshape(*t.shape, 4)
 
     return call
 
 
-def _composited(found: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Premultiplied RGBA (R, 4), and the weight of each sample (R, S)."""
     lengths = np.concatenate([np.diff(t, axis=1), np.full_like(t[:, :1], LAST)], axis=1)
     lengths = lengths * np.linalg.norm(directions, axis=1, keepdims=True)
-    passed = np.exp(-found[..., 3] * lengths)
+    passed = np.exp(-radiance[..., 3] * lengths)
     before = np.cumprod(np.concatenate([np.ones_like(t[:, :1]), passed[:, :-1] + np.float32(1e-10)], axis=1), axis=1)
     weights = (1 - passed) * before
-    rgb = np.sum(weights[..., None] * found[..., :3], axis=1)
+    rgb = np.sum(weights[..., None] * radiance[..., :3], axis=1)
     return np.concatenate([rgb, np.sum(weights, axis=1, keepdims=True)], axis=1), weights
 
 

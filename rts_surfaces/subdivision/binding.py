@@ -33,16 +33,16 @@ NONE, QUAD, TRIANGLE, SUBFACES = -1, 0, 1, 2
 """Kinds of faces: without a limit surface; with parameters in the unit square; in the triangle (0, 0), (1, 0), (0, 1);
 in sub-faces, one a corner, each a square of half the size."""
 VERTEX, UV = 0, 1
-"""What is subdivided: data of vertices, or face-varying."""
+"""Kinds of data that are subdivided: of vertices, or face-varying."""
 
 
 class Rules(NamedTuple):
-    """How a cage is subdivided.
+    """The rules by which a cage is subdivided.
 
     Attributes:
         boundary: a key of `BOUNDARIES`.
-        chaikin: whether the sharpness of a crease is smoothed along it by Chaikin's rule.
-        uv: a key of `UV_RULES`: where face-varying data is interpolated linearly.
+        chaikin: True to smooth the sharpness of a crease along it by Chaikin's rule.
+        uv: a key of `UV_RULES`: the places where face-varying data is interpolated linearly.
         smooth: the level to which extraordinary vertices are isolated.
         sharp: the level to which creases are.
     """
@@ -127,7 +127,7 @@ class Limit:
         handle, widths = ctypes.c_void_p(), (ctypes.c_int * 2)()
         self._call("rts_cage", ctypes.byref(description), ctypes.byref(handle), widths)
         self.handle = handle.value or 0
-        # What a `Points` leaves behind: the next one's memory need not be asked of the system, page by page.
+        # Memory that one `Points` leaves to the next, so that the system need not clear it page by page.
         self._left: list[int] = []
         weakref.finalize(self, _free, self._library, self.handle, self._left)
         self.used = read_only(used.astype(np.int32))
@@ -276,7 +276,7 @@ class Points:
         spread: np.ndarray,
         limits: tuple[float, int, float, float, int],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Where rays meet the surface, from samples nearby.
+        """Hits of rays with the surface, by Newton's method from samples nearby.
 
         Args:
             faces: (N,) integers, where to start.
@@ -284,11 +284,11 @@ class Points:
             origins: (N, 3) float.
             directions: (N, 3) float; the point at depth z is `origin + z direction`.
             spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
-            limits: residual in pixels, largest number of steps, largest step, how far beyond the edge of a face, both
-                in units of the face or sub-face; and how many edges may be crossed.
+            limits: residual in pixels, largest number of steps, largest step, largest distance beyond the edge of a
+                face, both in units of the face or sub-face; and the number of edges that may be crossed.
 
         Returns:
-            Faces (N,) int32, parameters (N, 2) float64, depth (N,) float64, and whether it met, (N,) bool.
+            Faces (N,) int32, parameters (N, 2) float64, depth (N,) float64, and (N,) bool, True for a hit.
         """
         faces, params = (x.copy() for x in self.limit._samples(faces, params))
         rays = [np.ascontiguousarray(x, np.float64) for x in (origins, directions, spread, limits)]

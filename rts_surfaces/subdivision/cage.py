@@ -1,4 +1,4 @@
-"""Cages of subdivision surfaces, checked: what OpenSubdiv would not survive never reaches it.
+"""Checks of cages of subdivision surfaces: a cage on which OpenSubdiv would crash never reaches it.
 
 Half edge h is the side of a face from its corner h to the next one; H is how many there are.
 """
@@ -74,7 +74,7 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), 
         holes: numbers of faces.
 
     Raises:
-        InputError: the cage is none that has a limit surface; one line that says what is wrong where.
+        InputError: the cage has no limit surface; one line names the fault and its place.
     """
     if not isinstance(scheme, str) or scheme not in ("catmark", "loop"):
         raise InputError(f"scheme is {quoted(scheme)}; expected 'catmark' or 'loop'")
@@ -179,7 +179,7 @@ def _sorted_edges(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """The half edge that runs the other way, or −1; what is no manifold is refused."""
+    """The half edge that runs the other way, or −1; a cage that is no manifold is refused."""
     same = keys[1:] == keys[:-1]
     thrice = np.flatnonzero(same[1:] & same[:-1])
     (a, b), owner = _ends(cage), cage.faces()

@@ -19,25 +19,25 @@ def tiles_of(limit: Limit) -> Tiles:
     count = int(start.max()) + 1
     against = start > end
     _, edge = np.unique(np.minimum(start, end) * count + np.maximum(start, end), return_inverse=True)
-    there = limit.kinds[owner] != NONE
+    has_limit = limit.kinds[owner] != NONE
     if (limit.kinds == SUBFACES).any():
-        faces, frames = owner[there].astype(np.int32), _quarters(limit)[there]
+        faces, frames = owner[has_limit].astype(np.int32), _quarters(limit)[has_limit]
         before = np.empty(len(owner), np.int64)
         before[cage.next()] = np.arange(len(owner))
         # Corners: a vertex, the middle of the edge after it, that of the face, the middle of the edge before it.
         edges, total = edge.max() + 1, len(owner)
-        corners = np.stack([start, count + edge, count + edges + owner, count + edge[before]], axis=1)[there]
+        corners = np.stack([start, count + edge, count + edges + owner, count + edge[before]], axis=1)[has_limit]
         # Edges: half k of edge e is 2 e + k, the first at the lesser vertex; then those to the middles of faces.
         first, last = 2 * edge + against, (2 * edge + ~against)[before]
         inner = 2 * edges + np.arange(total)
-        sides = np.stack([first, inner, inner[before], last], axis=1)[there]
+        sides = np.stack([first, inner, inner[before], last], axis=1)[has_limit]
         no = np.zeros(total, bool)
-        flips = np.stack([against, no, ~no, against[before]], axis=1)[there]
+        flips = np.stack([against, no, ~no, against[before]], axis=1)[has_limit]
     else:
         width = 3 if cage.scheme == "loop" else 4
         faces = np.flatnonzero(limit.kinds != NONE).astype(np.int32)
         frames = np.broadcast_to(np.array([(0.0, 0), (1, 0), (0, 1)]), (len(faces), 3, 2)).copy()
-        corners, sides, flips = (x[there].reshape(-1, width) for x in (start, edge, against))
+        corners, sides, flips = (x[has_limit].reshape(-1, width) for x in (start, edge, against))
     return Tiles.of(faces, frames, corners, sides, flips)
 
 

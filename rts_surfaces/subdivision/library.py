@@ -54,12 +54,12 @@ _first_use = threading.Lock()
 
 
 class Tools(NamedTuple):
-    """What the library is made with.
+    """The tools that build the library.
 
     Attributes:
         compiler: the command, perhaps with options.
         prefix: the folder that holds OpenSubdiv's include and lib.
-        version: the text of the header that tells OpenSubdiv's version.
+        version: the text of the header with OpenSubdiv's version.
     """
 
     compiler: tuple[str, ...]
@@ -85,12 +85,12 @@ def find() -> Tools:
         old = f", and that in {prefix} is older than {'.'.join(map(str, OLDEST))}"
     else:
         raise PluginError(f"subdivision surfaces need OpenSubdiv, whose headers are not found{old}; {HELP}")
-    given = shlex.split(os.environ.get("CXX", ""))
-    for command in [given] if given else [[name] for name in COMPILERS]:
-        found = shutil.which(command[0])
-        if found:
-            return Tools((found, *command[1:]), prefix, version)
-    missing = f"that CXX names, {given[0]!r}, is not found" if given else "is not found"
+    chosen = shlex.split(os.environ.get("CXX", ""))
+    for command in [chosen] if chosen else [[name] for name in COMPILERS]:
+        program = shutil.which(command[0])
+        if program:
+            return Tools((program, *command[1:]), prefix, version)
+    missing = f"that CXX names, {chosen[0]!r}, is not found" if chosen else "is not found"
     raise PluginError(f"subdivision surfaces need a C++ compiler, and one {missing}; {HELP}")
 
 

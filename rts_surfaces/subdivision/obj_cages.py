@@ -1,4 +1,4 @@
-"""Cages from OBJ files: polygons, uv, and the statements "t" by which OpenSubdiv's files tag what these are made of.
+"""Cages from OBJ files: polygons, uv, and the tags of OpenSubdiv's files, which are statements "t".
 
 `t name i/f/s …` has so many integers, floats and words. Vertices and faces in them count from 0, those of "f" from 1.
 """
@@ -17,17 +17,17 @@ from rts.plugin_api.files import read_polygons
 from rts_surfaces.subdivision.binding import UV_RULES
 
 _BOUNDARIES = ("none", "edge_and_corner", "edge_only")
-"""What interpolateboundary 0, 1 and 2 stand for."""
+"""Boundary rules of interpolateboundary 0, 1 and 2."""
 _TAGS = ("crease", "corner", "hole", "interpolateboundary", "facevaryinginterpolateboundary", "creasemethod")
 
 
 class CageFile(NamedTuple):
-    """What a file holds.
+    """A cage as its file has it.
 
     Attributes:
         faces: lists of vertices.
         options: keywords of `Subdivision`.
-        theta: "vertices" (V, 3) and what the file has of "uv", "colors", "texture" and "color", float32, linear.
+        theta: "vertices" (V, 3) and, if the file has them, "uv", "colors", "texture" and "color", float32, linear.
         shader: a shader for it.
     """
 
@@ -48,21 +48,21 @@ def read_cage(path: Path) -> CageFile:
     """
     if path.suffix.lower() != ".obj":
         raise InputError(f"{path} is no OBJ file; cages of subdivision surfaces are read from .obj")
-    found = read_polygons(path)
-    if found.materials > 1:
+    mesh = read_polygons(path)
+    if mesh.materials > 1:
         errors.warn(
-            f"{path} has {found.materials} materials, of which a cage can have but one; none is taken",
+            f"{path} has {mesh.materials} materials, of which a cage can have but one; none is taken",
             errors.FileWarning,
         )
     with np.errstate(over="ignore"):  # What overflows is refused.
-        theta: dict[str, Any] = {"vertices": found.vertices.astype(np.float32)}
-        options = _tagged(path, found.tags)
-        if (found.corners[:, 1] >= 0).all():
-            theta["uv"] = found.uv.astype(np.float32)
-            options["indices"] = {"uv": _lists(found.corners[:, 1], found.sizes)}
-        if found.colors is not None:
-            theta["colors"] = found.colors.astype(np.float32)
-    opaque = _material(found, theta)
+        theta: dict[str, Any] = {"vertices": mesh.vertices.astype(np.float32)}
+        options = _tagged(path, mesh.tags)
+        if (mesh.corners[:, 1] >= 0).all():
+            theta["uv"] = mesh.uv.astype(np.float32)
+            options["indices"] = {"uv": _lists(mesh.corners[:, 1], mesh.sizes)}
+        if mesh.colors is not None:
+            theta["colors"] = mesh.colors.astype(np.float32)
+    opaque = _material(mesh, theta)
     for name, values in theta.items():
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
@@ -70,20 +70,20 @@ def read_cage(path: Path) -> CageFile:
                 f"{path}: row {bad[0][0]} of {name} is NaN, infinite or too large for float32; repair the file"
             )
     shader = plugin("shaders", "textured" if "texture" in theta else "lambert")(opaque=opaque)
-    return CageFile(_lists(found.corners[:, 0], found.sizes), options, theta, shader)
+    return CageFile(_lists(mesh.corners[:, 0], mesh.sizes), options, theta, shader)
 
 
 def _lists(indices: np.ndarray, sizes: np.ndarray) -> list[list[int]]:
     return [part.tolist() for part in np.split(indices, np.cumsum(sizes)[:-1])]
 
 
-def _material(found: Any, theta: dict[str, Any]) -> bool:
+def _material(mesh: Any, theta: dict[str, Any]) -> bool:
     """Add colour and texture of the material to θ; True if all is opaque."""
-    color = found.color
+    color = mesh.color
     opaque = color is None or len(color) < 4 or color[3] >= 1
-    if found.texture is not None and "uv" in theta:
-        theta["texture"] = found.texture.astype(np.float32)
-        opaque = opaque and found.texture.shape[-1] < 4
+    if mesh.texture is not None and "uv" in theta:
+        theta["texture"] = mesh.texture.astype(np.float32)
+        opaque = opaque and mesh.texture.shape[-1] < 4
     if color is not None and (color < 1).any():
         theta["color"] = color[: 3 if (color[3:] >= 1).all() else 4].astype(np.float32)
     return bool(opaque)

@@ -29,8 +29,8 @@ from rts_surfaces.subdivision.face_tiles import tiles_of
 library.find()  # Without OpenSubdiv there is no such plugin.
 
 BESIDE = 1 / 16
-"""How far from the border of a tile it is looked at how it bends. At extraordinary vertices second derivatives have no
-bound, and at creases they are large, but both on so little of a tile that triangles are off by less than that."""
+"""Distance from the border of a tile from which on its bend is measured. At extraordinary vertices second derivatives
+have no bound, and at creases they are large. Both cover so little of a tile that triangles stay near the surface."""
 LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
 VERTEX_ATTRIBUTES = ("colors", "uv")
@@ -74,9 +74,9 @@ class Subdivision(Parametric):
             for ever.
         corners: rows (vertex, sharpness).
         holes: numbers of faces that shape the surface, and are no part of it.
-        boundary: what becomes of edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
+        boundary: the rule for edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
             face are corners), "edge_only" (no corners), "none" (faces at the boundary have no surface).
-        chaikin: whether the sharpness of creases is smoothed along them.
+        chaikin: True if the sharpness of creases is smoothed along them.
         indices: attribute name → None for one row a vertex, which is how others than the known ones are declared; and
             for "uv" lists of integers into θ["uv"], as `faces` are: a face-varying map with seams.
         uv_rule: where a face-varying uv is linear rather than smooth: "none", "corners_only", "corners_plus1",
@@ -104,9 +104,9 @@ class Subdivision(Parametric):
         uv_rule: str = "corners_plus1",
         tolerance: float = TOLERANCE,
     ):
-        for name, given, known in (("boundary", boundary, BOUNDARIES), ("uv_rule", uv_rule, UV_RULES)):
-            if not isinstance(given, str) or given not in known:
-                raise InputError(f"{name} is {quoted(given)}; expected one of {', '.join(map(repr, known))}")
+        for name, value, known in (("boundary", boundary, BOUNDARIES), ("uv_rule", uv_rule, UV_RULES)):
+            if not isinstance(value, str) or value not in known:
+                raise InputError(f"{name} is {quoted(value)}; expected one of {', '.join(map(repr, known))}")
         if not isinstance(chaikin, (bool, np.bool_)):
             raise InputError(f"chaikin is {quoted(chaikin)}; expected True or False")
         self._rules = Rules(boundary, bool(chaikin), uv_rule)
@@ -135,7 +135,7 @@ class Subdivision(Parametric):
         return tuple(dict.fromkeys((*VERTEX_ATTRIBUTES, *(indices or {})))), uv
 
     def _prepare(self) -> None:
-        """Make what is not kept in a copy."""
+        """Make the objects that copies do not keep."""
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
             raise InputError(
@@ -145,7 +145,7 @@ class Subdivision(Parametric):
         self._points: tuple[tuple, Points] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy is made of: the library's objects stay in this process."""
+        """The state of a copy: the library's objects stay in this process."""
         return {name: value for name, value in vars(self).items() if name not in ("limit", "_points")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -176,12 +176,12 @@ class Subdivision(Parametric):
         """
         from rts_surfaces.subdivision.obj_cages import read_cage
 
-        found = read_cage(path)
+        cage = read_cage(path)
         try:
-            surface = cls(found.faces, **found.options)
+            surface = cls(cage.faces, **cage.options)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-        return [Part(surface, found.theta, found.shader)]
+        return [Part(surface, cage.theta, cage.shader)]
 
     # ---------------------------------------------------------------------------------------------- checks
 
@@ -246,7 +246,7 @@ class Subdivision(Parametric):
         return gbuffer
 
     def _weights(self, like: Array, faces: Array, params: Array, channel: int, derivatives: bool) -> tuple[Array, ...]:
-        """Weights (N, W) of control points; for derivatives those along u, and those along v."""
+        """Weights (N, W) of control points; for derivatives also weights along u and along v."""
         engine = engine_of(like, params)
         dtype = np.float64 if engine.namespace.finfo(like.dtype).bits == 64 else np.float32
         table = self.limit.table if channel == VERTEX else self.limit.uv_table

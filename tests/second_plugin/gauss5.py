@@ -16,6 +16,8 @@ class Gauss5(rts.Splatter):
     def image(self, splats):
         xp, engine = rts.namespace(splats.positions), rts.engine_of(splats.positions)
         reach, (height, width) = self.reach, splats.row.shape[1:]
+        if splats.rgba.shape[0] == 0:  # Nothing can be taken by index.
+            return xp.stack([xp.zeros_like(splats.row[0], dtype=splats.rgba.dtype)] * 4, axis=-1)
         nothing = xp.full_like(splats.row[0, :1, :], -1)
         row = xp.concat([nothing] * reach + [splats.row[0]] + [nothing] * reach, axis=0)
         nothing = xp.full_like(row[:, :1], -1)

@@ -26,7 +26,7 @@ def explained(
     numbers: Sequence[Number],
     agrees: Callable[[Slope], bool],
     own_loss: bool,
-    going: Callable[[], bool],
+    turn: Callable[[int], Callable[[], bool]],
     phase: Phase,
 ) -> tuple[list[Reason], int]:
     """Why slopes differ or vanish.
@@ -36,24 +36,28 @@ def explained(
         numbers: of it.
         agrees: whether a slope's derivatives do.
         own_loss: whether the loss is the user's, and may be flat where images change.
-        going: whether there is time for another experiment.
+        turn: count → whether there is time for another experiment, of the next of so many that share what is left.
         phase: of a progress bar.
 
     Returns:
         The reasons, and the number of numbers that there was no time for.
     """
-    findings: list[tuple[str, Finding]] = []
-    done, left = phase("reasons", len(numbers) + 1), 0
-    for number in numbers:
-        watch = _Watch(going)
-        if watch():
-            findings += [(number.slope.name, f) for f in _why(subject, number, agrees, own_loss, watch)]
-        left += watch.refused
-        done()
-    if going():
+    found: dict[int, list[Finding]] = {}
+    done, left = phase("reasons", len(numbers) + 1), list(range(len(numbers)))
+    for first in (True, False):  # Who was cut short by the others' turns gets what time they leave.
+        waiting, left = left, []
+        for i, k in enumerate(waiting):
+            watch = _Watch(turn(len(waiting) - i if first else 1))
+            if watch():
+                found[k] = _why(subject, numbers[k], agrees, own_loss, watch)
+            left += [k] if watch.refused else []
+            if first:
+                done()
+    findings = [(numbers[k].slope.name, f) for k in sorted(found) for f in found[k]]
+    if turn(1)():
         findings += undetermined(subject, numbers)
     done()
-    return merged(findings, subject.size), left
+    return merged(findings, subject.size), len(left)
 
 
 class _Watch:

@@ -68,6 +68,21 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
         samples: the square root of the number of samples a pixel.
     """
     step = subject.step(direction) or _step_of_hidden(subject, direction) or STEP_UNSEEN
+    try:
+        pushed, forward = subject.push(direction) * step, True
+    except (RuntimeError, TypeError):  # Of torch and of jax, for a user's own operation.
+        pushed, forward = np.full_like(subject.seen, np.nan), False
+    if slope is None:
+        slope = float((subject.weights * pushed.astype(np.float64)).sum() / step)
+    nothing = Slope(name, slope, math.nan, math.nan, step)
+    return differenced(
+        subject, Number(nothing, direction, pushed.astype(np.float32), pushed, math.nan, forward), samples
+    )
+
+
+def differenced(subject: Subject, number: Number, samples: int) -> Number:
+    """The number, with a finite difference by so many samples a pixel, squared."""
+    step, direction = number.slope.step, number.direction
     to_numpy = subject.engine.to_numpy
 
     rounding: list[float] = []
@@ -80,16 +95,9 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
 
     (coarse, image), (fine, other), (wide, _) = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
     error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3 + max(rounding)
-    try:
-        pushed, forward = subject.push(direction) * step, True
-    except (RuntimeError, TypeError):  # Of torch and of jax, for a user's own operation.
-        pushed, forward = np.full_like(image, np.nan), False
-    if slope is None:
-        slope = float((subject.weights * pushed.astype(np.float64)).sum() / step)
-    found = Slope(name, slope, (coarse + fine) / 2, error, step)
+    slope = number.slope._replace(difference=(coarse + fine) / 2, error=error)
     noise = float(np.linalg.norm(low_pass((image - other) / 2)))
-    true = ((image + other) / 2).astype(np.float32)
-    return Number(found, direction, pushed.astype(np.float32), true, noise, forward)
+    return number._replace(slope=slope, true=((image + other) / 2).astype(np.float32), noise=noise)
 
 
 def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:

@@ -54,8 +54,9 @@ class Heightfield(rts.TriangleSurface):
             depth = depth + np.clip(step, -0.1, 0.1)
         met = (np.abs(step) < 1e-6) & (np.abs(depth - start) < 0.1)  # Past an outline, rays meet triangles only.
         params = np.where(met[:, None], np.stack([u, v], axis=-1), samples.params).astype(np.float32)
-        refined = np.where(cells, np.where(met, depth, start)[samples.row], 0).astype(np.float32)
-        return samples.replace(params=params, depth=refined)
+        row = np.where(cells & met[samples.row], samples.row, -1)
+        refined = np.where(row >= 0, depth[row], 0).astype(np.float32)
+        return samples.replace(params=params, row=row, depth=refined)
 
     @classmethod
     def example(cls):

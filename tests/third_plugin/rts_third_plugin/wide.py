@@ -33,6 +33,8 @@ class Wide(rts.Splatter):
         xp, engine = rts.namespace(splats.positions, splats.rgba), rts.engine_of(splats.positions)
         height, width = splats.row.shape[1:]
         row = splats.row[0]
+        if splats.rgba.shape[0] == 0:  # Nothing can be taken by index.
+            return xp.stack([xp.zeros_like(row, dtype=splats.rgba.dtype)] * 4, axis=-1)
         index = xp.reshape(xp.where(row >= 0, row, 0), (-1,))
         position = xp.reshape(xp.take(splats.positions, index, axis=0)[:, :2], (height, width, 2))
         rgba = xp.reshape(xp.take(splats.rgba, index, axis=0), (height, width, splats.rgba.shape[1]))

@@ -1,0 +1,60 @@
+"""warmup: loops of ordinary renders and fits, compiled ahead by making such calls.
+
+numba's compiler has one lock a process, so several processes share the calls (`rts.compiling.ordinary_calls`).
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from rts.compiling.threads import thread_count
+from rts.errors import InputError, RtsError
+
+FIRST = ("picture",)
+OTHERS = ("least_squares", "gradient_of_vertices", "adaptive", "gradient_of_crossing", "least_squares_of_mask")
+"""Names of calls: what all share comes first, alone, and the longest of the others before the rest."""
+
+
+def warmup(processes: int | None = None) -> float:
+    """Compile ahead what ordinary renders and fits of meshes use, and keep it on disk.
+
+    Loops are otherwise compiled when they are first called, once for each installation: the first render takes long.
+    Where all is compiled it takes seconds. Loops are for float32; those of derivatives need torch or jax.
+
+    Args:
+        processes: how many to use at once; None for as many as there are cores for this process.
+
+    Returns:
+        Seconds that it took.
+
+    Raises:
+        InputError: `processes` is no positive integer.
+        RtsError: a process failed; the last line of its errors is in the message.
+    """
+    count = thread_count() if processes is None else processes
+    if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
+        raise InputError(f"processes is {processes!r}; expected a positive integer, or None")
+    start = time.perf_counter()
+    with ThreadPoolExecutor(int(count)) as pool:
+        for names in (FIRST, OTHERS):
+            list(pool.map(_call, names))
+    return time.perf_counter() - start
+
+
+def _call(name: str) -> None:
+    """Make one of the calls in a process of its own, which finds modules and kept loops where this one does."""
+    path = [p or os.getcwd() for p in sys.path if isinstance(p, str)]  # An empty entry is the working directory.
+    own = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1"}
+    if kept := getattr(getattr(sys.modules.get("numba"), "config", None), "CACHE_DIR", ""):
+        own["NUMBA_CACHE_DIR"] = str(kept)
+    command = [sys.executable, "-P", "-m", "rts.compiling.ordinary_calls", name]
+    done = subprocess.run(command, env=os.environ | own, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    if done.returncode:
+        errors = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise RtsError(f"could not compile loops: {errors[-1]}")

@@ -1,0 +1,146 @@
+"""Claims about normals: they stand upright on the surface, or on its triangles in the mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts.arrays.trees import map_leaves
+from rts.contracts.records import Samples
+from rts.contracts.surface import TriangleSurface
+from rts.scene.parts import Part
+from rts.testing import derivatives, scenes
+from rts.testing.claims import claim
+from rts.testing.sample_claims import FEW
+
+STEP = 2**-8
+"""How far the two parameters of samples are moved."""
+
+SHIFT = 0.1
+"""How far pictures are shifted, pixels, where samples have other parameters."""
+
+UPRIGHT, LARGEST = 3.0, 10.0
+"""Degrees that normals may lean in the middle, and all but a tenth of them."""
+
+NEAR = 0.3
+"""How far apart two samples of one sheet are at most."""
+
+SPREAD, TILT = 0.6, 0.1
+"""How far normals of triangles may lean: a share of the angle between neighbours, and their mean, of unit length."""
+
+
+def claim_upright(part: Part, sampler: Any) -> None:
+    """Fail unless normals are not zero and, where samples lie on no triangles, perpendicular to the surface."""
+    surface = scenes.checked(part).surface
+    flat = isinstance(surface, TriangleSurface) and not (surface.refines and surface.refine_moves)
+    part = part.replace(theta=map_leaves(derivatives.single if flat else wide, part.theta))
+    sampled = scenes.find(part, sampler=sampler)
+    samples, front = sampled.samples[0], np.asarray(sampled.row)
+    gbuffer = part.surface.evaluate(part.theta, samples)
+    if "normal" not in gbuffer:
+        return
+    rows = np.sort(front[front >= 0])
+    normal = np.asarray(gbuffer["normal"], np.float64)[rows]
+    length = np.linalg.norm(normal, axis=1)
+    zero = ~(length > 0)
+    claim(zero.mean() <= FEW, f"{zero.sum()} of {len(zero)} normals are zero, or not finite, where the surface is seen")
+    if flat:
+        return
+    true = _perpendicular(part, sampler, samples)
+    if true is None:
+        return
+    told = ~zero & (np.linalg.norm(true[rows], axis=1) > 0)
+    lean = angles(normal[told], true[rows][told])
+    middle, most = np.quantile(lean, (0.5, 0.9))
+    claim(
+        middle <= UPRIGHT and most <= LARGEST,
+        f"normals lean by {middle:.2g}° in the middle, and a tenth of them by {most:.2g}° or more, against what is "
+        f"perpendicular to the surface as `position` changes from sample to sample; see 'normal' in evaluate",
+    )
+
+
+def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Fail unless the mean of a triangle's normals is about its own, as far as neighbours differ.
+
+    Args:
+        normals: (3, T, 3), at the corners of the triangles; of any length.
+        vertices: (V, 3).
+        faces: (T, 3).
+    """
+    corners = vertices[faces].astype(np.float64)
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    smooth = np.zeros(vertices.shape)
+    for i in range(3):
+        np.add.at(smooth, faces[:, i], outward)
+    given, seen = unit(normals.astype(np.float64)), np.linalg.norm(outward, axis=1) > 0
+    zero = (given == 0).all(axis=-1)
+    claim(zero.mean() <= FEW, f"{zero.sum()} of {zero.size} normals at the corners of triangles are zero")
+    between = np.median([angles(smooth[faces[seen, i]], outward[seen]) for i in range(3)])
+    lean = np.median(angles(given.mean(axis=0)[seen], outward[seen]))
+    tilt = np.linalg.norm((given.mean(axis=0) - unit(outward))[seen].mean(axis=0))
+    claim(
+        lean <= max(UPRIGHT, SPREAD * between) and tilt <= TILT,
+        f"normals of triangles lean by {lean:.2g}°, where those of neighbours differ by {between:.2g}°, and by "
+        f"{tilt:.2g} to one side; see 'normal' in evaluate",
+    )
+
+
+def normals_at(part: Part, samples: Samples) -> np.ndarray | None:
+    """(N, 3) unit normals where samples are: by their two parameters, else as the surface has them; None without."""
+    if samples.params.shape[1] == 2:
+        return _by_parameters(part, samples)
+    gbuffer = part.surface.evaluate(part.theta, samples)
+    return unit(np.asarray(gbuffer["normal"], np.float64)) if "normal" in gbuffer else None
+
+
+def wide(x: Any) -> np.ndarray:
+    """An array of floats as float64; anything else as it is."""
+    x = np.asarray(x)
+    return x.astype(np.float64) if np.issubdtype(x.dtype, np.floating) else x
+
+
+def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Degrees between lines along vectors (N, 3), from 0 to 90."""
+    return np.degrees(np.arccos(np.clip(np.abs(np.sum(unit(one) * unit(other), axis=-1)), 0, 1)))
+
+
+def unit(x: np.ndarray) -> np.ndarray:
+    """Vectors of unit length, zero where they are."""
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    return x / np.where(length > 0, length, 1)
+
+
+def _by_parameters(part: Part, samples: Samples) -> np.ndarray:
+    """∂position/∂u × ∂position/∂v, of unit length; zero where it is degenerate."""
+    tangents = []
+    for i in range(2):
+        step = STEP * np.eye(2)[i]
+        ends = [samples.replace(params=np.asarray(samples.params, np.float64) + sign * step) for sign in (1, -1)]
+        plus, minus = (np.asarray(part.surface.evaluate(part.theta, s)["position"], np.float64) for s in ends)
+        tangents.append(plus - minus)
+    return unit(np.cross(*tangents))
+
+
+def _perpendicular(part: Part, sampler: Any, samples: Samples) -> np.ndarray | None:
+    """Like `_by_parameters`; where samples have not two, by pictures that are shifted by a little."""
+    if samples.params.shape[1] == 2:
+        return _by_parameters(part, samples)
+    if not samples.centered:
+        return None
+    rows, tangents = np.asarray(samples.row), []
+    good = np.ones(rows.shape[1:], bool)
+    for axis in range(2):
+        ends = []
+        for sign in (1, -1):
+            moved = scenes.find(part, scenes.shifted(scenes.CAMERA, sign * SHIFT, axis), sampler).samples[0]
+            row = np.asarray(moved.row)[0]
+            position = np.asarray(part.surface.evaluate(part.theta, moved)["position"], np.float64)
+            good &= row >= 0
+            ends.append(position[np.maximum(row, 0)])
+        tangents.append(ends[0] - ends[1])
+        # Not where one of them lies on another sheet.
+        good &= np.linalg.norm(tangents[-1], axis=-1) < NEAR
+    found, good = np.zeros((len(samples.ids), 3)), good & (rows[0] >= 0)
+    found[rows[0][good]] = unit(np.cross(*tangents))[good]
+    return found
