@@ -74,7 +74,7 @@ class Scene:
 
 
 def is_constant(tree: Tree) -> bool:
-    """Whether every leaf is a NumPy array or a number, which is never differentiated."""
+    """True where every leaf is a NumPy array or a number, which is never differentiated."""
     return all(isinstance(x, (np.ndarray, np.generic, int, float, complex)) for x in leaves(tree))
 
 
@@ -151,7 +151,7 @@ def _check(parts: Sequence[Part], exact: Sequence[Part], moved: Sequence[int], m
 
 
 class _Ways(NamedTuple):
-    """How parts and a camera change with the parameter of each mode.
+    """Changes of parts and a camera with the parameter of each mode.
 
     Attributes:
         camera: at rest.

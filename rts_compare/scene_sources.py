@@ -142,7 +142,7 @@ def _module(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _told(what: str) -> Iterator[None]:
-    """What goes wrong in a user's code, told in one line."""
+    """Errors of a user's code, told in one line."""
     try:
         yield
     except (Exception, SystemExit) as error:

@@ -38,7 +38,7 @@ Grids = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
 class Truth(NamedTuple):
-    """How an image changes along one mode.
+    """The change of an image along one mode.
 
     Attributes:
         derivative: (H, W, 3) a pixel of motion, the mean of the two grids'.

@@ -62,7 +62,7 @@ def _gradient(values: np.ndarray, method: Method) -> tuple[float, int]:
 
 
 def _of_values(values: np.ndarray, usual: np.ndarray, limits: tuple[float, float], method: Method) -> Outcome:
-    """How the largest gradient compares with that of usual values."""
+    """Compare the largest gradient with that of usual values."""
     try:
         own(method)
     except Unable:

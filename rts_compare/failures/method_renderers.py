@@ -1,4 +1,4 @@
-"""What rows ask of a method: derivative images, and losses with their slopes, by us and by other renderers."""
+"""Renderers of methods, as rows ask for them: derivative images, and slopes of losses, by us and by others."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Renderer(abc.ABC):
         """The derivatives (modes,) of a loss along all modes, with the scene moved by amounts (modes,)."""
 
     def broken(self) -> int:
-        """How many values of the image and of gradients are not finite."""
+        """The number of values of the image and of gradients that are not finite."""
         return 0
 
 

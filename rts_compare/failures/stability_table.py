@@ -142,7 +142,7 @@ def stability(
 
 
 def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) -> list[Any]:
-    """What is known by these names."""
+    """The known things of these names."""
     if wanted is None:
         return list(known.values())
     wanted = [wanted] if isinstance(wanted, str) else wanted
@@ -174,7 +174,7 @@ def _measured(row: Row, method: Method, context: Context, measured: KeptMeasurem
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold: numbers to four digits, those that are not finite as words."""
+    """A value that JSON can hold: numbers to four digits, those that are not finite as words."""
     if isinstance(value, Mapping):
         return {key: _plain(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):
