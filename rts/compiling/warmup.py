@@ -39,9 +39,10 @@ def warmup(processes: int | None = None) -> float:
     """
     count = thread_count() if processes is None else processes
     if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
-        raise InputError(f"processes is {processes!r}; expected a positive integer, or None")
+        shown = repr(processes) if isinstance(processes, (int, float)) else f"a {type(processes).__name__}"
+        raise InputError(f"processes is {shown}; expected a positive integer, or None")
     start = time.perf_counter()
-    with ThreadPoolExecutor(int(count)) as pool:
+    with ThreadPoolExecutor(min(int(count), len(OTHERS))) as pool:
         for names in (FIRST, OTHERS):
             list(pool.map(_call, names))
     return time.perf_counter() - start
