@@ -52,6 +52,18 @@ def test_no_file_imports_in_a_circle():
         pytest.fail(" → ".join(error.args[1]))
 
 
+def test_rooms_import_from_those_above_them():
+    """In the order of the table of rooms in docs/architecture.md, which names all."""
+    table = (ROOT / "docs/architecture.md").read_text().partition("## The rooms")[2].partition("## The tree")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    order = {name: n for n, row in enumerate(rows) for name in re.findall(r"`(\w+)(?:/|\.py)`", row)}
+    for name, path in FILES.items():
+        package, _, rest = name.partition(".")
+        if package == "rts" and rest not in ("", "__main__"):
+            others = {other.split(".")[1] for other in imports(path, types=True) if other.startswith("rts.")}
+            assert all(order[other] <= order[rest.partition(".")[0]] for other in others), name
+
+
 def test_the_core_never_imports_a_plugin_package():
     for name, path in FILES.items():
         if name.partition(".")[0] == "rts":
