@@ -29,7 +29,7 @@ def octahedra() -> list[rts.Part]:
 
 
 def engine() -> Any:
-    """Arrays of zeros that are differentiated, and the gradient, by torch or else jax; None without either."""
+    """A function that makes arrays of torch, or else jax, and one (f, x) → ∂f/∂x; None where neither is installed."""
     try:
         import torch
     except ImportError:

@@ -167,10 +167,10 @@ def _accumulate(
                 if len(fields[1]) > 0 and not _counts(fields[1][y // fine, own : own + pixels]):
                     continue
                 down, right = y + border, left + border
+                # Arguments are written out, since numba inlines no calls with *arguments.
                 moving_row = busy(choices.states, down, right, count, least)
-                if moving_row or busy(choices.mixed, down, right, count, 1):
-                    moving_row = True
-                    # Inlined, so its arguments are written out.
+                moving_row |= busy(choices.mixed, down, right, count, 1)
+                if moving_row:
                     first = load_around(
                         sources, loaded, positions, rgba, fronts, down, right - 1, count + 2, scale, peak, gamma
                     )
