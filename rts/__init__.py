@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rts import errors, registry, regularizers
 from rts.camera import Camera
+from rts.compiling.warmup import warmup
 from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import Shader
@@ -48,7 +49,6 @@ from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.warming import warmup
 
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "

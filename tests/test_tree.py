@@ -24,7 +24,7 @@ FILES = {
     for path in sorted((ROOT / package).rglob("*.py"))
 }
 
-COMPILING = ("rts.compiling", "rts.pipeline", "rts.plugin_api.loops")
+COMPILING = ("rts.compiling.loops", "rts.plugin_api.loops")
 
 
 def imports(path, types=False):

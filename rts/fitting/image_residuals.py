@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
-from rts import companion
 from rts.arguments import quoted
 from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
 from rts.camera import Camera
@@ -282,8 +281,6 @@ class ImageResiduals(Residuals):
             and self._image_channels == 3
             and self._settings.contrast is None
         ):
-            mask = self._channels == 1
-            companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine, self.loss) if found is None else found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 from rts.operations.projection_loops import CHUNK
 from rts.threads import parallel, read_only
 

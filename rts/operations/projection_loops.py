@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 from rts.threads import parallel, read_only
 
 CHUNK = 4096

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 
 SMALL = 1e-2
 """Squared angles below which series are used, which are right to 3e-14 there."""

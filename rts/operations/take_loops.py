@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 
 
 @loop

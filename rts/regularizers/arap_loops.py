@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 from rts.threads import parallel, read_only
 
 SWEEPS = 12

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
 from rts.contracts.records import Fragments
 from rts.threads import parallel
 

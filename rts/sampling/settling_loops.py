@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 
 
 @loop

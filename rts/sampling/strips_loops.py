@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
 
 WANTED, NEAR = 1, 2
 """Bits of cells: inside of an active pixel, and within two cells of one."""

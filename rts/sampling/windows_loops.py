@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled
+from rts.compiling.loops import compiled
 
 
 @compiled

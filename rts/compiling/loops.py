@@ -1,0 +1,146 @@
+"""Decorators of compiled loops: `loop` for functions that Python calls, `compiled` for their helpers.
+
+Loops are kept on disk; helpers are not, since a helper that is loaded is not inlined. Where much has to be compiled, a
+terminal is told.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import IO, Any, cast
+
+import numba
+from numba.core import event
+from numba.core.caching import FunctionCache
+
+try:
+    import fcntl
+except ImportError:  # Windows.
+    fcntl = None
+
+LOOP = {"nogil": True, "no_cfunc_wrapper": True}
+"""numba's options of loops. It makes two wrappers beside a function's code, one for Python and one for C."""
+
+HELPER = LOOP | {"no_cpython_wrapper": True}
+"""numba's options of functions that only loops call."""
+
+TOLD_AFTER = 1.0
+"""Seconds of compilation after which a terminal is told of it."""
+
+
+def loop(function: Callable | None = None, **options: Any) -> Any:
+    """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
+
+    def decorate(function: Callable) -> Any:
+        made = cast(Any, numba.njit(**LOOP, **options)(function))
+        if made is not function:  # As it is where compilation is switched off.
+            made._cache = _Cache(function)
+        return made
+
+    return decorate if function is None else decorate(function)
+
+
+def compiled(function: Callable | None = None, **options: Any) -> Any:
+    """Compile a function that only compiled loops call, not Python, nor itself. `options` are numba's."""
+    decorate = numba.njit(**HELPER, **options)
+    return decorate if function is None else decorate(function)
+
+
+@contextmanager
+def alone(folder: str, writes: bool = True) -> Iterator[None]:
+    """Hold a folder of loops as the only process that writes, where the system and the file system know such locks.
+
+    numba reads a function's index, chooses a name for the code, and writes both, one after the other. Two processes
+    that do so at once, for different types, may choose the same name: one type's calls would then run the other's code.
+
+    Args:
+        folder: where the loops are.
+        writes: False to hold it together with others that read.
+    """
+    file = _lock_file(folder)
+    if fcntl is None or file is None:
+        yield
+        return
+    with file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX if writes else fcntl.LOCK_SH)
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_UN)  # A child that was forked meanwhile has the file, too.
+
+
+def _lock_file(folder: str) -> IO[bytes] | None:
+    for mode in ("ab", "rb"):  # It may be another user's.
+        with suppress(OSError):
+            return open(os.path.join(folder, ".lock"), mode)
+    return None
+
+
+class _Cache(FunctionCache):
+    """A loop's compiled code on disk, which another process may be about to write."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The code on disk; None if it is to be compiled."""
+        with alone(self.cache_path, writes=False):
+            return super().load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Write compiled code."""
+        with alone(self.cache_path):
+            super().save_overload(sig, data)
+
+
+class _Watch(event.Listener):
+    """Listener to the compilation of our loops, with all that each calls. The compiler's lock is held meanwhile.
+
+    It tells a terminal once that loops are compiled, where that takes long. It pauses the collection of garbage:
+    compilation makes so many objects that this takes a tenth of the time.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth, self._since, self._told, self._paused = 0, 0.0, False, False
+
+    def on_start(self, event: Any) -> None:
+        """Begin with a function, or with one that it calls."""
+        if self._depth == 0:
+            self._since = time.perf_counter()
+            self._paused = _is_ours(event) and gc.isenabled()
+            if self._paused:
+                gc.disable()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        """End with a function, compiled or refused."""
+        self._depth -= 1
+        if self._depth:
+            return
+        if self._paused:
+            gc.enable()
+        if _is_ours(event):
+            self.seconds += time.perf_counter() - self._since
+            if self.seconds > TOLD_AFTER and not self._told:
+                self._told = True
+                _tell("rts: compiling loops (once for each installation; `rts warmup` does it ahead) …")
+
+
+def _is_ours(event: Any) -> bool:
+    return isinstance(getattr(event.data["dispatcher"], "_cache", None), _Cache)
+
+
+def _tell(line: str) -> None:
+    stream = sys.stderr
+    if stream is not None and stream.isatty():
+        with suppress(UnicodeEncodeError):
+            stream.write(line + "\n")
+            stream.flush()
+
+
+event.register("numba:compile", _Watch())
