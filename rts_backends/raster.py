@@ -253,7 +253,7 @@ def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray,
     return _List(keep, np.argsort(-sums), offsets, items, rows)
 
 
-@loop(error_model="numpy")
+@loop
 def _project(first, last, used, vertices, m, screen):
     """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others.
 
@@ -280,7 +280,7 @@ def _project(first, last, used, vertices, m, screen):
             written[v] = (pixels[1, v] << SIXTEEN) | (pixels[0, v] & LOWER)
 
 
-@loop(error_model="numpy")
+@loop
 def _select(
     first,
     last,
@@ -327,7 +327,7 @@ def _select(
         fronts[1][chunk, 1], backs[1][chunk, 1] = places[0], places[1]
 
 
-@compiled(inline="always", error_model="numpy")
+@compiled(inline="always")
 def _look(count, xy, height, width, step, sign, box, clips, near):
     """Fill in the box of pixels of each triangle, whether it is clipped, and whether it may cover a pixel's centre."""
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)

@@ -174,7 +174,7 @@ def _find_blocks(faces, last, offsets, blocks):
     return count
 
 
-@loop(error_model="numpy")
+@loop
 def _bound(start, stop, vertices, faces, boxes, cones):
     """Fill in boxes and cones of clusters."""
     normals = np.empty((SIZE, 3))
@@ -227,7 +227,7 @@ def _same(vertices, i, j):
     return vertices[i, 0] == vertices[j, 0] and vertices[i, 1] == vertices[j, 1] and vertices[i, 2] == vertices[j, 2]
 
 
-@loop(error_model="numpy")
+@loop
 def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
     """Fill in which clusters may hold what is wanted, and what these may hold; how many there are.
 
@@ -259,7 +259,7 @@ def _minor(rows, i, j, k):
     return a[i] * (b[j] * c[k] - b[k] * c[j]) + a[j] * (b[k] * c[i] - b[i] * c[k]) + a[k] * (b[i] * c[j] - b[j] * c[i])
 
 
-@compiled(inline="always", error_model="numpy")
+@compiled(inline="always")
 def _test(boxes, cones, planes, towards, rows, sides):
     """Fill in for each cluster as bits which triangles it may hold: FRONTS, BACKS; none if it is out of view."""
     qx, qy, qz, s = towards
@@ -286,7 +286,7 @@ def _test(boxes, cones, planes, towards, rows, sides):
         sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
 
 
-@loop(error_model="numpy")
+@loop
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
     """Fill in for some clusters whether they may touch blocks that are asked for; `there` counts these from the first.
 

@@ -23,7 +23,7 @@ NUMBERS = 18
 """Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
 
 
-@loop(error_model="numpy")
+@loop
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
     """Fill the three fragment arrays (K, H · W), band by band.
 
@@ -45,7 +45,7 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
             _depths(depths[k, start:stop], nearest[k])
 
 
-@loop(error_model="numpy")
+@loop
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
     """As `draw`, of some cells: arrays (K, M), which `clear` has emptied, are of their list; depths are left to it.
 
@@ -86,7 +86,7 @@ def _depths(depths, nearest):
         depths[i] = nearest[i] if nearest[i] < np.inf else 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _draw(items, given, top, end, width, asked, layered):
     """Insert the triangles of a band of rows from `top` to the one before `end`, `width` wide, into layers of cells.
 
@@ -218,7 +218,7 @@ def _cover(count, entries, numbers, covers):
         covers[b] = bits
 
 
-@compiled(error_model="numpy")
+@compiled
 def _insert(hits, met, drawn, layered):
     """Insert the block's triangles into the layers of cells; hits (n, 2) are triangle and row of the band, column."""
     top, width, entries, numbers, clips = drawn
@@ -234,7 +234,7 @@ def _insert(hits, met, drawn, layered):
             _put(depths[h], entries[0, b], p, q, place, cell, nearest, triangle_ids, barycentrics)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
     """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and whether it is surely one."""
     for h in range(len(hits)):

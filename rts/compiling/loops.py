@@ -23,8 +23,12 @@ try:
 except ImportError:  # Windows.
     fcntl = None
 
-LOOP = {"nogil": True, "no_cfunc_wrapper": True}
-"""numba's options of loops. It makes two wrappers beside a function's code, one for Python and one for C."""
+LOOP = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+"""numba's options of loops. It makes two wrappers beside a function's code, one for Python and one for C.
+
+Divisions by zero are not looked for. All loops have the same options, since numba compiles its own functions, such as
+`min` and `np.empty`, once for each set of options.
+"""
 
 HELPER = LOOP | {"no_cpython_wrapper": True}
 """numba's options of functions that only loops call."""

@@ -30,7 +30,7 @@ def turned(spokes: np.ndarray, rest: np.ndarray, starts: np.ndarray) -> np.ndarr
     return out
 
 
-@loop(error_model="numpy")
+@loop
 def _turn(start, stop, spokes, rest, starts, out):
     columns, axes, rotation = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(start, stop):

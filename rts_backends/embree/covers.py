@@ -78,7 +78,7 @@ class Covers(NamedTuple):
         parallel(_cover, len(faces), *given, self.corners, self.owners, self.margins, work=100 * len(faces))
 
 
-@compiled(error_model="numpy")
+@compiled
 def _shape(vertices, faces, t, sphere, points):
     """Fill corners (3, 3) in units of the sphere; lengths of the edges opposite to them, and twice the area."""
     for c in range(3):
@@ -92,7 +92,7 @@ def _shape(vertices, faces, t, sphere, points):
     return a, b, np.sqrt(ux * ux + uy * uy + uz * uz), np.sqrt(nx * nx + ny * ny + nz * nz)
 
 
-@loop(error_model="numpy")
+@loop
 def _count(start, stop, vertices, faces, sphere, wanted):
     """How many further covers triangles need."""
     points = np.empty((3, 3))
@@ -103,7 +103,7 @@ def _count(start, stop, vertices, faces, sphere, wanted):
             wanted[t] = 2 if max(a, b, c) < SMALL else 1
 
 
-@loop(error_model="numpy")
+@loop
 def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners, margins):
     points, along, side, across = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for t in range(start, stop):
@@ -147,7 +147,7 @@ def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners
                 corners[3 * at + 2, r] = points[p, r] - wide * (0.9 * across[r] + 0.5 * side[r])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _perpendicular(points, p, s, along, height, side):
     """A unit vector across `along`, in the plane of the triangle if it has one."""
     if height > 1e-12:

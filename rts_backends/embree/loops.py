@@ -70,7 +70,7 @@ def _pointer(typing_context, address):
     return types.voidptr(types.intp), generate
 
 
-@compiled(error_model="numpy")
+@compiled
 def _decide(t, state, work, vertices, faces):
     """Whether a triangle is hit, and at which depth; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
@@ -175,7 +175,7 @@ def keep_nearest_address() -> int:
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
-@loop(error_model="numpy")
+@loop
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
     vertices, faces, owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
@@ -305,7 +305,7 @@ def _pixels(tile, across, width, height, cells, at, columns, lines):
     return count
 
 
-@compiled(error_model="numpy")
+@compiled
 def _aim(space, sphere, planes, x, y, ray, state):
     """Write the ray through an NDC position, from where it meets the object's sphere; False if it misses.
 
