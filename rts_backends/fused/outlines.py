@@ -248,7 +248,7 @@ def fill(
                 d += 1
 
 
-@compiled(inline="always")
+@compiled
 def _any(ends):
     some = np.uint16(0)
     for x in range(len(ends)):
@@ -259,7 +259,7 @@ def _any(ends):
 # Not handed views of single targets, since to make these takes as long as the work.
 
 
-@compiled(inline="always")
+@compiled
 def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples):
     """List the slopes of the weights of the fronts around a target, and what each gives if none is mixed.
 
@@ -292,7 +292,7 @@ def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, w
     return red, green, blue, alpha, weight
 
 
-@compiled(inline="always")
+@compiled
 def _change(gives, changes, d, total):
     """How the colour of a target changes with its coverage, to which all fronts around it give."""
     zero, one = changes.dtype.type(0), changes.dtype.type(1)
@@ -304,13 +304,13 @@ def _change(gives, changes, d, total):
         _clear(gives, d)
 
 
-@compiled(inline="always")
+@compiled
 def _clear(gives, d):
     for n in range(9):
         gives[d, n] = NOTHING
 
 
-@compiled(inline="always")
+@compiled
 def _change_mixed(changes, d, sums, m):
     """How the colour of a mixed target changes with the coverage of its buffers, and whether these may change."""
     zero, one = sums.dtype.type(0), sums.dtype.type(1)
@@ -335,7 +335,7 @@ def _list(gives, d, ranges, m, front, surface):
                 gives[d, n] = NOTHING
 
 
-@compiled(inline="always")
+@compiled
 def _part(gives, d, part, ends, y, x):
     """Sources of other parts than the target's move as their own outlines, if any: there may be a gap between."""
     n = 0
@@ -346,7 +346,7 @@ def _part(gives, d, part, ends, y, x):
             n += 1
 
 
-@compiled(inline="always")
+@compiled
 def _outline(t_positions, row, beta, partner, y, x, axis):
     """The motion v̂ of the outline beside a cell, along an axis."""
     b, own = beta[y, x], t_positions[row[0, y, x], axis]
