@@ -15,8 +15,8 @@ from PIL import Image, ImageDraw
 
 import rts
 from benchmarks.meshes import DATA
-from rts.cli.default_camera import bounds_of, orbit
 from rts.errors import InputError
+from rts.scene.default_camera import bounds_of, orbit
 
 MODELS = {
     "bunny": "meshes/bunny.obj",

@@ -6,8 +6,8 @@ differentiate only that.
 Plugins import from `rts.plugin_api` what is not here. The kinds of warnings are in `rts.errors`.
 
 The surfaces that come with it are attributes, too, loaded when they are first used: `rts.Mesh`, `rts.Bezier`,
-`rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So is `rts.tune`, of the package
-`rts_compare`.
+`rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are
+`rts.tune`, of the package `rts_compare`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -37,8 +37,6 @@ from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
-from rts.ndc import Ndc
-from rts.radiance_fields import load_radiance_field
 from rts.registry import plugin, plugins
 from rts.rendering.batched import render_views
 from rts.rendering.image import render, render_samples
@@ -55,7 +53,6 @@ _MOVED = {
     "LayersWarning SamplerWarning ToleranceWarning",
     "rts.plugin_api.operations": "Operation combine gradient",
     "rts.plugin_api.records": "ArraySpec Fragments Proxy RayHits Rays Samples Splats",
-    "rts.radiance_fields": "volume_render",
     "rts.splatting": "exact_calibration",
 }
 """Module → names that were here."""
@@ -69,7 +66,10 @@ if TYPE_CHECKING:
     Revolution: Any
     Sdf: Any
     Subdivision: Any
+    Ndc: Any
+    load_radiance_field: Any
     tune: Any
+    volume_render: Any
 else:
 
     def __getattr__(name: str):
@@ -136,5 +136,6 @@ __all__ = [
     "save_animation",
     "save_image",
     "tune",
+    "volume_render",
     "warmup",
 ]

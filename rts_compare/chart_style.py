@@ -1,4 +1,4 @@
-"""What the rows of a comparison look like in charts, and what they are called there.
+"""Looks and names of a comparison's rows in charts.
 
 Colours are those of Okabe and Ito, which those who are colour blind tell apart, and others chosen to be far from these
 for them too. Symbols have the names that plotly.js gives them.
@@ -35,7 +35,7 @@ OTHER_SYMBOLS = ("pentagon", "star", "cross", "triangle-left", "triangle-right")
 PEER_SYMBOL = "x"
 ENGINE_FILLS = {"torch": "", "jax": "-open"}
 OTHER_FILLS = ("-open-dot", "-dot")
-"""What is added to a symbol: full, hollow, hollow with a dot, full with a dot."""
+"""Endings of a symbol's name: full, hollow, hollow with a dot, full with a dot."""
 
 
 def assigned(names: Iterable[str], fixed: Mapping[str, str], others: Sequence[str]) -> dict[str, str]:
@@ -86,7 +86,7 @@ class Looks:
 
 
 def drawn(row: Row) -> bool:
-    """Whether a row has a place on logarithmic axes."""
+    """True where a row has a place on logarithmic axes."""
     return timed(row) and milliseconds(row) > 0 and row["error"] > 0
 
 
@@ -99,7 +99,7 @@ def time_label(milliseconds: float) -> str:
 
 
 def side_length(supersample: int | str) -> float:
-    """How large a row is drawn, by how many samples it takes along the side of a pixel; in pixels of a screen."""
+    """The side of a row's symbol, in pixels of a screen, by the samples along the side of a pixel."""
     return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import Adaptive, Engine, plugin, plugins
+from rts.diagnostics.command_tools import engine_named
 from rts.errors import InputError, PluginError
-from rts.plugin_api.arrays import engine_named
 from rts.plugin_api.checks import quoted
 from rts_compare.pareto_front import LEVELS
 
@@ -56,12 +56,12 @@ class Setting(NamedTuple):
 
 
 def samples_of(supersample: int | str) -> int | Adaptive:
-    """What `rts.render` takes, of what settings hold: a number, or a text."""
+    """Samples a pixel as `rts.render` takes them, of a setting's number or text."""
     return Adaptive.of_text(supersample) if isinstance(supersample, str) else int(supersample)
 
 
 def as_text(supersample: Adaptive) -> str:
-    """What settings hold of samples at outlines: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
+    """Samples at outlines as settings hold them: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
     given = {"dilated": supersample.dilated, "contrast": supersample.contrast}
     return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
 
@@ -144,5 +144,5 @@ def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tupl
 
 
 def _no_worse(error: float, other: float) -> bool:
-    """Whether an error is not much larger than another one, and within all `LEVELS` that the other is within."""
+    """True where an error is not much larger than another one, and within all `LEVELS` that the other is within."""
     return error <= ALIKE * other and not any(other <= level < error for level in LEVELS)

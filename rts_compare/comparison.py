@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Adaptive, Engine
+from rts.diagnostics.command_tools import output_folder, writing
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
-from rts.plugin_api.files import output_folder, writing
 from rts_compare.compared_settings import Setting, as_text, finest, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
@@ -98,12 +98,12 @@ class Comparison:
 
 
 def file_name(scene: str) -> str:
-    """What the files of a scene are called."""
+    """The name of a scene's files, without suffix."""
     return re.sub(r"\W+", "_", scene).strip("_") or "scene"
 
 
 class Plan(NamedTuple):
-    """What is to be measured.
+    """A plan of what is measured.
 
     Attributes:
         splatters: names.
@@ -222,7 +222,7 @@ def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()
 
 
 def _samples(given: Any) -> list[int | str]:
-    """What `Setting.supersample` holds, of what a user gave."""
+    """Values of `Setting.supersample`, of what a user gave."""
     wanted = list(SUPERSAMPLE) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
     if not wanted or not all(is_count(finest(s)) for s in wanted):
         raise InputError(f"supersample is {quoted(given)}; expected integers of at least 1 or rts.Adaptive")
@@ -236,7 +236,7 @@ def _unthinned() -> list[str]:
 
 
 def _earlier(folder: Path | None, scene: Scene, fresh: bool) -> KeptMeasurements:
-    """What earlier runs have measured of scenes of this name."""
+    """Measurements that earlier runs have kept of scenes of this name."""
     if folder is None:
         return KeptMeasurements()
     path = folder / f".{file_name(scene.name)}.jsonl"

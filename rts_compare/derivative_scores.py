@@ -1,4 +1,4 @@
-"""How near the derivative of an image is to the truth."""
+"""Scores of derivative images: how near they are to the truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from rts.diagnostics.smoothing import low_pass
 
 LOSSES, LOSS_SCALE = 16, 8.0
-"""How many random losses, and the standard deviation of the Gaussian that smooths their weights, pixels."""
+"""The number of random losses, and the standard deviation of the Gaussian that smooths their weights, pixels."""
 
 
 def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
@@ -30,7 +30,7 @@ def loss_weights(height: int, width: int, count: int = LOSSES) -> np.ndarray:
 
 
 def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """How near a derivative image (H, W, 3) is to the true one.
+    """Score a derivative image (H, W, 3) beside the true one.
 
     Returns:
         error: relative L2 of the two through the low-pass; what charts show.
@@ -43,7 +43,7 @@ def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 
 def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """How near a derivative image (H, W, 3) is to the true one, in more ways.
+    """Score a derivative image (H, W, 3) beside the true one, in more ways.
 
     Returns:
         relative_l2, cosine, gain: raw.

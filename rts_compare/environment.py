@@ -1,4 +1,4 @@
-"""What measurements depend on beside the code: the date, the machine, the versions of packages."""
+"""Conditions of measurements beside the code: the date, the machine, the versions of packages."""
 
 from __future__ import annotations
 

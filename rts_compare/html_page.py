@@ -11,8 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from rts.diagnostics.command_tools import writing
 from rts.errors import InputError, PluginError
-from rts.plugin_api.files import writing
 from rts_compare.chart_style import (
     OTHER_COLORS,
     PEER_COLORS,
@@ -57,7 +57,7 @@ def write_page(comparisons: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _data(comparisons: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """All that the page shows. Settings are listed once, and rows refer to them by index."""
+    """The data of the page. Settings are listed once, and rows refer to them by index."""
     rows = [row for comparison in comparisons for row in comparison["rows"] if drawn(row)]
     settings: dict[str, int] = {}
     listed = []
@@ -77,7 +77,7 @@ def _data(comparisons: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _settings(row: Row) -> dict[str, Any]:
-    """What a row was measured with, and how it is shown."""
+    """The settings of a row, and how they are shown."""
     given = row["settings"]
     shown = {"text": arguments(row), "label": label(row), "size": side_length(given.get("supersample", 1))}
     if "peer" in row:

@@ -24,7 +24,7 @@ WARM = 0.5
 """Seconds that a first call may always take: it loads what the next ones find."""
 
 Calls = Mapping[tuple, Callable[[], Callable[[], Any]]]
-"""What to keep a time under → a function that makes the function to be timed."""
+"""The key of a time → a function that makes the function to be timed."""
 
 
 class InterleavedTiming:

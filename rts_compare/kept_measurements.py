@@ -1,4 +1,4 @@
-"""What was measured, kept line by line, so that an interrupted run goes on where it was."""
+"""Measurements kept line by line, so that an interrupted run goes on where it was."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rts.diagnostics.command_tools import writing
 from rts.errors import InputError
-from rts.plugin_api.files import writing
 
 
 class KeptMeasurements:
@@ -41,7 +41,7 @@ class KeptMeasurements:
                 raise InputError(f"line {number} of {path} is no measurement; remove the file to start anew") from error
 
     def get(self, *key: Any) -> Any:
-        """What was put under a key, or None."""
+        """The value that was put under a key, or None."""
         value, date = self._kept.get(_text(key), (None, self.since))
         self.since = min(self.since, date)
         return value

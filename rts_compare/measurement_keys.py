@@ -1,4 +1,4 @@
-"""What measurements depend on: hashes of scenes and of code, so that a kept one only stands for what it was made of."""
+"""Keys of measurements: hashes of the scene and the code that a kept measurement was made of."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from rts import Camera, Part, engine_of, plugin, render, sample
+from rts.diagnostics.command_tools import check_scene
 from rts.plugin_api.arrays import leaves
-from rts.plugin_api.checks import check_scene, fingerprint
+from rts.plugin_api.checks import fingerprint
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 """The library's own."""
@@ -23,7 +24,7 @@ MOST_LAYERS = 8
 
 
 def layers_of(parts: list[Part], camera: Camera) -> int:
-    """How many layers a hard image needs: one, or all where something is translucent."""
+    """The number of layers that a hard image needs: one, or all where something is translucent."""
     return 1 if all(part.shader.opaque for part in check_scene(parts, camera)[0]) else MOST_LAYERS
 
 

@@ -1,4 +1,4 @@
-"""What is measured of a scene, each once: errors of derivatives, and seconds of a render with its gradient."""
+"""Measurements of a scene, each made once: errors of derivatives, and seconds of a render with its gradient."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ class Measurements:
         return None if self.scene.separate else self.engine
 
     def state(self, mode: str) -> tuple[str, ...]:
-        """What measurements of a mode depend on: the scene where it begins and ends, its truth, and the library."""
+        """The key of a mode's measurements: the scene where it begins and ends, its truth, and the library."""
         if mode not in self._states:
             step = STEP * self.pixel(mode)
             moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]
@@ -207,7 +207,7 @@ class Measurements:
     # -------------------------------------------------------------------------------------------------- samplers
 
     def samplers(self, names: Iterable[str]) -> list[str]:
-        """Those that can sample all parts, the one that "auto" takes first; "auto" itself where it takes several."""
+        """Samplers that can sample all parts, the one that "auto" takes first; "auto" itself where it takes several."""
         found = self.scene.at(self.start(self.group(next(iter(self.scene.directions)))))
         parts = parts_of(found)
         auto = {choice.sampler for choice in explain(parts, found[1])}
@@ -238,7 +238,7 @@ class Measurements:
         return found
 
     def _agrees(self, name: str, usual: str, group: str) -> bool:
-        """Whether a sampler gives the derivatives that the usual one gives."""
+        """True where a sampler gives the derivatives that the usual one gives."""
         for mode in self.modes(group):
             setting = Setting("auto", 2, 1)
             try:
@@ -250,7 +250,7 @@ class Measurements:
         return True
 
     def _tried(self, name: str, parts: list[Part], camera: Camera) -> dict[str, Any]:
-        """Whether a sampler suits the scene, and why not."""
+        """Try a sampler on the scene: {"suits": …, "why": why not}."""
         side = PROBE
         try:
             for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
@@ -280,7 +280,7 @@ class Measurements:
         kinds: Iterable[str] = ("",),
         rates: bool = True,
     ) -> list[Setting]:
-        """All that may differ in their error, those that can be had.
+        """Settings that may differ in their error, of those that can be had.
 
         Args:
             group: of modes.
@@ -351,7 +351,7 @@ class Measurements:
         return kept
 
     def _identity(self, mode: str, setting: Setting) -> tuple[str, ...]:
-        """What a measurement of a setting depends on beside the setting."""
+        """The key of a setting's measurement beside the setting."""
         plugins = ("rts.splatters", setting.splatter), ("rts.samplers", setting.sampler)
         return *(plugin_key(*p) for p in plugins), *self.state(mode)
 
@@ -375,7 +375,7 @@ class Measurements:
     # ----------------------------------------------------------------------------------------------------- times
 
     def work(self, group: str, setting: Setting) -> tuple[float, ...]:
-        """What a setting costs, in respects that are known beforehand: layers, samples, rate."""
+        """The cost of a setting, in respects that are known beforehand: layers, samples, rate."""
         layers = self.counting(group, setting) or 0
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),

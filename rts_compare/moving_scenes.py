@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, TriangleSurface, engine_of, plugin
+from rts.diagnostics.command_tools import check_scene
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array, Tree, constants, exemplar, leaves, map_leaves
-from rts.plugin_api.checks import check_scene, quoted
+from rts.plugin_api.checks import quoted
 
 SceneFunction = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 
@@ -73,7 +74,7 @@ class Scene:
 
 
 def is_constant(tree: Tree) -> bool:
-    """Whether every leaf is a NumPy array or a number, which is never differentiated."""
+    """True where every leaf is a NumPy array or a number, which is never differentiated."""
     return all(isinstance(x, (np.ndarray, np.generic, int, float, complex)) for x in leaves(tree))
 
 
@@ -150,7 +151,7 @@ def _check(parts: Sequence[Part], exact: Sequence[Part], moved: Sequence[int], m
 
 
 class _Ways(NamedTuple):
-    """How parts and a camera change with the parameter of each mode.
+    """Changes of parts and a camera with the parameter of each mode.
 
     Attributes:
         camera: at rest.

@@ -1,4 +1,4 @@
-"""Which rows of a comparison are worth their time: the Pareto front, and the fastest row within an error.
+"""Rows of a comparison that are worth their time: the Pareto front, and the fastest row within an error.
 
 A row is plain data: `mode`, `settings`, `error`, and `ms`, the quartiles of its time, or None where only the error was
 measured. Rows without time, or with an error that is no number, take no part.
@@ -18,7 +18,7 @@ LEVELS = (0.1, 0.03, 0.01)
 
 
 def timed(row: Row) -> bool:
-    """Whether both the time and the error of a row are known."""
+    """True where both the time and the error of a row are known."""
     return row["ms"] is not None and math.isfinite(row["ms"]["median"]) and math.isfinite(row["error"])
 
 
@@ -28,7 +28,7 @@ def milliseconds(row: Row) -> float:
 
 
 def front(rows: Sequence[Row]) -> list[bool]:
-    """Which rows are on the Pareto front of error and time of their mode.
+    """Find the rows on the Pareto front of error and time of their mode.
 
     A row is on it unless another of its mode has neither more error nor more time, and less of one of them. Equal rows
     are on it together.

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rts.diagnostics.command_tools import writing
 from rts.errors import PluginError
-from rts.plugin_api.files import writing
 from rts_compare.chart_style import (
     PEER_SYMBOL,
     Looks,
@@ -97,7 +97,7 @@ def draw(comparison: Mapping[str, Any], path: Path) -> None:
 
 
 def _texts(figure: Figure, comparison: Mapping[str, Any]) -> None:
-    """What was compared, above the panels, and where, below them."""
+    """Write what was compared above the panels, and where below them."""
     scene = comparison["scene"]
     title = f"{scene['name']}, {' × '.join(map(str, scene['size']))}"
     note = f"\n{scene['note']}" if scene.get("note") else ""
@@ -212,7 +212,7 @@ def _number(figure: Figure, axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _list(axes: Axes, rows: Sequence[Row]) -> None:
-    """What the numbers of a panel stand for."""
+    """List what the numbers of a panel stand for."""
     lines = [f"    {'ms':>8}  {'error':>7}"] if rows else ["    no row was timed"]
     for number, row in enumerate(rows, 1):
         text = f"{number:>3} {milliseconds(row):>8.4g}  {100 * row['error']:>5.3g} %  {label(row)}"
@@ -230,7 +230,7 @@ def _list(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _legend(figure: Figure, rows: Sequence[Row], looks: Looks) -> None:
-    """All that looks mean, beside the panels."""
+    """Explain all looks beside the panels."""
     from matplotlib.legend_handler import HandlerTuple
     from matplotlib.lines import Line2D
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, namespace
+from rts.diagnostics.command_tools import check_scene, default_camera
 from rts.errors import InputError, RtsError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
-from rts.plugin_api.checks import check_scene, is_count, quoted
-from rts.plugin_api.commands import default_camera
+from rts.plugin_api.checks import is_count, quoted
 from rts_compare import builtin_scenes
 from rts_compare.compared_settings import engines
 from rts_compare.left_out import one_line
@@ -142,7 +142,7 @@ def _module(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _told(what: str) -> Iterator[None]:
-    """What goes wrong in a user's code, told in one line."""
+    """Errors of a user's code, told in one line."""
     try:
         yield
     except (Exception, SystemExit) as error:

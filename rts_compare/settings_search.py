@@ -22,9 +22,9 @@ ALIKE = 0.9
 TURNS = 6
 """Turns of the fastest settings; those that are told of beside the chosen one have a sixth."""
 MORE_WORK = 2.0
-"""What is so many times the work of what will do is not looked at: no splatter is worth it."""
+"""A setting with so many times the work of one that will do is not looked at: no splatter is worth it."""
 SLOWER = 3.0
-"""What takes so many times as long as the fastest has one call."""
+"""A setting that takes so many times as long as the fastest has one call."""
 ENOUGH = 3
 """Turns of the chosen one, at least."""
 NEARLY = 1.2
@@ -34,7 +34,7 @@ FAR = 1.5
 
 
 class Found(NamedTuple):
-    """What a search has chosen.
+    """The choice of a search.
 
     Attributes:
         setting: of the sampler, splatter, layers, samples and rate.
@@ -97,7 +97,7 @@ class Search:
         return Found(chosen, reasons, error, seconds)
 
     def _told_of_failure(self, error: float) -> str:
-        """What to say where nothing is within the tolerance; a warning, too."""
+        """A line for where nothing is within the tolerance; a warning, too."""
         wanted = _percent(self.tolerance)
         told = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
         told = f"{told}: the least error that was found is {_percent(error)}"
@@ -139,7 +139,7 @@ class Search:
         return found
 
     def _cell(self, setting: Setting) -> Setting:
-        """What the error of a setting is kept under."""
+        """The key of a setting's error."""
         return setting._replace(sampler=self.samplers.get(setting.sampler, setting.sampler), engine="")
 
     def _work(self, setting: Setting) -> tuple[float, ...]:

@@ -17,10 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, render_views
+from rts.diagnostics.command_tools import output_folder, writing
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
 from rts.plugin_api.checks import fingerprint
-from rts.plugin_api.files import cache_folder, output_folder, writing
+from rts.plugin_api.files import cache_folder
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.measurement_keys import layers_of, state_key
 from rts_compare.moving_scenes import Scene, parts_of
@@ -37,7 +38,7 @@ Grids = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
 class Truth(NamedTuple):
-    """How an image changes along one mode.
+    """The change of an image along one mode.
 
     Attributes:
         derivative: (H, W, 3) a pixel of motion, the mean of the two grids'.

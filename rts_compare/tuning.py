@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Part, engine_of
+from rts.diagnostics.command_tools import output_folder
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError
 from rts.plugin_api.arrays import Tree, map_leaves
 from rts.plugin_api.checks import check_positive, is_count, quoted
-from rts.plugin_api.files import output_folder
 from rts_compare.compared_settings import usable
 from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.measurements import TOGETHER, Measurements
@@ -25,7 +25,7 @@ from rts_compare.true_derivatives import SAMPLES
 TRUTH_SAMPLES = (4, 8, SAMPLES)
 """Samples of truths, along each side of a pixel: more where the error of the truth itself is too large."""
 TRUE = 0.3
-"""What the error of a truth may be, as a share of the tolerance, which it makes larger by a twentieth."""
+"""The largest error of a truth, as a share of the tolerance, which it makes larger by a twentieth."""
 SAMPLED = 1.0
 """Seconds that a sampler may take, for 512² pixels or fewer."""
 
@@ -160,7 +160,7 @@ def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase
 
 
 def _told_of_truths(measured: Measurements, tolerance: float) -> list[str]:
-    """What to say where errors are measured against a truth that is too rough for the tolerance."""
+    """A line for where errors are measured against a truth that is too rough for the tolerance."""
     rough = measured.rough(TRUE * tolerance)
     if not rough:
         return []

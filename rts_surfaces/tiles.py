@@ -203,7 +203,7 @@ class Allowed(NamedTuple):
 
     @classmethod
     def everywhere(cls, count: int, chord: float) -> Allowed:
-        """The same distance for `count` tiles."""
+        """One distance for `count` tiles."""
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 

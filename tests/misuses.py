@@ -125,9 +125,7 @@ def broken(**options):
 
 
 def volume(**options):
-    return rts.radiance_fields.volume_render(
-        **{"field": FIELD, "camera": CAMERA, "size": SIZE, "samples": (3, 1), **options}
-    )
+    return rts.volume_render(**{"field": FIELD, "camera": CAMERA, "size": SIZE, "samples": (3, 1), **options})
 
 
 def energy(kind, **options):

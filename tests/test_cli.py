@@ -15,8 +15,8 @@ import rts
 from rts.cli import demo
 from rts.cli import main as cli
 from rts.cli import pose_fit as pose
-from rts.cli.default_camera import Bounds, bounds_of, orbit
 from rts.errors import InputError, PluginError
+from rts.scene.default_camera import Bounds, bounds_of, orbit
 
 pytestmark = pytest.mark.files
 

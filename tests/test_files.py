@@ -12,9 +12,9 @@ import trimesh
 from PIL import Image
 
 import rts
-from rts.cli.default_camera import bounds_of, orbit
 from rts.errors import InputError, PluginError
 from rts.files.srgb import decode_srgb, encode_srgb
+from rts.scene.default_camera import bounds_of, orbit
 
 pytestmark = pytest.mark.files
 

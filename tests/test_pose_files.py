@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 import rts
 from rts.cli import main as cli
-from rts.cli.default_camera import bounds_of, orbit
 from rts.cli.pose_file import Pose, posed, read_pose
 from rts.cli.pose_verdict import intersection_over_union, judged, touches_border, unlike_a_mask
 from rts.errors import InputError
+from rts.scene.default_camera import bounds_of, orbit
 
 pytestmark = pytest.mark.files
 

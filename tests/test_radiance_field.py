@@ -481,7 +481,7 @@ def test_rays_in_ndc_are_straight_and_reach_infinity():
 
 
 def test_a_volume_is_what_its_quadrature_says():
-    found = rts.radiance_fields.volume_render(FIELD, CAMERA, (5, 6), near=1, far=5, samples=(10, 7), background=None)
+    found = rts.volume_render(FIELD, CAMERA, (5, 6), near=1, far=5, samples=(10, 7), background=None)
     assert found.image.shape == (5, 6, 4) and (found.coarse, found.fine) == (300, 510)
     rays = CAMERA.rays((5, 6))
     for y, x in ((0, 0), (3, 2), (4, 5)):
@@ -500,7 +500,7 @@ def test_a_volume_is_what_its_quadrature_says():
         placed = np.interp(np.linspace(0, 1, 7), total, (t[1:] + t[:-1]) / 2)
         weights, color = shaded("fine", np.sort(np.append(t, placed)))
         np.testing.assert_allclose(found.image[y, x], [*color, weights.sum()], atol=1e-3)
-    white = rts.radiance_fields.volume_render(FIELD, CAMERA, (5, 6), near=1, far=5, samples=(10, 7)).image
+    white = rts.volume_render(FIELD, CAMERA, (5, 6), near=1, far=5, samples=(10, 7)).image
     np.testing.assert_allclose(white, found.image[..., :3] + 1 - found.image[..., 3:], atol=1e-6)
 
 
@@ -510,7 +510,7 @@ def test_lego_is_the_reference(data):
     camera = Camera.from_blender(reference["c2w"], (100, 100), focal=float(reference["focal"]))
     # NeRF's rays pass through 0.375 of the pixels.
     camera = camera.window((100, 100), (45 - 0.125, -0.125), (10, 100))
-    found = rts.radiance_fields.volume_render(field, camera, (10, 100))
+    found = rts.volume_render(field, camera, (10, 100))
     np.testing.assert_allclose(found.image, reference["rgb"][45:55], atol=3e-3)
     assert (found.coarse, found.fine) == (64_000, 128_000)
     images = np.load(data / "nerf/lego_images_100.npz")
@@ -528,16 +528,16 @@ def test_fern_is_like_its_photograph(data):
     camera = Camera.from_blender(fern["c2w"][0], size, focal=focal / n)
     shift = (n - 1) / (2 * n) - 0.5
     camera = camera.window(size, (15 + shift, shift), (12, 56))
-    found = rts.radiance_fields.volume_render(field, camera, (12, 56), ndc=ndc, background="black")
+    found = rts.volume_render(field, camera, (12, 56), ndc=ndc, background="black")
     assert -10 * np.log10(np.mean((found.image - photo[15:27]) ** 2)) > 22
 
 
 @pytest.mark.parametrize("target", ALL)
 def test_weights_of_every_engine_are_drawn(target):
     options = {"near": 1, "far": 5, "samples": (8, 8)}
-    expected = rts.radiance_fields.volume_render(FIELD, CAMERA, (4, 5), **options).image
+    expected = rts.volume_render(FIELD, CAMERA, (4, 5), **options).image
     field = RadianceField(arrays(target, FIELD.weights))
-    np.testing.assert_array_equal(rts.radiance_fields.volume_render(field, CAMERA, (4, 5), **options).image, expected)
+    np.testing.assert_array_equal(rts.volume_render(field, CAMERA, (4, 5), **options).image, expected)
 
 
 @pytest.mark.parametrize(
@@ -558,7 +558,7 @@ def test_weights_of_every_engine_are_drawn(target):
 )
 def test_wrong_arguments_are_refused(changes, message):
     given = {"field": FIELD, "camera": CAMERA, "size": (4, 5), **changes}
-    refused(lambda: rts.radiance_fields.volume_render(**given), message)
+    refused(lambda: rts.volume_render(**given), message)
 
 
 # ------------------------------------------------------------------------------------------------ surfaces out of NDC

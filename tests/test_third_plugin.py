@@ -54,7 +54,8 @@ class TestWide(SplatterConformance):
 
 def test_its_command_is_listed_and_runs_beside_ours(tmp_path, monkeypatch):
     entry = EntryPoint("turntable", "rts_third_plugin.turntable:turntable", "rts.commands")
-    monkeypatch.setitem(registry._found, "rts.commands", {**registry._entries("rts.commands"), "turntable": [entry]})
+    commands = {**registry._entries("rts.commands"), "turntable": [entry]}
+    monkeypatch.setitem(registry._entry_points, "rts.commands", commands)
     monkeypatch.chdir(tmp_path)
     listed = CliRunner().invoke(app, ["--help"]).output
     for told in ("render ", "compare ", r"turntable +Write an animation of a model"):

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.cli.default_camera import bounds_of, orbit
 from rts.cli.pose_file import posed
 from rts.cli.pose_fit import PoseFit, fit_pose, shrunk, silhouette_of
 from rts.cli.pose_report import write_report
 from rts.cli.pose_verdict import judged
 from rts.files.paths import writing
 from rts.rendering.image import render
+from rts.scene.default_camera import bounds_of, orbit
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
 

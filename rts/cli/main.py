@@ -303,9 +303,9 @@ def render(
 ) -> None:
     """Render a model to a picture."""
     import rts
-    from rts.cli.default_camera import bounds_of, orbit
     from rts.cli.pose_file import posed, read_pose
     from rts.files.paths import output_file
+    from rts.scene.default_camera import bounds_of, orbit
 
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
@@ -386,12 +386,12 @@ def fit_pose(
     `rts render MODEL --pose pose.json` draws the model so.
     """
     import rts
-    from rts.cli.default_camera import bounds_of, orbit
     from rts.cli.pose_fit import fit_pose as fit
     from rts.cli.pose_fit import silhouette_of
     from rts.cli.pose_report import write_report
     from rts.cli.pose_verdict import judged
     from rts.files.paths import output_folder
+    from rts.scene.default_camera import bounds_of, orbit
 
     if f_scale is not None and loss == "linear":
         raise typer.BadParameter("--f-scale is for a robust --loss: soft_l1, huber or cauchy")
@@ -432,9 +432,9 @@ def export(
 ) -> None:
     """Make a mesh of a model's surface, its positions and triangles, and write it."""
     import rts
-    from rts.cli.default_camera import bounds_of
     from rts.cli.mesh_export import FORMATS, write_mesh
     from rts.files.paths import output_file
+    from rts.scene.default_camera import bounds_of
 
     output_file(output, "mesh", FORMATS)
     if not (np.isfinite(tolerance) and tolerance > 0):

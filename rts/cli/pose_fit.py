@@ -11,13 +11,13 @@ import numpy as np
 from rts import registry
 from rts.arrays.engines import Engine, engine_named, engine_of, namespace
 from rts.arrays.trees import Array
-from rts.cli.default_camera import Bounds
 from rts.cli.pose_file import Pose, posed
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.schedule import Stage, box_filtered, pyramid
 from rts.scene.camera import Camera
+from rts.scene.default_camera import Bounds
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
 

@@ -1,14 +1,13 @@
 """Arrays of any engine, and trees of them."""
 
 from rts.arrays.array_functions import from_numbers, shape_of, unit
-from rts.arrays.engines import constants, engine_named, exemplar
+from rts.arrays.engines import constants, exemplar
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 
 __all__ = [
     "Array",
     "Tree",
     "constants",
-    "engine_named",
     "exemplar",
     "from_numbers",
     "leaves",

@@ -1,7 +1,7 @@
 """Checks of arguments that users give, with one-line errors, and of tables of triangles."""
 
 from rts.arrays.argument_checks import check_numbers, check_positive, quoted
-from rts.contracts.checks import check_scene, is_count
+from rts.contracts.checks import is_count
 from rts.contracts.pieces import pieces
 from rts.sampling.cache import fingerprint
 from rts.sampling.sample_checks import check_camera
@@ -11,7 +11,6 @@ __all__ = [
     "check_camera",
     "check_numbers",
     "check_positive",
-    "check_scene",
     "fingerprint",
     "index_table",
     "is_count",

@@ -166,11 +166,14 @@ def _accumulate(
             for y in range(top * fine, bottom * fine):
                 if len(fields[1]) > 0 and not _counts(fields[1][y // fine, own : own + pixels]):
                     continue
-                at = y + border, left + border
-                moving_row = busy(choices.states, *at, count, least) or busy(choices.mixed, *at, count, 1)
-                if moving_row:
-                    given = y + border, left + border - 1, count + 2
-                    first = load_around(sources, loaded, positions, rgba, fronts, *given, scale, peak, gamma)
+                down, right = y + border, left + border
+                moving_row = busy(choices.states, down, right, count, least)
+                if moving_row or busy(choices.mixed, down, right, count, 1):
+                    moving_row = True
+                    # Inlined, so its arguments are written out.
+                    first = load_around(
+                        sources, loaded, positions, rgba, fronts, down, right - 1, count + 2, scale, peak, gamma
+                    )
                     for v in range(first, y + border + 2):
                         for k in range(layers):
                             s = slot(sources, k, v, SOURCE)

@@ -284,8 +284,8 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_r
             if not busy(states, y + border, left + border, count, least):
                 out[:, y, left : left + count] = out.dtype.type(0)
                 continue
-            at = y + border, left + border - 1, count + 2
-            first = load_around(sources, loaded, positions, rgba, row, *at, scale, peak, gamma)
+            down, right = y + border, left + border - 1
+            first = load_around(sources, loaded, positions, rgba, row, down, right, count + 2, scale, peak, gamma)
             for v in range(first, y + border + 2):
                 for k in range(layers):
                     s = slot(sources, k, v, SOURCE)

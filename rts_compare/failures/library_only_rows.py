@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Part, fit, plugin, render, rigid
+from rts.diagnostics.command_tools import engine_named
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
-from rts.plugin_api.arrays import Array, engine_named
+from rts.plugin_api.arrays import Array
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.failures import failure_scenes
 from rts_compare.failures.method_renderers import Own, Unable, quiet
@@ -61,7 +62,7 @@ def _gradient(values: np.ndarray, method: Method) -> tuple[float, int]:
 
 
 def _of_values(values: np.ndarray, usual: np.ndarray, limits: tuple[float, float], method: Method) -> Outcome:
-    """How the largest gradient compares with that of usual values."""
+    """Compare the largest gradient with that of usual values."""
     try:
         own(method)
     except Unable:

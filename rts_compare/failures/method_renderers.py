@@ -1,4 +1,4 @@
-"""What rows ask of a method: derivative images, and losses with their slopes, by us and by other renderers."""
+"""Renderers of methods, as rows ask for them: derivative images, and slopes of losses, by us and by others."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from rts import Engine, engine_of, render
+from rts.diagnostics.command_tools import engine_named
 from rts.errors import RtsWarning
-from rts.plugin_api.arrays import Array, Tree, engine_named, leaves, map_leaves
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.derivative_scores import loss_weights
 from rts_compare.failures.table_columns import Method
 from rts_compare.left_out import one_line
@@ -75,7 +76,7 @@ class Renderer(abc.ABC):
         """The derivatives (modes,) of a loss along all modes, with the scene moved by amounts (modes,)."""
 
     def broken(self) -> int:
-        """How many values of the image and of gradients are not finite."""
+        """The number of values of the image and of gradients that are not finite."""
         return 0
 
 

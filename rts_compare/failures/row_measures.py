@@ -1,4 +1,4 @@
-"""How cells are measured: the error of a derivative image, and how often fits converge."""
+"""Measures of cells: the error of a derivative image, and how often fits converge."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Derivative(NamedTuple):
         return Outcome(verdict, f"{numbers['error']:.2f} ({numbers['largest']:.1f}×){more}", numbers)
 
     def numbers(self, method: Method, context: Context) -> dict[str, float]:
-        """What is measured.
+        """Measure the derivative of a method.
 
         Returns:
             error: relative L2 through the low-pass of `scores`.

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.diagnostics.command_tools import output_folder, writing
 from rts.diagnostics.progress import phases
 from rts.errors import InputError
 from rts.plugin_api.checks import is_count, quoted
-from rts.plugin_api.files import output_folder, writing
 from rts_compare.environment import environment
 from rts_compare.failures.table_cells import Context, Outcome, Row, cannot
 from rts_compare.failures.table_columns import METHODS, Method
@@ -142,7 +142,7 @@ def stability(
 
 
 def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) -> list[Any]:
-    """What is known by these names."""
+    """The known things of these names."""
     if wanted is None:
         return list(known.values())
     wanted = [wanted] if isinstance(wanted, str) else wanted
@@ -174,7 +174,7 @@ def _measured(row: Row, method: Method, context: Context, measured: KeptMeasurem
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold: numbers to four digits, those that are not finite as words."""
+    """A value that JSON can hold: numbers to four digits, those that are not finite as words."""
     if isinstance(value, Mapping):
         return {key: _plain(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""What a cell of the table holds, and what a row is."""
+"""Cells of the table, and its rows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Outcome(NamedTuple):
 
 
 class Context(NamedTuple):
-    """How thoroughly cells are measured.
+    """The effort with which cells are measured.
 
     Attributes:
         seeds: how many starts fits have.

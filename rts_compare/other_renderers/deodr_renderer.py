@@ -93,7 +93,7 @@ class Deodr(Peer):
         return slope
 
     def _velocity(self, mode: str) -> tuple[np.ndarray, np.ndarray]:
-        """Those of vertices and of colours, (V, 3) each."""
+        """Velocities of vertices and of colours, (V, 3) each."""
         pairs = list(zip(self.given.parts, self.given.velocity(mode), strict=True))
         moves = [np.zeros_like(p.vertices) if v.vertices is None else v.vertices for p, v in pairs]
         changes = [np.zeros_like(p.colors) if v.colors is None else v.colors for p, v in pairs]

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, plugin
+from rts.diagnostics.command_tools import check_scene
 from rts.errors import InputError
 from rts.plugin_api.arrays import map_leaves
-from rts.plugin_api.checks import check_scene
 from rts_compare.moving_scenes import Scene
 
 EDGE = 4.0
@@ -27,7 +27,7 @@ CUTS = (1, 2, 4, 8, 16, 32, 64)
 TRIAL = 1e-3
 """Step in t by which speeds are guessed, before they are measured over a pixel."""
 COLOR_STEP = 0.1
-"""What counts as far as a pixel where colours move."""
+"""A change of colour that counts as far as a pixel."""
 
 
 class Unsuited(Exception):
@@ -49,7 +49,7 @@ class Colored(NamedTuple):
 
 
 class Velocity(NamedTuple):
-    """How a part moves, per unit of t.
+    """The motion of a part, per unit of t.
 
     Attributes:
         vertices: (V, 3), or None where they rest.
@@ -62,7 +62,7 @@ class Velocity(NamedTuple):
 
 @dataclass(frozen=True)
 class RendererInput:
-    """What other renderers are given.
+    """A scene as it is given to other renderers.
 
     Attributes:
         size: (height, width).
@@ -79,7 +79,7 @@ class RendererInput:
     velocities: Mapping[str, tuple[Velocity, ...] | str]
 
     def velocity(self, mode: str) -> tuple[Velocity, ...]:
-        """Those of all parts, in one mode.
+        """Velocities of all parts, in one mode.
 
         Raises:
             InputError: the mode moves no triangles in a way that has a velocity.
@@ -246,7 +246,7 @@ def _colors(index: int, part: Part, rate: int, count: int) -> np.ndarray:
 
 
 def _of_vertices(index: int, part: Part, rate: int) -> np.ndarray:
-    """What θ says of the colours of vertices, (V, C)."""
+    """Colours of vertices (V, C), as θ has them."""
     colors = part.theta.get("colors")
     if isinstance(colors, np.ndarray):
         if _is_mesh(part) and part.surface.sample_widths[0] == 3:
@@ -266,7 +266,7 @@ def _rgb(index: int, part: Part, colors: np.ndarray) -> np.ndarray:
 
 
 def _joints(part: Colored) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices (V',) to keep where several are in one place and of one colour, and (V,) what each becomes."""
+    """Vertices (V',) to keep where several are in one place and of one colour, and (V,) which of them each becomes."""
     _, first, became = np.unique(
         np.hstack([part.vertices, part.colors]), axis=0, return_index=True, return_inverse=True
     )
@@ -316,7 +316,7 @@ def _turned(part: Colored) -> Colored:
 def _velocities(
     at: Callable[[float], list[Colored]], rest: list[Colored], focal: float, near: float
 ) -> tuple[Velocity, ...] | str:
-    """Those of all parts in one mode, or why there are none."""
+    """Velocities of all parts in one mode, or why there are none."""
     try:
         guess = _differences(at, rest, TRIAL)
         speed = _fastest(rest, guess, focal, near)

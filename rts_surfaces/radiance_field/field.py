@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,9 +91,32 @@ class RadianceField:
         return map_leaves(engine_of(self.weights).to_numpy, self.weights)
 
 
-def load_radiance_field(path: Path) -> RadianceField:
-    """The field whose weights an .npz holds, as float32; see `rts.load_radiance_field`."""
-    if not path.is_file():
+def load_radiance_field(path: Any) -> RadianceField:
+    """The radiance field (Mildenhall et al. 2020) whose weights an .npz holds.
+
+    Its arrays are called as krrish94/nerf-pytorch calls its layers, after the name of the network: coarse.layer1.weight
+    (out, in), coarse.layer1.bias (out,), coarse.layers_xyz.0.weight, …, coarse.fc_alpha.weight, coarse.fc_feat.weight,
+    coarse.layers_dir.0.weight, coarse.fc_rgb.weight, and so on for fine. Nothing is unpickled.
+
+    As a surface light field, it is a part with the shader "radiance" and one network of it as θ["weights"], on a
+    surface such as where `lattice`, the density, is 50.
+
+    Returns:
+        An object with `weights`, {"coarse": network, "fine": network} of float32 NumPy arrays; `architecture(network)`;
+        `lattice(bounds, shape)`, its density at points; and `save(path)`.
+
+    Raises:
+        InputError: there is no such file, it is no .npz, holds pickles, or something other than real finite numbers; a
+            layer is missing, unknown, or its shape does not fit.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path")
+    path = Path(os.fsdecode(path))
+    try:
+        there = path.is_file()
+    except OSError as error:
+        raise InputError(f"the path {quoted(str(path))} is no good ({error.strerror}); choose another name") from None
+    if not there:
         raise InputError(f"there is no file {path} of weights; check the path (relative paths start at {Path.cwd()})")
     networks: dict[str, Any] = {}
     for key, array in _arrays(path).items():

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from rts import GBuffer, InputError, Ndc, Part, TriangleSurface, namespace
+from rts import GBuffer, InputError, Part, TriangleSurface, namespace
 from rts.plugin_api.arrays import Array, Tree, unit
 from rts.plugin_api.checks import quoted
 from rts.plugin_api.records import ArraySpec, Proxy, Rays, Samples
+from rts_surfaces.radiance_field.ndc import Ndc
 
 DEEPEST = 1e4
 """Depth, over that of the near plane, beyond which triangles are left out: rounding moves them too far in the world."""

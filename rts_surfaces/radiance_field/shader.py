@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rts import Camera, GBuffer, InputError, Ndc, Shader, engine_of, namespace
+from rts import Camera, GBuffer, InputError, Shader, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, constants, exemplar, unit
 from rts.plugin_api.checks import is_count, quoted
 from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
+from rts_surfaces.radiance_field.ndc import Ndc
 from rts_surfaces.radiance_field.network import check_network, radiance
 from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
 
@@ -65,5 +66,5 @@ class RadianceShader(Shader):
 
     @staticmethod
     def volume_render(field: RadianceField, camera: Camera, size: tuple[int, int], **options: Any) -> VolumeImage:
-        """See `rts.radiance_fields.volume_render`."""
+        """See `rts.volume_render`."""
         return volume_render(field, camera, size, **options)

@@ -7,15 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts import Camera, InputError, Ndc, engine_of
+from rts import Camera, InputError, engine_of
 from rts.plugin_api.arrays import constants, map_leaves
-from rts.plugin_api.checks import is_count, quoted
+from rts.plugin_api.checks import check_numbers, is_count, quoted
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, in_chunks, progress_bar
 from rts_surfaces.radiance_field.field import RadianceField
+from rts_surfaces.radiance_field.ndc import Ndc, checked_size
 from rts_surfaces.radiance_field.network import density_and_radiance
 
 RAYS = 512
 """Rays at a time."""
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LAST = 1e10
 """Length of the last interval of a ray, which has no end."""
 
@@ -39,24 +41,41 @@ def volume_render(
     camera: Camera,
     size: tuple[int, int],
     *,
-    planes: tuple[float, float],
-    samples: tuple[int, int],
-    background: np.ndarray | None,
-    ndc: Ndc | None,
-    progress: bool | None,
+    near: float | None = None,
+    far: float | None = None,
+    samples: tuple[int, int] = (64, 64),
+    background: Any = "white",
+    ndc: Ndc | None = None,
+    progress: bool | None = None,
 ) -> VolumeImage:
-    """The image, and the evaluations of both networks; see `rts.radiance_fields.volume_render`, which checks the rest.
+    """The image of a radiance field by quadrature along rays, as NeRF's test mode: without noise; no derivatives.
+
+    The coarse network is evaluated at N_c equal steps of depth; N_f more samples are placed where it has weight, by
+    the inverse of their distribution; the fine network is evaluated at all of them (Mildenhall et al. 2020, §4 and 5).
+    It is what surface light fields are compared with. By torch where that is installed, else by NumPy.
 
     Args:
-        field: the field.
-        camera: a perspective camera.
+        field: what `load_radiance_field` gives; its weights may be arrays of any engine.
+        camera: a perspective camera; rays pass through the centres of its pixels (for NeRF's own, cameras of
+            `load_views` with `pixel_center`).
         size: (height, width).
-        planes: the parameters of rays at which they begin and end.
-        samples: of the coarse and the fine network, along each ray.
-        background: a colour (3,), or None for transparency.
-        ndc: the map to the field's space, or None.
-        progress: True to show a progress bar.
+        near: depth at which rays begin; default 2, as in NeRF's Blender scenes; with `ndc`, always its near plane.
+        far: depth at which they end; default 6; with `ndc`, always infinity.
+        samples: (N_c, N_f).
+        background: what is behind: "white", "black" or a colour (3,); None for transparency.
+        ndc: the map from the world to the field's space, or None where that is the world.
+        progress: whether to show a progress bar; None to do so in a terminal.
+
+    Returns:
+        A named tuple: `image` (H, W, 3) float32 on the background, or (H, W, 4) premultiplied RGBA, in the encoding of
+        the images that the field was trained on; `coarse` and `fine`, the evaluations of each network.
+
+    Raises:
+        InputError: an argument is none of these, or the camera is orthographic.
     """
+    height, width = checked_size(size)
+    near, far = _planes(near, far, ndc)
+    color = None if background is None else _color(background)
     if not isinstance(field, RadianceField):
         raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")
     if not isinstance(camera, Camera):
@@ -66,7 +85,6 @@ def volume_render(
     counts = tuple(samples) if isinstance(samples, (tuple, list)) else ()
     if len(counts) != 2 or not all(map(is_count, counts)) or counts[0] < 3:
         raise InputError(f"samples is {quoted(samples)}; expected (coarse, fine), at least 3 and 1")
-    (height, width), (near, far) = size, planes
     camera = map_leaves(engine_of(camera).to_numpy, camera)
     if camera.for_size((height, width)).projection[3, 2] == 0:
         raise InputError("the camera is orthographic; volumes are drawn by perspective ones")
@@ -92,9 +110,36 @@ def volume_render(
             done["fine"] += t.size
             advance(len(o))
     image = image.reshape(height, width, 4)
-    if background is not None:
-        image = image[..., :3] + (1 - image[..., 3:]) * background
+    if color is not None:
+        image = image[..., :3] + (1 - image[..., 3:]) * color
     return VolumeImage(image, done["coarse"], done["fine"])
+
+
+def _planes(near: float | None, far: float | None, ndc: Ndc | None) -> tuple[float, float]:
+    """The parameters of rays at which they begin and end."""
+    if ndc is not None and not isinstance(ndc, Ndc):
+        raise InputError(f"ndc is {quoted(ndc)}; expected an Ndc, or None")
+    if ndc is not None and not near is far is None:
+        raise InputError("near and far are given with ndc, whose rays run from its near plane to infinity; leave them")
+    if ndc is not None:
+        return 0.0, 1.0
+    near, far = 2.0 if near is None else near, 6.0 if far is None else far
+    check_numbers("near", near, ())
+    check_numbers("far", far, ())
+    if not 0 < near < far:
+        raise InputError(f"near is {quoted(near)} and far is {quoted(far)}; expected near > 0 and near < far")
+    return float(near), float(far)
+
+
+def _color(background: Any) -> np.ndarray:
+    """(3,) float32 of "white", "black" or three numbers in [0, 1]."""
+    if isinstance(background, str) and background not in BACKGROUNDS:
+        raise InputError(f"background is {quoted(background)}; expected 'white', 'black' or a colour (3,)")
+    value = BACKGROUNDS[background] if isinstance(background, str) else background
+    color = check_numbers("background", value, (3,))
+    if color is None or color.min() < 0 or color.max() > 1:
+        raise InputError(f"background is {quoted(background)}; expected a colour (3,) of numbers from 0 to 1")
+    return color.astype(np.float32)
 
 
 def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arrays.argument_checks import check_pixels, check_positive
-from rts.arrays.array_functions import described, from_numbers, shape_of
-from rts.arrays.engines import constants, context_of, namespace
-from rts.arrays.trees import Array
-from rts.errors import InputError
+import numpy as np
+
+from rts import InputError, engine_of, namespace
+from rts.plugin_api.arrays import Array, constants, exemplar, from_numbers, shape_of
+from rts.plugin_api.checks import check_positive, is_count, quoted
 
 NEAREST, FARTHEST = 1e-6, 1e6
 """Depths, over that of the near plane, to which points behind the camera and at infinity are brought."""
@@ -42,7 +42,7 @@ class Ndc:
         Raises:
             InputError: no positive numbers.
         """
-        height, width = check_pixels(size)
+        height, width = checked_size(size)
         check_positive("focal", focal)
         check_positive("near", near)
         return cls((2 * float(focal) / width, 2 * float(focal) / height), float(near))
@@ -75,9 +75,11 @@ class Ndc:
         """
         origins, directions = _checked("origins", origins), _checked("directions", directions)
         if origins.shape != directions.shape:
-            raise InputError(f"origins {described(origins)} and directions {described(directions)}; expected one shape")
-        engine, like = context_of(origins, directions)
-        origins, directions = constants((origins, directions), engine, like)
+            raise InputError(
+                f"origins have shape {shape_of(origins)} and directions {shape_of(directions)}; expected one shape"
+            )
+        engine = engine_of(origins, directions)
+        origins, directions = constants((origins, directions), engine, exemplar(origins, directions))
         xp = engine.namespace
         at_near = origins - directions * ((self.near + origins[:, 2:]) / directions[:, 2:])
         start = self.from_world(at_near)
@@ -85,11 +87,19 @@ class Ndc:
         return start, xp.stack([x, y, xp.ones_like(x)], axis=1) - start
 
 
+def checked_size(size: Any) -> tuple[int, int]:
+    """The size (height, width) of an image; anything but two positive integers is refused."""
+    sides = tuple(size) if isinstance(size, (tuple, list, np.ndarray)) else ()
+    if len(sides) != 2 or not all(map(is_count, sides)):
+        raise InputError(f"size is {quoted(size)}; expected (height, width), two positive integers")
+    return int(sides[0]), int(sides[1])
+
+
 def _checked(name: str, points: Any) -> Array:
     """Rows of three numbers, refused where they are something else."""
     points = from_numbers(points, name)
     if len(shape_of(points)) != 2 or points.shape[1] != 3:
-        raise InputError(f"{name} {described(points)}; expected (N, 3)")
+        raise InputError(f"{name} has shape {shape_of(points)}; expected (N, 3)")
     return points
 
 
