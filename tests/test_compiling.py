@@ -5,8 +5,8 @@ import io
 import os
 import subprocess
 import sys
+from pathlib import Path
 
-import numpy as np
 import pytest
 
 import rts
@@ -16,8 +16,11 @@ import numba
 
 from rts.compiling import loops as compiling
 from rts.compiling import warmup
+from rts.operations import take_loops
 
 pytestmark = pytest.mark.core
+
+ROOT = Path(__file__).resolve().parent.parent
 
 FIRST_RENDER = """
 import sys
@@ -60,39 +63,40 @@ class Terminal(io.StringIO):
         return True
 
 
+OURS, THEIRS = (type("", (), {"data": {"dispatcher": x}}) for x in (take_loops.put, numba.njit(lambda x: x)))
+"""Events of a loop, and of another function that is compiled."""
+
+
 @pytest.mark.parametrize(("stream", "told"), [(Terminal(), True), (io.StringIO(), False)], ids=["terminal", "pipe"])
-def test_a_terminal_is_told_of_what_takes_long(stream, told, monkeypatch):
+def test_a_terminal_is_told_once_of_what_takes_long(stream, told, monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
-    progress = compiling._Progress()
-    ours, theirs = (type("", (), {"py_func": f}) for f in (rts.render, np.linalg.norm))
+    watch = compiling._Watch()
 
-    def compile_(dispatcher, seconds):
-        happened = type("", (), {"data": {"dispatcher": dispatcher}})
+    def compile_(event, seconds):
         monkeypatch.setattr(compiling.time, "perf_counter", lambda: 0.0)
-        progress.on_start(happened)
-        progress.on_start(happened)  # Helpers are compiled within.
-        progress.on_end(happened)
+        watch.on_start(event)
+        watch.on_start(event)  # Helpers are compiled within.
+        watch.on_end(event)
         monkeypatch.setattr(compiling.time, "perf_counter", lambda: seconds)
-        progress.on_end(happened)
+        watch.on_end(event)
 
-    compile_(ours, 0.5)
-    compile_(theirs, 9.0)
+    compile_(OURS, 0.5)
+    compile_(THEIRS, 9.0)
     assert not stream.getvalue()
     for seconds in (2.5, 1.0, 4.0):
-        compile_(ours, seconds)
-    lines = ["rts: compiling loops (once): 2 in 3 s", "rts: compiling loops (once): 4 in 8 s"]
-    assert stream.getvalue().splitlines() == (lines if told else [])
+        compile_(OURS, seconds)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == told and all(line.startswith("rts: compiling loops (once") for line in lines)
 
 
-def test_no_garbage_is_collected_while_our_loops_are_compiled():
-    ours, theirs = (type("", (), {"data": {"dispatcher": type("", (), {"py_func": f})}}) for f in (rts.render, np.dot))
-    listener = compiling._NoCollection()
-    for event, paused in ((ours, True), (theirs, False)):
-        listener.on_start(event)
-        listener.on_start(ours)
-        listener.on_end(ours)
+def test_no_garbage_is_collected_while_loops_are_compiled():
+    watch = compiling._Watch()
+    for event, paused in ((OURS, True), (THEIRS, False)):
+        watch.on_start(event)
+        watch.on_start(OURS)
+        watch.on_end(OURS)
         assert gc.isenabled() is not paused
-        listener.on_end(event)
+        watch.on_end(event)
         assert gc.isenabled()
 
 
@@ -144,6 +148,37 @@ def test_warmup_makes_the_calls_and_says_what_failed(monkeypatch, tmp_path):
     monkeypatch.setattr(warmup, "OTHERS", ("nothing",))
     with pytest.raises(rts.RtsError, match="could not compile loops: KeyError: 'nothing'"):
         rts.warmup(1)
+
+
+ORDINARY_CALLS = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from benchmarks.cold_start import TASKS
+from rts.compiling import ordinary_calls, warmup
+
+def compiled():
+    ours = ("rts", "rts_backends", "rts_surfaces")
+    modules = [m for name, m in sys.modules.items() if name.partition(".")[0] in ours]
+    found = {id(x): x for m in modules for x in vars(m).values() if isinstance(x, Dispatcher)}
+    return {f"{x.__module__}.{x.__name__} {sig}" for x in found.values() for sig in x.overloads}
+
+for name in warmup.FIRST + warmup.OTHERS:
+    getattr(ordinary_calls, name)()
+before = compiled()
+assert len(before) > 40
+for task in TASKS.values():
+    task()()
+print(*(compiled() - before), sep="\\n")
+"""
+
+
+def test_warmup_makes_all_that_ordinary_calls_need():
+    for package in ("torch", "jax"):
+        pytest.importorskip(package)
+    done = subprocess.run(
+        [sys.executable, "-c", ORDINARY_CALLS], capture_output=True, text=True, check=True, timeout=600, cwd=ROOT
+    )
+    assert not done.stdout.split()
 
 
 @pytest.mark.parametrize("processes", [0, -1, 1.5, "two", True])

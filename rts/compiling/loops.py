@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -33,11 +32,6 @@ LOOP = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
 Divisions by zero are not looked for. All loops have these options, since numba compiles its own functions, such as
 `min` and `np.empty`, once for each set of options.
 """
-
-PACKAGES = ("rts", "rts_backends", "rts_surfaces")
-
-saving = threading.RLock()
-"""Held while a loop is written to disk."""
 
 
 def loop(function: Callable | None = None, **options: Any) -> Any:
@@ -102,84 +96,54 @@ class _Cache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write code that has been compiled."""
-        with saving, alone(self.cache_path):
+        with alone(self.cache_path):
             super().save_overload(sig, data)
 
 
-class _Outermost(event.Listener):
-    """Listens to numba's compiler, but not to compilations within others; the lock of the compiler is held."""
+class _Watch(event.Listener):
+    """Listener to the compilation of our loops, with all that each calls. The compiler's lock is held meanwhile.
 
-    def __init__(self) -> None:
-        self._depth = 0
-
-    def on_start(self, event: Any) -> None:
-        """Go deeper."""
-        if self._depth == 0:
-            self.begun(_is_ours(event.data["dispatcher"]))
-        self._depth += 1
-
-    def on_end(self, event: Any) -> None:
-        """Come back."""
-        self._depth -= 1
-        if self._depth == 0:
-            self.ended(_is_ours(event.data["dispatcher"]))
-
-    def begun(self, ours: bool) -> None:
-        """Compilation of a function, ours or not, begins."""
-
-    def ended(self, ours: bool) -> None:
-        """Compilation of it is done."""
-
-
-class _Progress(_Outermost):
-    """Lines on a terminal while loops are compiled: how many, in which time; nothing where they are on disk.
-
-    Each comes after twice the time of the one before, and is whole, since nobody knows which loop is the last.
+    It tells a terminal once that loops are compiled, where that takes long. It pauses the collection of garbage:
+    compilation makes so many objects that this takes a tenth of the time.
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.count, self.seconds = 0, 0.0
-        self._since, self._next = 0.0, TOLD_AFTER
+        self.seconds = 0.0
+        self._depth, self._since, self._told, self._paused = 0, 0.0, False, False
 
-    def begun(self, ours: bool) -> None:
-        """Begin to count time."""
-        self._since = time.perf_counter()
+    def on_start(self, event: Any) -> None:
+        """Begin with a function, or with one that it calls."""
+        if self._depth == 0:
+            self._since = time.perf_counter()
+            self._paused = _is_ours(event) and gc.isenabled()
+            if self._paused:
+                gc.disable()
+        self._depth += 1
 
-    def ended(self, ours: bool) -> None:
-        """Count a loop that is done, and tell of it."""
-        if ours:
-            self.count, self.seconds = self.count + 1, self.seconds + time.perf_counter() - self._since
-            stream = sys.stderr
-            if self.seconds > self._next and stream is not None and stream.isatty():
-                self._next = 2 * self.seconds
-                stream.write(f"rts: compiling loops (once): {self.count} in {self.seconds:.0f} s\n")
-                stream.flush()
-
-
-class _NoCollection(_Outermost):
-    """Stops the collection of garbage while a loop is compiled, which makes many objects: a tenth of the time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._paused = False
-
-    def begun(self, ours: bool) -> None:
-        """Stop, if it is on."""
-        self._paused = ours and gc.isenabled()
-        if self._paused:
-            gc.disable()
-
-    def ended(self, ours: bool) -> None:
-        """Go on."""
+    def on_end(self, event: Any) -> None:
+        """End with a function, compiled or refused."""
+        self._depth -= 1
+        if self._depth:
+            return
         if self._paused:
             gc.enable()
+        if _is_ours(event):
+            self.seconds += time.perf_counter() - self._since
+            if self.seconds > TOLD_AFTER and not self._told:
+                self._told = True
+                _tell("rts: compiling loops (once for each installation; `rts warmup` does it ahead) …")
 
 
-def _is_ours(dispatcher: Any) -> bool:
-    module = getattr(getattr(dispatcher, "py_func", None), "__module__", None) or ""
-    return module.partition(".")[0] in PACKAGES
+def _is_ours(event: Any) -> bool:
+    return isinstance(getattr(event.data["dispatcher"], "_cache", None), _Cache)
 
 
-event.register("numba:compile", _Progress())
-event.register("numba:compile", _NoCollection())
+def _tell(line: str) -> None:
+    stream = sys.stderr
+    if stream is not None and stream.isatty():
+        with suppress(UnicodeEncodeError):
+            stream.write(line + "\n")
+            stream.flush()
+
+
+event.register("numba:compile", _Watch())

@@ -19,21 +19,6 @@ from rts_backends.fused.uniform_cells import BUSY, EMPTY
 MORE_BEHIND = Cells.MORE_BEHIND
 
 
-@compiled
-def _depths(z, at, positions, row, y, x, beyond):
-    """Column `at` of z (K, ·): depths of a cell's layers, `beyond` where not covered; NaN where none is."""
-    layers, height, width = row.shape
-    some = False
-    if 0 <= y < height and 0 <= x < width:
-        for k in range(layers):
-            i = row[k, y, x]
-            some |= i >= 0
-            z[k, at] = positions[i, 2] if i >= 0 else beyond
-    if not some:
-        for k in range(layers):
-            z[k, at] = z.dtype.type(np.nan)
-
-
 @loop
 def find(start, stop, positions, row, beyond, hidden, states, mixed, counts):
     """Mark mixed targets (H, W) of `Multi`, and count those of each row. `survey` finds those of `Visible`.
@@ -132,8 +117,15 @@ def choose(
                 continue
             columns[d], states[y, x] = x, EMPTY
             choices[d] = 0
-            for n in range(9):
-                _depths(z, n, positions, row, y + 1 - n // 3, x + 1 - n % 3, beyond)
+            for n in range(9):  # A helper would have references to its arrays counted here.
+                py, px, some = y + 1 - n // 3, x + 1 - n % 3, False
+                inside = 0 <= py < height and 0 <= px < width
+                for k in range(layers):
+                    i = row[k, py, px] if inside else -1
+                    some |= i >= 0
+                    z[k, n] = positions[i, 2] if i >= 0 else beyond
+                for k in range(0 if some else layers):
+                    z[k, n] = z.dtype.type(np.nan)
             for k in range(layers):
                 target[k] = z[k, 4] if z[k, 4] == z[k, 4] else beyond
             if len(facing) > 0:

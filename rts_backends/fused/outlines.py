@@ -114,21 +114,31 @@ def narrow(start, stop, ends, wanted, kept, counts):
             counts[y] += bits & LISTED != 0
 
 
-@compiled(inline="always")
+# Helpers that are handed arrays have references to them counted, call by call, where the code has branches. So what is
+# done for each direction of a cell stands where the arrays are.
+
+
+@compiled
 def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
+    layers, height, width = row.shape
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
-    bits = ends[y, x] & DIRECTIONS
+    bits, front = ends[y, x] & DIRECTIONS, positions[row[0, y, x], 2]
     leaves = len(exits) > 0 and exits[y, x] >= 0
-    if leaves or _has_chord(row, part, one_part, y, x):
-        own = _gap(positions, row, exits, leaves, y, x)
-        least, m = rules.converging * own * own, 0
+    # The other end of the chord, if any: where the ray leaves, or a second layer of the front's part.
+    second = min(1, layers - 1)
+    back = exits[y, x] if leaves else row[second, y, x]
+    same = layers > 1 if one_part else len(part) > 1 and part[0, y, x] == part[1, y, x]
+    if back >= 0 and (leaves or same):
+        own, m = positions[back, 2] - front, 0
         while OUTWARD[bits, m] >= 0:
             py, px = y + 1 - OUTWARD[bits, m] // 3, x + 1 - OUTWARD[bits, m] % 3
-            if _covered(row, py, px):
-                inner = _gap(positions, row, exits, leaves, py, px)
-                if least <= inner * inner:
-                    return -rules.half, _back(row, exits, leaves, y, x)
+            if 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
+                j = exits[py, px] if leaves else row[second, py, px]
+                if j >= 0:
+                    inner = positions[j, 2] - positions[row[0, py, px], 2]
+                    if rules.converging * own * own <= inner * inner:
+                        return -rules.half, back
             m += 1
     beta, partner = zero, np.int32(-1)
     for m in range(9):
@@ -136,54 +146,22 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
         if n < 0:
             break
         v, u = n // 3 - 1, n % 3 - 1
-        if not _covered(row, y - v, x - u):
+        py, px, qy, qx = y - v, x - u, y - 2 * v, x - 2 * u
+        if not (0 <= py < height and 0 <= px < width and row[0, py, px] >= 0):
             continue
         if partner < 0:
-            beta, partner = rules.half, row[0, y - v, x - u]
-        ratio = _ratio(positions, row, ends, y, x, v, u, rules.flat * extent)
-        if ratio > rules.least:
-            root = (one + two * ratio - ratio * ratio) / (two * ratio * (ratio - one))
-            return min(max(root, zero), rules.largest), row[0, y - v, x - u]
+            beta, partner = rules.half, row[0, py, px]
+        # Where the surface does not go on in this direction, or does not fall, the next may be usable.
+        if not (0 <= qy < height and 0 <= qx < width and row[0, qy, qx] >= 0) or ends[py, px] >> (4 - 3 * v - u) & 1:
+            continue
+        middle = positions[row[0, py, px], 2]
+        slope = middle - positions[row[0, qy, qx], 2]
+        if slope > rules.flat * extent:
+            ratio = (front - middle) / slope
+            if ratio > rules.least:
+                root = (one + two * ratio - ratio * ratio) / (two * ratio * (ratio - one))
+                return min(max(root, zero), rules.largest), row[0, py, px]
     return beta, partner
-
-
-@compiled(inline="always")
-def _has_chord(row, part, one_part, y, x):
-    """Whether the second layer of a cell that has a front is known to be of the front's part."""
-    if one_part:
-        return len(row) > 1 and row[1, y, x] >= 0
-    return len(part) > 1 and part[0, y, x] == part[1, y, x]
-
-
-@compiled(inline="always")
-def _covered(row, y, x):
-    """Whether there is a cell, and a sample in it."""
-    _, height, width = row.shape
-    return 0 <= y < height and 0 <= x < width and row[0, y, x] >= 0
-
-
-@compiled(inline="always")
-def _back(row, exits, leaves, y, x):
-    """The sample at the other end of a cell's chord, or −1: where the ray leaves, or of the second layer."""
-    return exits[y, x] if leaves else row[min(1, len(row) - 1), y, x]
-
-
-@compiled(inline="always")
-def _gap(positions, row, exits, leaves, y, x):
-    """How far the other end of a chord lies behind the front of a cell; NaN, which compares as false, without one."""
-    i, j = row[0, y, x], _back(row, exits, leaves, y, x)
-    return positions[j, 2] - positions[i, 2] if j >= 0 else positions.dtype.type(np.nan)
-
-
-@compiled(inline="always")
-def _ratio(positions, row, ends, y, x, v, u, flat):
-    """The ratio r of `rts.splatting.rims` along a usable direction; 0 where the surface does not go on, or not fall."""
-    zero, py, px = positions.dtype.type(0), y - 2 * v, x - 2 * u
-    if not _covered(row, py, px) or ends[y - v, x - u] >> (4 - 3 * v - u) & 1:
-        return zero
-    middle = positions[row[0, y - v, x - u], 2]
-    slope = middle - positions[row[0, py, px], 2]
-    return (positions[row[0, y, x], 2] - middle) / slope if slope > flat else zero
 
 
 @loop
@@ -270,7 +248,7 @@ def fill(
                 d += 1
 
 
-@compiled(inline="always")
+@compiled
 def _any(ends):
     some = np.uint16(0)
     for x in range(len(ends)):
@@ -281,7 +259,7 @@ def _any(ends):
 # Not handed views of single targets, since to make these takes as long as the work.
 
 
-@compiled(inline="always")
+@compiled
 def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples):
     """List the slopes of the weights of the fronts around a target, and what each gives if none is mixed.
 
@@ -314,7 +292,7 @@ def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, w
     return red, green, blue, alpha, weight
 
 
-@compiled(inline="always")
+@compiled
 def _change(gives, changes, d, total):
     """How the colour of a target changes with its coverage, to which all fronts around it give."""
     zero, one = changes.dtype.type(0), changes.dtype.type(1)
@@ -326,13 +304,13 @@ def _change(gives, changes, d, total):
         _clear(gives, d)
 
 
-@compiled(inline="always")
+@compiled
 def _clear(gives, d):
     for n in range(9):
         gives[d, n] = NOTHING
 
 
-@compiled(inline="always")
+@compiled
 def _change_mixed(changes, d, sums, m):
     """How the colour of a mixed target changes with the coverage of its buffers, and whether these may change."""
     zero, one = sums.dtype.type(0), sums.dtype.type(1)
@@ -357,7 +335,7 @@ def _list(gives, d, ranges, m, front, surface):
                 gives[d, n] = NOTHING
 
 
-@compiled(inline="always")
+@compiled
 def _part(gives, d, part, ends, y, x):
     """Sources of other parts than the target's move as their own outlines, if any: there may be a gap between."""
     n = 0
@@ -368,7 +346,7 @@ def _part(gives, d, part, ends, y, x):
             n += 1
 
 
-@compiled(inline="always")
+@compiled
 def _outline(t_positions, row, beta, partner, y, x, axis):
     """The motion v̂ of the outline beside a cell, along an axis."""
     b, own = beta[y, x], t_positions[row[0, y, x], axis]
@@ -423,16 +401,17 @@ def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_posi
 @loop
 def _pull(start, stop, row, outlines, border, g, first, g_positions):
     """`pull` of every other band of rows, from band `first` on: these have no sample in common."""
-    width, zero = g.shape[1], g_positions.dtype.type(0)
+    beta, partner, offsets, columns, gives, slopes, changes = outlines
+    arrays = beta, partner, offsets, columns, gives, slopes, changes
     for band in range(start, stop):
         top = (2 * band + first) * BAND
-        _pull_rows(border + top, border + min(top + BAND, len(g)), row, outlines, border, g, width, zero, g_positions)
+        _pull_rows(border + top, border + min(top + BAND, len(g)), row, *arrays, border, g, g_positions)
 
 
-@compiled(inline="always")
-def _pull_rows(top, bottom, row, outlines, border, g, width, zero, g_positions):
+@compiled
+def _pull_rows(top, bottom, row, beta, partner, offsets, columns, gives, slopes, changes, border, g, g_positions):
     """`pull` of some rows."""
-    _, _, offsets, columns, gives, slopes, changes = outlines
+    width, zero = g.shape[1], g_positions.dtype.type(0)
     for y in range(top, bottom):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d]
@@ -457,21 +436,21 @@ def _pull_rows(top, bottom, row, outlines, border, g, width, zero, g_positions):
                             g_positions[i, 1] -= h_y
                             joined_x, joined_y = joined_x + h_x, joined_y + h_y
                         else:
-                            _lead(g_positions, row, outlines, y - v, x - u, h_x, h_y)
+                            _lead(g_positions, row, beta, partner, y - v, x - u, h_x, h_y)
                     n += 1
             if joined_x != zero or joined_y != zero:
                 i = row[0, y, x]
                 g_positions[i, 0] += joined_x
                 g_positions[i, 1] += joined_y
-                _lead(g_positions, row, outlines, y, x, joined_x, joined_y)
+                _lead(g_positions, row, beta, partner, y, x, joined_x, joined_y)
 
 
 @compiled(inline="always")
-def _lead(g_positions, row, outlines, y, x, g_x, g_y):
+def _lead(g_positions, row, beta, partner, y, x, g_x, g_y):
     """Hand on the gradient of what the outline beside a cell moves more than its front: to that, and to its partner."""
-    b = outlines.beta[y, x]
+    b = beta[y, x]
     if b != 0:
-        i, j = row[0, y, x], outlines.partner[y, x]
+        i, j = row[0, y, x], partner[y, x]
         g_positions[i, 0] += b * g_x
         g_positions[i, 1] += b * g_y
         g_positions[j, 0] -= b * g_x

@@ -70,7 +70,7 @@ def _exp(x):
 # Helpers get views, so that the compiler knows that no index is negative: it would have to count from the end.
 
 
-@compiled(inline="always")
+@compiled
 def slot(s, k, y, size):
     """The slot of layer k in row y ≥ −2."""
     start = (3 * k + (y + 3) % 3) * size
@@ -84,7 +84,7 @@ def tile(width, t):
     return width * t // count, width * (t + 1) // count - width * t // count
 
 
-@compiled(inline="always")
+@compiled
 def busy(states, y, first, count, least):
     """Whether some target of a row is of at least this state."""
     height, width = states.shape
@@ -96,7 +96,7 @@ def busy(states, y, first, count, least):
     return most >= least
 
 
-@compiled(inline="always")
+@compiled
 def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
     """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
@@ -126,7 +126,7 @@ def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
                 s[WX + (3 * axis + u) * PITCH + j] = peak * exp(-(d * d) * scale)
 
 
-@compiled(inline="always")
+@compiled
 def add_row(to, s, v, count):
     """Add a source row's splats to a buffer's row; v leads from source to target; target j lies over source j + 1."""
     wy = s[WY + (v + 1) * PITCH :]
@@ -137,7 +137,7 @@ def add_row(to, s, v, count):
             to[p] += w0 * s[p] + w1 * s[p + 1] + w2 * s[p + 2]
 
 
-@compiled(inline="always")
+@compiled
 def normalised_sums(total, sources, layers, y, count):
     """Both buffers of target row y: colours over the weight, taken as at least one, and the weight."""
     one = total.dtype.type(1)

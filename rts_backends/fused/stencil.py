@@ -34,7 +34,7 @@ X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 """Places in a tangent's slot, after five planes D: w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
 
 
-@compiled(inline="always")
+@compiled
 def load_around(sources, loaded, positions, rgba, row, y, first, count, scale, peak, gamma):
     """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; returns the first row that was not."""
     start = y + 2
@@ -81,7 +81,7 @@ def _copy(image, rgba, cells, states, most):
             image[x, 0], image[x, 1], image[x, 2], image[x, 3] = rgba[i, 0], rgba[i, 1], rgba[i, 2], rgba[i, 3]
 
 
-@compiled(inline="always")
+@compiled
 def add_adjoint(to, total, g, count):
     """Adjoint of a buffer's sums from that of its normalised colours; zero for the weight where it is below one."""
     zero, one = to.dtype.type(0), to.dtype.type(1)
@@ -95,7 +95,7 @@ def add_adjoint(to, total, g, count):
         to[ONE + j] = zero if weight < one else -dot * over
 
 
-@compiled(inline="always")
+@compiled
 def adjoint_row(to, total, g, layers, count):
     """Adjoints of both buffers' sums in a row, from those of the image at `g`, which are overwritten."""
     one = to.dtype.type(1)
@@ -111,7 +111,7 @@ def adjoint_row(to, total, g, layers, count):
     add_adjoint(to, total, g, count)
 
 
-@compiled(inline="always")
+@compiled
 def load_image(s, image, states, least, border, y, first, count):
     """Cells of an image as planes, zero beyond it and at targets whose state is below `least`."""
     height, width, _ = image.shape
@@ -126,7 +126,7 @@ def load_image(s, image, states, least, border, y, first, count):
                 s[c * PITCH + j] = s.dtype.type(0)
 
 
-@compiled(inline="always")
+@compiled
 def _any(planes, count):
     """Whether any number of four planes is not zero."""
     some = False
@@ -136,7 +136,7 @@ def _any(planes, count):
     return some
 
 
-@compiled(inline="always")
+@compiled
 def gather(to, s, above, level, below, count):
     """Sums of w, w u and w v over nine targets' adjoints: for colour the first, and the three along (colour, 1).
 
@@ -195,7 +195,7 @@ def pull(start, stop, positions, rgba, row, scale, peak, gamma, states, border, 
                 scatter(g_positions, g_rgba, row[k, y - 1], left, found, s, slope, count)
 
 
-@compiled(inline="always")
+@compiled
 def scatter(g_positions, g_rgba, row, left, found, s, slope, count):
     """Hand what a row of cells has gathered to their samples."""
     for j in range(count):
