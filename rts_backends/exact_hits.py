@@ -1,4 +1,4 @@
-"""Hits of a rasterizer that snaps vertices, settled exactly: each goes to the triangle that truly covers the pixel."""
+"""Hits of a rasterizer that snaps vertices, made exact: each goes to the triangle that truly covers the pixel."""
 
 from __future__ import annotations
 
@@ -77,8 +77,46 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     return inside, min(ea, eb, ec) / total, z, ea / total, eb / total
 
 
+@compiled
+def holds(triangles, count, t):
+    """True if a triangle is among the first `count` of a list."""
+    same = False
+    for n in range(count):
+        same |= triangles[n] == t
+    return same
+
+
+@compiled
+def _walk(t, x, y, hits, count, scene, around, offsets, members):
+    """Go from triangle to triangle towards one that covers a pixel and is not among the first `count` hits.
+
+    Returns whether there is one, the triangle, its depth and two barycentrics.
+    """
+    inside, least, z, a, b = look(t, x, y, *scene)
+    for _ in range(WALK):
+        if inside:
+            break
+        # The best of the triangles around this one; none better means that the surface ends here.
+        best, best_least, best_z, best_a, best_b, best_inside = t, least, z, a, b, False
+        for c in range(3):
+            v = around[t, c]
+            for at in range(offsets[v], offsets[v + 1]):
+                s = members[at]
+                inside_s, least_s, z_s, a_s, b_s = look(s, x, y, *scene)
+                # Triangles among the hits have hits of their own; so coplanar layers all stay.
+                if holds(hits, count, s):
+                    inside_s, least_s = False, -np.inf
+                if (inside_s and not best_inside) or (inside_s == best_inside and least_s > best_least):
+                    best, best_least, best_z = s, least_s, z_s
+                    best_a, best_b, best_inside = a_s, b_s, inside_s
+        if best == t:
+            break
+        t, least, z, a, b, inside = best, best_least, best_z, best_a, best_b, best_inside
+    return inside, t, z, a, b
+
+
 @loop
-def settle(
+def correct(
     first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
 ):  # fmt: skip
     """Correct the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop triangles that miss.
@@ -86,52 +124,26 @@ def settle(
     `around` are the faces by place, `offsets` and `members` their `corner_lists`.
     """
     layers, _, width = triangle_ids.shape
-    corners = np.empty((3, 4))
-    found, found_z, found_b = np.empty(layers, np.int32), np.empty(layers), np.empty((layers, 2))
+    scene = matrix, row, keep, vertices, faces, np.empty((3, 4))
+    hits, hit_depths, hit_params = np.empty(layers, np.int32), np.empty(layers), np.empty((layers, 2))
     for j in range(first, last):
-        y = j + 0.5
         for i in range(width):
-            x, count = i + 0.5, 0
+            count = 0
             for k in range(layers):
                 t = triangle_ids[k, j, i]
                 if t < 0:
                     break
-                inside, least, z, a, b = look(t, x, y, matrix, row, keep, vertices, faces, corners)
-                for _ in range(WALK):
-                    if inside:
-                        break
-                    # The best of the triangles around this one; none better means that the surface ends here.
-                    best, best_least, best_z, best_a, best_b, best_inside = t, least, z, a, b, False
-                    for c in range(3):
-                        v = around[t, c]
-                        for at in range(offsets[v], offsets[v + 1]):
-                            s = members[at]
-                            inside_s, least_s, z_s, a_s, b_s = look(
-                                s, x, y, matrix, row, keep, vertices, faces, corners
-                            )
-                            # Triangles that were found already have hits of their own; so coplanar layers all stay.
-                            for n in range(count):
-                                if found[n] == s:
-                                    inside_s, least_s = False, -np.inf
-                            if (inside_s and not best_inside) or (inside_s == best_inside and least_s > best_least):
-                                best, best_least, best_z = s, least_s, z_s
-                                best_a, best_b, best_inside = a_s, b_s, inside_s
-                    if best == t:
-                        break
-                    t, least, z, a, b, inside = best, best_least, best_z, best_a, best_b, best_inside
-                known = not inside
-                for n in range(count):
-                    known = known or found[n] == t
-                if known:
+                inside, t, z, a, b = _walk(t, i + 0.5, j + 0.5, hits, count, scene, around, offsets, members)
+                if not inside or holds(hits, count, t):
                     continue
                 at = count
-                while at > 0 and (z < found_z[at - 1] or (z == found_z[at - 1] and t < found[at - 1])):
-                    found[at], found_z[at], found_b[at] = found[at - 1], found_z[at - 1], found_b[at - 1]
+                while at > 0 and (z < hit_depths[at - 1] or (z == hit_depths[at - 1] and t < hits[at - 1])):
+                    hits[at], hit_depths[at], hit_params[at] = hits[at - 1], hit_depths[at - 1], hit_params[at - 1]
                     at -= 1
-                found[at], found_z[at], found_b[at, 0], found_b[at, 1] = t, z, a, b
+                hits[at], hit_depths[at], hit_params[at, 0], hit_params[at, 1] = t, z, a, b
                 count += 1
             for k in range(layers):
-                triangle_ids[k, j, i] = found[k] if k < count else -1
-                depths[k, j, i] = found_z[k] if k < count else 0
-                barycentrics[k, j, i, 0] = found_b[k, 0] if k < count else 0
-                barycentrics[k, j, i, 1] = found_b[k, 1] if k < count else 0
+                triangle_ids[k, j, i] = hits[k] if k < count else -1
+                depths[k, j, i] = hit_depths[k] if k < count else 0
+                barycentrics[k, j, i, 0] = hit_params[k, 0] if k < count else 0
+                barycentrics[k, j, i, 1] = hit_params[k, 1] if k < count else 0

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from rts import InputError, namespace
 from rts.plugin_api.arrays import Array, unit
 from rts.plugin_api.operations import Operation, combine
-from rts.plugin_api.threads import parallel, read_only
 
 COLLAPSED = 1e-4
 """A tangent is taken for zero, and the normal from the mixed derivative, where it is less than this share of the
 other."""
-SHARES = 4
-"""Parts of the samples whose gradients are added up by themselves: a fixed number, so that sums do not depend on how
-many threads there are."""
 
 
 def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
@@ -71,11 +69,7 @@ def _specified_normals(rows: Array, params: Array, patch: Array, table: Array) -
     return unit(xp.linalg.cross(first, second))
 
 
-def _nets(rows: np.ndarray, operands: Sequence[np.ndarray]) -> np.ndarray:
-    """The control points (n, 16, C) of all patches; operands that do not fit one another are refused."""
-    from rts_surfaces import bicubic_loops
-
-    _, params, patch, table = operands
+def _check(rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray) -> None:
     if params.shape != (len(patch), 2) or table.shape[1] != 16:
         raise InputError(
             f"params and patches have shapes {params.shape} and {patch.shape}, the table has {table.shape}; expected "
@@ -86,98 +80,34 @@ def _nets(rows: np.ndarray, operands: Sequence[np.ndarray]) -> np.ndarray:
             raise InputError(
                 f"samples refer to {what} {named.min()} to {named.max()} of {count}; sample this surface anew"
             )
-    nets = np.empty((len(table), 16, rows.shape[1]), rows.dtype)
-    parallel(bicubic_loops.gather, len(table), rows, table, nets, work=50 * len(table))
-    return nets
-
-
-def _shares(nets: np.ndarray) -> np.ndarray:
-    """Zeros (SHARES, n, 16, C) to add gradients to."""
-    return np.zeros((SHARES, *nets.shape), nets.dtype)
 
 
 def _value_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, ...]:
     return params[0], rows[1]
 
 
-def _sums(rows: np.ndarray, operands: Sequence[np.ndarray], out: np.ndarray) -> None:
-    from rts_surfaces import bicubic_loops
+def _value_loops() -> tuple[Callable, Callable, Callable]:
+    from rts_surfaces import bicubic_loops as loops
 
-    _, params, patch, _ = operands
-    parallel(bicubic_loops.values, len(out), _nets(rows, operands), patch, params, out, work=30 * len(out))
-
-
-def _values(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
-    _sums(operands[0], operands, out)
-
-
-def _push_values(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray | None], out: np.ndarray) -> None:
-    _sums(read_only(tangents[0]), operands, out)  # pyright: ignore[reportArgumentType]  # Only rows have tangents.
-
-
-def _pull_values(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
-    from rts_surfaces import bicubic_loops
-
-    if results[0] is not None:
-        _, params, patch, table = operands
-        shares = _shares(_nets(results[0], operands))
-        parallel(bicubic_loops.pull_values, len(shares), patch, params, read_only(g), shares, work=30 * len(g))
-        bicubic_loops.scatter(table, shares, results[0])
+    return loops.values, loops.push_values, loops.pull_values
 
 
 def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, ...]:
     return params[0], 3
 
 
-def _normals(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
-    from rts_surfaces import bicubic_loops
+def _normal_loops() -> tuple[Callable, Callable, Callable]:
+    from rts_surfaces import bicubic_loops as loops
 
-    rows, params, patch, _ = operands
-    arguments = _nets(rows, operands), patch, params, rows.dtype.type(COLLAPSED)
-    parallel(bicubic_loops.normals, len(out), *arguments, out, work=60 * len(out))
-
-
-def _push_normals(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray | None], out: np.ndarray) -> None:
-    from rts_surfaces import bicubic_loops
-
-    rows, params, patch, _ = operands
-    moved = _nets(read_only(tangents[0]), operands)  # pyright: ignore[reportArgumentType]  # Only rows have tangents.
-    arguments = _nets(rows, operands), moved, patch, params, rows.dtype.type(COLLAPSED)
-    parallel(bicubic_loops.push_normals, len(out), *arguments, out, work=120 * len(out))
+    normals, push, pull = loops.normals, loops.push_normals, loops.pull_normals
+    return partial(normals, COLLAPSED), partial(push, COLLAPSED), partial(pull, COLLAPSED)
 
 
-def _pull_normals(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
-    from rts_surfaces import bicubic_loops
-
-    if results[0] is not None:
-        rows, params, patch, table = operands
-        nets = _nets(rows, operands)
-        shares = _shares(nets)
-        arguments = nets, patch, params, rows.dtype.type(COLLAPSED), read_only(g), shares
-        parallel(bicubic_loops.pull_normals, len(shares), *arguments, work=80 * len(g))
-        bicubic_loops.scatter(table, shares, results[0])
-
-
-VALUES = Operation(
-    "rts_surfaces.bicubic_values",
-    _specified_values,
-    ranks=(2, 2, 1, 2),
-    shape=_value_shape,
-    forward=_values,
-    push=_push_values,
-    pull=_pull_values,
-    packed=(1, 2),
-    packed_result=True,
+_PACKED: dict[str, Any] = {"packed": (1, 2), "packed_result": True}
+VALUES = Operation.of_loops(
+    "rts_surfaces.bicubic_values", _specified_values, (2, 2, 1, 2), _value_shape, _value_loops, _check, **_PACKED
 )
-NORMALS = Operation(
-    "rts_surfaces.bicubic_normals",
-    _specified_normals,
-    ranks=(2, 2, 1, 2),
-    shape=_normal_shape,
-    forward=_normals,
-    push=_push_normals,
-    pull=_pull_normals,
-    packed=(1, 2),
-    packed_result=True,
+NORMALS = Operation.of_loops(
+    "rts_surfaces.bicubic_normals", _specified_normals, (2, 2, 1, 2), _normal_shape, _normal_loops, _check, **_PACKED
 )
 """Both on rows, params, patch and table."""

@@ -12,10 +12,14 @@ from functools import partial
 import numpy as np
 
 from rts.plugin_api import loops
+from rts.plugin_api.threads import parallel
 
 compiled = partial(loops.compiled, fastmath={"contract"})
 loop = partial(loops.loop, fastmath={"contract"})
 
+SHARES = 4
+"""Parts of the samples whose gradients are added up by themselves: a fixed number, so that sums do not depend on how
+many threads there are."""
 BEZIER = np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 """Coefficients of 1, t, t², t³ (rows) from Bézier control points (columns)."""
 
@@ -74,6 +78,66 @@ def expansions(start, stop, powers, patch, params, out):
 # ------------------------------------------------------------------------------------- values and gradients
 
 
+def values(rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
+    """Fill `out` (N, C) with patches of control points (V, C) at samples."""
+    parallel(_sum_values, len(out), _nets(rows, table), patch, params, out, work=30 * len(out))
+
+
+def push_values(_: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray) -> None:
+    """Fill the last array (N, C) with their tangent along that of the control points."""
+    values(moved[0], params, patch, table, moved[1])
+
+
+def pull_values(
+    _: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, g: np.ndarray, result: np.ndarray
+) -> None:
+    """Add to the gradient (V, C) of the control points, from that (N, C) of the values."""
+    found = np.zeros((SHARES, len(table), 16, g.shape[1]), g.dtype)
+    parallel(_pull_shares, SHARES, patch, params, g, found, work=30 * len(g))
+    _scatter(table, found, result)
+
+
+def normals(
+    collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray
+) -> None:
+    """Fill `out` (N, 3) with unit normals; tangents below this share of the other one are taken for zero."""
+    given = _nets(rows, table), patch, params, rows.dtype.type(collapsed)
+    parallel(_fill_normals, len(out), *given, out, work=60 * len(out))
+
+
+def push_normals(
+    collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray
+) -> None:
+    """Fill the last array (N, 3) with their tangent along that of the control points."""
+    tangents, out = moved
+    given = _nets(rows, table), _nets(tangents, table), patch, params, rows.dtype.type(collapsed)
+    parallel(_move_normals, len(out), *given, out, work=120 * len(out))
+
+
+def pull_normals(
+    collapsed: float,
+    rows: np.ndarray,
+    params: np.ndarray,
+    patch: np.ndarray,
+    table: np.ndarray,
+    g: np.ndarray,
+    result: np.ndarray,
+) -> None:
+    """Add to the gradient (V, 3) of the control points, from that (N, 3) of the normals."""
+    nets = _nets(rows, table)
+    found = np.zeros((SHARES, *nets.shape), nets.dtype)
+    given = nets, patch, params, rows.dtype.type(collapsed), g, found
+    parallel(_pull_normal_shares, SHARES, *given, work=80 * len(g))
+    _scatter(table, found, result)
+
+
+def _nets(rows: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """The control points (n, 16, C) of all patches."""
+    nets = np.empty((len(table), 16, rows.shape[1]), rows.dtype)
+    parallel(_gather, len(table), rows, table, nets, work=50 * len(table))
+    return nets
+
+
 @compiled
 def _bernstein(t, value, slope):
     """The cubic Bernstein polynomials (4,) and their derivatives, also beyond [0, 1]."""
@@ -86,7 +150,7 @@ def _bernstein(t, value, slope):
 
 
 @loop
-def gather(start, stop, rows, table, out):
+def _gather(start, stop, rows, table, out):
     """Fill `out` (n, 16, C) with the rows (V, C) of each patch."""
     for n in range(start, stop):
         for k in range(16):
@@ -95,8 +159,8 @@ def gather(start, stop, rows, table, out):
 
 
 @loop
-def scatter(table, found, out):
-    """Add to `out` (V, C) the gradients of patches in all shares of `found` (S, n, 16, C)."""
+def _scatter(table, found, out):
+    """Add to `out` (V, C) the gradients of patches in all shares (S, n, 16, C)."""
     for n in range(len(table)):
         for k in range(16):
             for c in range(out.shape[1]):
@@ -105,7 +169,7 @@ def scatter(table, found, out):
 
 
 @loop
-def values(start, stop, nets, patch, params, out):
+def _sum_values(start, stop, nets, patch, params, out):
     """Fill `out` (N, C) with sums of control points (n, 16, C) of patches (N,) at params (N, 2)."""
     a, b, none = np.empty(4, nets.dtype), np.empty(4, nets.dtype), np.empty(4, nets.dtype)
     for n in range(start, stop):
@@ -121,8 +185,8 @@ def values(start, stop, nets, patch, params, out):
 
 
 @loop
-def pull_values(start, stop, patch, params, g, found):
-    """Add to `found` (S, n, 16, C), for each of S shares of the samples, the pullback of g (N, C) to control points."""
+def _pull_shares(start, stop, patch, params, g, found):
+    """Add to `found` (S, n, 16, C), for each of S shares of the samples, what g (N, C) pulls back to control points."""
     for share in range(start, stop):
         _pull_values(*_share(share, len(found), len(patch)), patch, params, g, found[share])
 
@@ -202,7 +266,7 @@ def _unit_product(work, normal):
 
 
 @loop
-def normals(start, stop, nets, patch, params, collapsed, out):
+def _fill_normals(start, stop, nets, patch, params, collapsed, out):
     """Fill `out` (N, 3) with unit normals; `collapsed` says which tangents are none, relative to the other."""
     work = np.zeros((7, 4), nets.dtype)
     for n in range(start, stop):
@@ -211,7 +275,7 @@ def normals(start, stop, nets, patch, params, collapsed, out):
 
 
 @loop
-def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
+def _move_normals(start, stop, nets, tangents, patch, params, collapsed, out):
     """Fill `out` (N, 3) with the derivatives of unit normals along tangents (n, 16, 3) of control points."""
     work, moved, normal = np.zeros((7, 4), nets.dtype), np.zeros((7, 4), nets.dtype), np.empty(3, nets.dtype)
     for n in range(start, stop):
@@ -236,8 +300,8 @@ def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
 
 
 @loop
-def pull_normals(start, stop, nets, patch, params, collapsed, g, found):
-    """Add to `found` (S, n, 16, 3), for each of S shares of the samples, the pullback of g (N, 3) to control points."""
+def _pull_normal_shares(start, stop, nets, patch, params, collapsed, g, found):
+    """Add to `found` (S, n, 16, 3), for each of S shares of the samples, what g (N, 3) pulls back to control points."""
     for share in range(start, stop):
         _pull_normals(*_share(share, len(found), len(patch)), nets, patch, params, collapsed, g, found[share])
 

@@ -17,18 +17,24 @@ def bounds(nets, out):
         out[n] = 0
         for i in range(4):
             for j in range(4):
-                uu, uv, vv = 0.0, 0.0, 0.0
-                for c in range(3):
-                    if i < 2:
-                        uu += (nets[n, i, j, c] - 2 * nets[n, i + 1, j, c] + nets[n, i + 2, j, c]) ** 2
-                    if j < 2:
-                        vv += (nets[n, i, j, c] - 2 * nets[n, i, j + 1, c] + nets[n, i, j + 2, c]) ** 2
-                    if i < 3 and j < 3:
-                        low, high = nets[n, i, j, c], nets[n, i + 1, j, c]
-                        uv += (low - high - nets[n, i, j + 1, c] + nets[n, i + 1, j + 1, c]) ** 2
+                uu, uv, vv = _differences(nets[n], i, j)
                 out[n, 0] = max(out[n, 0], 6 * math.sqrt(uu))
                 out[n, 1] = max(out[n, 1], 9 * math.sqrt(uv))
                 out[n, 2] = max(out[n, 2], 6 * math.sqrt(vv))
+
+
+@compiled
+def _differences(net, i, j):
+    """Squares of the lengths of second differences from a control point on, where there are: in u, in u and v, in v."""
+    uu, uv, vv = 0.0, 0.0, 0.0
+    for c in range(3):
+        if i < 2:
+            uu += (net[i, j, c] - 2 * net[i + 1, j, c] + net[i + 2, j, c]) ** 2
+        if j < 2:
+            vv += (net[i, j, c] - 2 * net[i, j + 1, c] + net[i, j + 2, c]) ** 2
+        if i < 3 and j < 3:
+            uv += (net[i, j, c] - net[i + 1, j, c] - net[i, j + 1, c] + net[i + 1, j + 1, c]) ** 2
+    return uu, uv, vv
 
 
 @compiled
@@ -83,60 +89,65 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
         limits: (5,): residual in pixels, largest number of steps on a patch, largest step in params, how far beyond the
             edge, how many edges may be crossed.
     """
-    residual, steps, largest, beyond, crossings = limits[0], int(limits[1]), limits[2], limits[3], int(limits[4])
     for y in range(start, stop):
         for x in range(row.shape[1]):
             n = row[y, x]
             if n < 0:
                 continue
-            row[y, x] = -1
-            patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
-            dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
-            square, step, crossed = dx * dx + dy * dy + dz * dz, 0, 0
+            met, z = _meet(n, powers, bounds, across, flips, ids, params, origins, directions, spread, limits)
+            row[y, x], depth[y, x] = n if met else -1, z
+            if not met:
+                params[n, 0], params[n, 1] = 0, 0
+
+
+@compiled
+def _meet(n, powers, bounds, across, flips, ids, params, origins, directions, spread, limits):
+    """Move the params of a sample until its point lies on its ray; whether that is possible, and the depth."""
+    residual, steps, largest, beyond, crossings = limits[0], int(limits[1]), limits[2], limits[3], int(limits[4])
+    patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
+    dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+    square, step, crossed = dx * dx + dy * dy + dz * dz, 0, 0
+    out_u, out_v = u, v
+    while True:
+        p, bound = powers[patch], bounds[patch]
+        sx, ax, bx = first(p[0], u, v)
+        sy, ay, by = first(p[1], u, v)
+        sz, az, bz = first(p[2], u, v)
+        # From the point to the ray's origin.
+        rx, ry, rz = origins[n, 0] - sx, origins[n, 1] - sy, origins[n, 2] - sz
+        z = -(rx * dx + ry * dy + rz * dz) / square
+        near = residual * abs(spread[0] + spread[1] * z)
+        cx, cy, cz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
+        met = cx * cx + cy * cy + cz * cz <= near * near * square
+        # Where the ray meets the tangent plane, by Cramer's rule.
+        hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+        determinant = ax * hx + ay * hy + az * hz
+        scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
+        ended = met or step == steps or not determinant * determinant > 1e-24 * scale
+        if not ended:
+            qx, qy, qz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+            du = (rx * hx + ry * hy + rz * hz) / determinant
+            dv = (dx * qx + dy * qy + dz * qz) / determinant
+            size = max(abs(du), abs(dv))
+            if size > largest:
+                du, dv = du * largest / size, dv * largest / size
+            else:
+                off = bound[0] * du * du + 2 * bound[1] * abs(du * dv) + bound[2] * dv * dv
+                if off <= 2 * near:
+                    met, z = True, (bx * qx + by * qy + bz * qz) / determinant
+            u, v, step = u + du, v + dv, step + 1
+        if met and -beyond <= u <= 1 + beyond and -beyond <= v <= 1 + beyond:
+            ids[n, 0], params[n, 0], params[n, 1] = patch, u, v
+            return True, z
+        if u < 0 or u > 1 or v < 0 or v > 1:
             out_u, out_v = u, v
-            while True:
-                p, bound = powers[patch], bounds[patch]
-                sx, ax, bx = first(p[0], u, v)
-                sy, ay, by = first(p[1], u, v)
-                sz, az, bz = first(p[2], u, v)
-                # From the point to the ray's origin.
-                rx, ry, rz = origins[n, 0] - sx, origins[n, 1] - sy, origins[n, 2] - sz
-                z = -(rx * dx + ry * dy + rz * dz) / square
-                near = residual * abs(spread[0] + spread[1] * z)
-                cx, cy, cz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
-                met = cx * cx + cy * cy + cz * cz <= near * near * square
-                # Where the ray meets the tangent plane, by Cramer's rule.
-                hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
-                determinant = ax * hx + ay * hy + az * hz
-                scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
-                ended = met or step == steps or not determinant * determinant > 1e-24 * scale
-                if not ended:
-                    qx, qy, qz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
-                    du = (rx * hx + ry * hy + rz * hz) / determinant
-                    dv = (dx * qx + dy * qy + dz * qz) / determinant
-                    size = max(abs(du), abs(dv))
-                    if size > largest:
-                        du, dv = du * largest / size, dv * largest / size
-                    else:
-                        off = bound[0] * du * du + 2 * bound[1] * abs(du * dv) + bound[2] * dv * dv
-                        if off <= 2 * near:
-                            met, z = True, (bx * qx + by * qy + bz * qz) / determinant
-                    u, v, step = u + du, v + dv, step + 1
-                if met and -beyond <= u <= 1 + beyond and -beyond <= v <= 1 + beyond:
-                    row[y, x], depth[y, x] = n, z
-                    ids[n, 0], params[n, 0], params[n, 1] = patch, u, v
-                    break
-                if u < 0 or u > 1 or v < 0 or v > 1:
-                    out_u, out_v = u, v
-                if met or ended:
-                    if crossed == crossings:
-                        break
-                    # Beside a fold the far side of the edge attracts: each time the start moves farther into the patch.
-                    patch, u, v = _crossed(across, flips, patch, out_u, out_v, min(beyond * 2.0**crossed, 0.5))
-                    if patch < 0:
-                        break
-                    step, crossed, out_u, out_v = 0, crossed + 1, u, v
-                else:
-                    u, v = min(max(u, -0.25), 1.25), min(max(v, -0.25), 1.25)
-            if row[y, x] < 0:
-                depth[y, x], params[n, 0], params[n, 1] = 0, 0, 0
+        if met or ended:
+            if crossed == crossings:
+                return False, 0.0
+            # Beside a fold the far side of the edge attracts: each time the start moves farther into the patch.
+            patch, u, v = _crossed(across, flips, patch, out_u, out_v, min(beyond * 2.0**crossed, 0.5))
+            if patch < 0:
+                return False, 0.0
+            step, crossed, out_u, out_v = 0, crossed + 1, u, v
+        else:
+            u, v = min(max(u, -0.25), 1.25), min(max(v, -0.25), 1.25)

@@ -122,6 +122,18 @@ def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
 
 
 @compiled
+def _square(faces, params, t, i, j, rs, rt, frame, base):
+    """Both triangles of a cell of a tile; the number of the next."""
+    for half in range(2):
+        for k in range(3):
+            # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
+            c = (k + 2 * half) % 4
+            x, y = i + (1 if c == 1 or c == 2 else 0), j + (1 if c >= 2 else 0)
+            _square_point(faces, params, t + half, k, x, y, rs, rt, frame, base)
+    return t + 2
+
+
+@compiled
 def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
     """The point number m, from 1 on, of the ring within a tile, along a side."""
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
@@ -161,13 +173,7 @@ def quadrilaterals(
             continue
         for i in range(1, rs - 1):
             for j in range(1, rt - 1):
-                for half in range(2):
-                    for k in range(3):
-                        # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
-                        c = (k + 2 * half) % 4
-                        x, y = i + (1 if c == 1 or c == 2 else 0), j + (1 if c >= 2 else 0)
-                        _square_point(faces, params, t, k, x, y, rs, rt, frame, base)
-                    t += 1
+                t = _square(faces, params, t, i, j, rs, rt, frame, base)
         for side in range(4):
             e, count = sides[n, side], rs if side % 2 == 0 else rt
             cuts = edges[e]

@@ -255,6 +255,37 @@ def test_its_derivatives_are_its_own_in_both_modes_and_see_what_was_kept(target,
     assert ("push", True) in calls
 
 
+def test_loops_get_arrays_one_by_one_that_are_contiguous_and_read_only():
+    seen, asked = [], []
+
+    def noting(results):
+        return lambda *arrays: seen.append((arrays[:-results], arrays[-results:]))
+
+    def loops():
+        asked.append(True)
+        return noting(1), noting(1), noting(2)
+
+    def check(x, scale):
+        if len(scale) != 3:
+            raise rts.InputError("scale is not of 3")
+
+    operation = Operation.of_loops(
+        "tests.loops", CLAMP.specification, (2, 1), CLAMP.shape, loops, check, differentiable=2
+    )
+    assert not asked and operation.differentiable == 2
+    x, scale = operands()
+    operation.push_on_host((x, scale), [x.T.copy().T[None], None], np.empty((1, 6, 3)), None, {})
+    (_, _, moved, none), (out,) = seen.pop()
+    assert moved.flags.c_contiguous and not moved.flags.writeable and none is None and out.flags.writeable
+    operation.pull_on_host((x, scale), x.T.copy().T, [None, out[0]], None, {})
+    (_, _, g), results = seen.pop()
+    assert g.flags.c_contiguous and not g.flags.writeable and results[0] is None and results[1].flags.writeable
+    operation.pull_on_host((x, scale), x, [None, None], None, {})
+    assert not seen
+    with pytest.raises(rts.InputError, match="scale is not of 3"):
+        operation.forward((x, scale[:2]), out)
+
+
 def test_torch_checks_it_to_second_order():
     torch = pytest.importorskip("torch")
     given = [torch.tensor(x, requires_grad=True) for x in operands()]

@@ -207,3 +207,32 @@ def test_the_version_is_that_of_the_distribution():
     assert rts.__version__ == version("rasterize-then-splat")
     assert f"version: {rts.__version__}" in (ROOT / "CITATION.cff").read_text()
     assert sys.modules["rts"].__file__ == str(FILES["rts"])
+
+
+BLOCKS = (ast.For, ast.While, ast.If, ast.With, ast.Try)
+
+
+def nesting(nodes, depth=0):
+    """How deep blocks are nested in these statements; `elif` is as deep as its `if`, functions within count apart."""
+    deepest = depth
+    for node in nodes:
+        if not isinstance(node, BLOCKS):
+            continue
+        inside = [*node.body, *getattr(node, "finalbody", [])]
+        inside += [n for handler in getattr(node, "handlers", []) for n in handler.body]
+        beside = getattr(node, "orelse", [])
+        follows = isinstance(node, ast.If) and len(beside) == 1 and isinstance(beside[0], ast.If)
+        deepest = max(deepest, nesting(inside, depth + 1), nesting(beside, depth if follows else depth + 1))
+    return deepest
+
+
+def test_no_function_nests_deeper_than_four_blocks():
+    lines = ("for a in b:", " if a:", "  pass", " elif b:", "  while b:", "   with a:", "    try:", "     b")
+    five = ast.parse("\n".join((*lines, "    finally:", "     c")))
+    assert nesting(five.body) == 5
+    deep = []
+    for module, path in FILES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and nesting(node.body) > 4:
+                deep.append(f"{module}.{node.name}")
+    assert not deep

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rts.arrays.array_functions import described, from_numbers, shape_of
 from rts.arrays.engines import constants, engine_of, exemplar, namespace
 from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.operations.operation import Arrays, Operation, Some
+from rts.operations.operation import Operation
 from rts.operations.take import take
 
 
@@ -92,48 +94,28 @@ def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...]
     return weights[0], rows[1]
 
 
-def _columns(operands: Arrays, column: int, count: int, affine: bool) -> Arrays:
-    """The operands, after a check that ids and weights have the columns used."""
-    _, weights, ids = operands
+def _check(rows: np.ndarray, weights: np.ndarray, ids: np.ndarray, *, column: int, count: int, affine: bool) -> None:
+    """Refuse ids and weights that lack columns that are used."""
     if len(ids) != len(weights) or not 0 <= column <= ids.shape[1] - count or weights.shape[1] < count - affine:
         raise InputError(
             f"ids and weights have shapes {ids.shape} and {weights.shape}; expected (N, {column + count}) and "
             f"(N, {count - affine}), or more columns"
         )
-    return operands
 
 
-def _forward(operands: Arrays, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
-    from rts.operations import combine_loops
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts.operations import combine_loops as loops
 
-    rows, weights, ids = _columns(operands, column, count, affine)
-    combine_loops.forward(rows, weights, ids, out, column, count, affine)
-
-
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
-    from rts.operations import combine_loops
-
-    rows, weights, ids = _columns(operands, column, count, affine)
-    t_rows, t_weights = tangents
-    combine_loops.push(rows, weights, ids, t_rows, t_weights, out, column, count, affine)
+    return loops.forward, loops.push, loops.pull
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, *, column: int, count: int, affine: bool) -> None:
-    from rts.operations import combine_loops
-
-    rows, weights, ids = _columns(operands, column, count, affine)
-    g_rows, g_weights = results
-    combine_loops.pull(rows, weights, ids, g, g_rows, g_weights, column, count, affine)
-
-
-COMBINE = Operation(
+COMBINE = Operation.of_loops(
     "rts.combine",
     _specification,
-    ranks=(2, 2, 2),
-    shape=_shape,
-    forward=_forward,
-    push=_push,
-    pull=_pull,
+    (2, 2, 2),
+    _shape,
+    _loops,
+    _check,
     differentiable=2,
     packed=(1, 2),
     packed_result=True,

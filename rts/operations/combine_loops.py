@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.compiling.threads import parallel, read_only
+from rts.compiling.threads import parallel
 from rts.errors import InputError
 
 
@@ -54,10 +54,9 @@ def push(
     if t_rows is None:
         out[...] = 0
     else:
-        _combine(read_only(t_rows), weights, ids, out, column, count, affine)
+        _combine(t_rows, weights, ids, out, column, count, affine)
     if t_weights is None:
         return
-    t_weights = read_only(t_weights)
     if affine and count == 3:
         parallel(_add_weighted, len(ids), rows, ids, column, t_weights, out)
     else:
@@ -76,7 +75,6 @@ def pull(
     affine: bool,
 ) -> None:
     """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), and fill `g_weights` (N, W)."""
-    g = read_only(g)
     if g_rows is not None:
         if affine and count == 3:
             _scatter(ids, column, weights, g, g_rows)

@@ -28,14 +28,20 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
                 continue
             top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
             for c in range(channels):
-                # Rows first, as in the specification, whose rounding this has.
-                total = out.dtype.type(0)
-                for u in range(left, left + side):
-                    column = out.dtype.type(0)
-                    for v in range(top, top + side):
-                        column += fine[v, u, c]
-                    total += column * share
-                out[y, x, c] = total * share
+                out[y, x, c] = _sum(fine, top, left, c, side, share) * share
+
+
+@compiled
+def _sum(fine, top, left, c, side, share):
+    """The sum of the means of columns of a pixel's cells."""
+    # Rows first, as in the specification, whose rounding this has.
+    total = fine.dtype.type(0)
+    for u in range(left, left + side):
+        column = fine.dtype.type(0)
+        for v in range(top, top + side):
+            column += fine[v, u, c]
+        total += column * share
+    return total
 
 
 @compiled
@@ -64,16 +70,22 @@ def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
     over, down = (row.shape[1] - width) // 2, (len(row) - len(g)) // 2
     for y in range(start, stop):
         for x in range(width):
-            if pixel[y, x] < 0:
-                if len(image) > 0:
-                    for c in range(channels):
-                        image[y, x, c] = g[y, x, c]
-                elif len(sums) > 0 and (row[y + down, x + over] >= 0 or settled[y + down, x + over] >= 0):
-                    for c in range(channels):
-                        sums[y, c] += g[y, x, c]
-            elif len(fine):
-                top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
-                for v in range(top, top + side):
-                    for u in range(left, left + side):
-                        for c in range(channels):
-                            fine[v, u, c] = g[y, x, c] * share
+            if pixel[y, x] >= 0:
+                if len(fine) > 0:
+                    top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
+                    _share(fine, top, left, side, g, y, x, share)
+            elif len(image) > 0:
+                for c in range(channels):
+                    image[y, x, c] = g[y, x, c]
+            elif len(sums) > 0 and (row[y + down, x + over] >= 0 or settled[y + down, x + over] >= 0):
+                for c in range(channels):
+                    sums[y, c] += g[y, x, c]
+
+
+@compiled
+def _share(fine, top, left, side, g, y, x, share):
+    """Give each cell of a pixel its share of the pixel's gradient."""
+    for v in range(top, top + side):
+        for u in range(left, left + side):
+            for c in range(g.shape[2]):
+                fine[v, u, c] = g[y, x, c] * share

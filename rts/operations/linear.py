@@ -5,7 +5,7 @@ Matrix units of some devices round float32 products to fewer bits. There, produc
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -58,38 +58,19 @@ def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
     return points[0], rows[0]
 
 
-def _fitting(operands: Arrays) -> Arrays:
-    rows, points = operands
+def _check(rows: np.ndarray, points: np.ndarray) -> None:
     if rows.shape[1] != 4 or points.shape[1] != 3:
         raise InputError(f"rows and points have shapes {rows.shape} and {points.shape}; expected (R, 4) and (N, 3)")
-    return operands
 
 
-def _forward(operands: Arrays, out: np.ndarray) -> None:
-    from rts.operations import linear_loops
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts.operations import linear_loops as loops
 
-    rows, points = _fitting(operands)
-    linear_loops.affine(rows, points, out)
-
-
-def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    from rts.operations import linear_loops
-
-    rows, points = _fitting(operands)
-    t_rows, t_points = tangents
-    linear_loops.affine_push(rows, points, t_rows, t_points, out)
-
-
-def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    from rts.operations import linear_loops
-
-    rows, points = _fitting(operands)
-    g_rows, g_points = results
-    linear_loops.affine_pull(rows, points, g, g_rows, g_points)
+    return loops.forward, loops.push, loops.pull
 
 
 _PACKED: dict[str, Any] = {"differentiable": 2, "packed": (1,), "packed_result": True}
-AFFINE = Operation("rts.affine", specified_affine_map, (2, 2), _shape, _forward, _push, _pull, **_PACKED)
+AFFINE = Operation.of_loops("rts.affine", specified_affine_map, (2, 2), _shape, _loops, _check, **_PACKED)
 
 
 # ------------------------------------------------------------------------------------------------- of several views
@@ -137,18 +118,18 @@ def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
 def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
     out[rows_in_views(operands[2]) :] = 0
     for _, own, given in _each_view(operands):
-        _forward(given, out[own])
+        AFFINE.forward(given, out[own])
 
 
 def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     out[rows_in_views(operands[2]) :] = 0
     for b, own, given in _each_view(operands):
-        _push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
+        AFFINE.push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
 
 
 def _pull_of_views(operands: Arrays, g: np.ndarray, results: Some) -> None:
     for b, own, given in _each_view(operands):
-        _pull(given, g[own], [of_view(results[0], b), of_view(results[1], own)])
+        AFFINE.pull(given, g[own], [of_view(results[0], b), of_view(results[1], own)])
 
 
 VIEWS = Operation(

@@ -5,32 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import loop
-from rts.compiling.threads import parallel, read_only
+from rts.compiling.threads import parallel
 from rts.operations.projection_loops import CHUNK
 
 
-def affine(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
+def forward(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (N, R)."""
     parallel(_affine, len(out), rows, points, out, work=len(rows) * len(out))
 
 
-def affine_push(
+def push(
     rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
 ) -> None:
     """Fill `out` (N, R) with the tangent along `t_rows` and `t_points`, or None for zeros."""
     if t_rows is None:
         out[...] = 0
     else:
-        affine(read_only(t_rows), points, out)
+        forward(t_rows, points, out)
     if t_points is not None:
-        parallel(_add_moved, len(out), rows, read_only(t_points), out, work=len(rows) * len(out))
+        parallel(_add_moved, len(out), rows, t_points, out, work=len(rows) * len(out))
 
 
-def affine_pull(
+def pull(
     rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
 ) -> None:
     """Pull back the gradient `g` (N, R) of the result: fill `g_rows` and `g_points` unless they are None."""
-    g = read_only(g)
     if g_rows is not None:
         sums = np.zeros((-(-len(points) // CHUNK), *rows.shape))
         parallel(_pull_rows, len(sums), points, g, sums, work=2 * g.size)

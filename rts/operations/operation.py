@@ -14,6 +14,7 @@ from rts.arrays.argument_checks import one_line, quoted
 from rts.arrays.array_functions import from_numbers, kind_of
 from rts.arrays.engines import OWNERS, constants, context_of, engine_of, value_of
 from rts.arrays.trees import Array
+from rts.compiling.threads import read_only
 from rts.errors import InputError, RtsError
 
 _SHAPED = ("shape",)
@@ -106,6 +107,55 @@ class Operation:
 
     _seen: set[tuple] = field(default_factory=set, init=False, repr=False)
     """Dtype and names of parameters of the calls whose first value has been checked."""
+
+    @classmethod
+    def of_loops(
+        cls,
+        name: str,
+        specification: Callable[..., Array],
+        ranks: tuple[int, ...],
+        shape: Callable[..., tuple[int, ...]],
+        loops: Callable[[], tuple[Callable, Callable, Callable]],
+        check: Callable[..., None] | None = None,
+        **options: Any,
+    ) -> Operation:
+        """An operation of three functions that take arrays one by one, such as compiled loops.
+
+        Arrays that these read are C-contiguous and read-only, tangents and the gradient too: each loop is compiled
+        once for each dtype of the floats.
+
+        Args:
+            name: see the attributes, as of specification, ranks and shape.
+            specification: in array code.
+            ranks: of the operands.
+            shape: of the result.
+            loops: () → (forward, push, pull), asked in each call, so that it may import numba when that is needed.
+                forward(*operands, out, **params) and push(*operands, *tangents, out, **params) fill `out`;
+                pull(*operands, gradient, *results, **params) fills the results, of which not all are None.
+            check: (*operands, **params), raises an InputError where operands do not fit one another.
+            **options: the other attributes, from `differentiable` on.
+
+        Raises:
+            InputError: an attribute is not of its kind.
+        """
+
+        def fitting(operands: Arrays, params: dict[str, Any]) -> Arrays:
+            if check is not None:
+                check(*operands, **params)
+            return operands
+
+        def forward(operands: Arrays, out: np.ndarray, **params: Any) -> Any:
+            return loops()[0](*fitting(operands, params), out, **params)
+
+        def push(operands: Arrays, tangents: Some, out: np.ndarray, **params: Any) -> None:
+            along = [None if t is None else read_only(t) for t in tangents]
+            loops()[1](*fitting(operands, params), *along, out, **params)
+
+        def pull(operands: Arrays, gradient: np.ndarray, results: Some, **params: Any) -> None:
+            if any(x is not None for x in results):
+                loops()[2](*fitting(operands, params), read_only(gradient), *results, **params)
+
+        return cls(name, specification, ranks, shape, forward, push, pull, **options)
 
     def __post_init__(self):
         if not (isinstance(self.name, str) and self.name):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -54,44 +54,24 @@ def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
     return points
 
 
-def _fitting(operands: Arrays) -> Arrays:
-    rows, points = operands
+def _check(rows: np.ndarray, points: np.ndarray) -> None:
     if rows.shape != (4, 4) or points.shape[1] != 3:
         raise InputError(f"rows and points have shapes {rows.shape} and {points.shape}; expected (4, 4) and (N, 3)")
-    return operands
 
 
-def _forward(operands: Arrays, out: np.ndarray) -> None:
-    from rts.operations import projection_loops
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts.operations import projection_loops as loops
 
-    rows, points = _fitting(operands)
-    projection_loops.project(rows, points, out)
-
-
-def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    from rts.operations import projection_loops
-
-    rows, points = _fitting(operands)
-    t_rows, t_points = tangents
-    projection_loops.push(rows, points, t_rows, t_points, out)
+    return loops.forward, loops.push, loops.pull
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    from rts.operations import projection_loops
-
-    rows, points = _fitting(operands)
-    g_rows, g_points = results
-    projection_loops.pull(rows, points, g, g_rows, g_points)
-
-
-PROJECTION = Operation(
+PROJECTION = Operation.of_loops(
     "rts.projection",
     _specification,
-    ranks=(2, 2),
-    shape=_shape,
-    forward=_forward,
-    push=_push,
-    pull=_pull,
+    (2, 2),
+    _shape,
+    _loops,
+    _check,
     differentiable=2,
     packed=(1,),
     packed_result=True,
@@ -126,7 +106,7 @@ def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
     out[rows_in_views(operands[2]) :] = 0
     for _, own, given, place in _each_view(operands):
         found = out[own]
-        _forward(given, found)
+        PROJECTION.forward(given, found)
         found[:, :2] += place[:2]
         found[:, 2] *= place[2]
 
@@ -134,14 +114,14 @@ def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
 def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     out[rows_in_views(operands[2]) :] = 0
     for b, own, given, place in _each_view(operands):
-        _push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
+        PROJECTION.push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
         out[own, 2] *= place[2]
 
 
 def _pull_of_views(operands: Arrays, g: np.ndarray, results: Some) -> None:
     for b, own, given, place in _each_view(operands):
         gradient = g[own] if place[2] == 1 else g[own] * np.array([1, 1, place[2]], g.dtype)
-        _pull(given, gradient, [of_view(results[0], b), of_view(results[1], own)])
+        PROJECTION.pull(given, gradient, [of_view(results[0], b), of_view(results[1], own)])
 
 
 VIEWS = Operation(

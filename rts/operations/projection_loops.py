@@ -15,7 +15,7 @@ CHUNK = 4096
 """Number of points that are summed together. Fixed, so that results do not depend on the number of threads."""
 
 
-def project(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
+def forward(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (N, 3)."""
     parallel(_project, len(out), rows, points, out, work=4 * len(out))
 
@@ -24,9 +24,9 @@ def push(
     rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
 ) -> None:
     """Fill `out` (N, 3) with the tangent along `t_rows` (4, 4) and `t_points` (N, 3), or None for zeros."""
-    turn = np.zeros_like(rows) if t_rows is None else t_rows
-    move = np.empty((0, 3), points.dtype) if t_points is None else t_points
-    parallel(_push, len(out), rows, points, read_only(turn), read_only(move), out, work=8 * len(out))
+    turn = read_only(np.zeros_like(rows)) if t_rows is None else t_rows
+    move = read_only(np.empty((0, 3), points.dtype)) if t_points is None else t_points
+    parallel(_push, len(out), rows, points, turn, move, out, work=8 * len(out))
 
 
 def pull(
@@ -35,7 +35,7 @@ def pull(
     """Pull back the gradient `g` (N, 3) of the result: fill `g_rows` (4, 4) and `g_points` (N, 3) unless None."""
     sums = np.empty((-(-len(points) // CHUNK), 4, 4))
     g_points = np.empty((0, 3), points.dtype) if g_points is None else g_points
-    parallel(_pull, len(sums), rows, points, read_only(g), sums, g_points, work=5 * len(points))
+    parallel(_pull, len(sums), rows, points, g, sums, g_points, work=5 * len(points))
     if g_rows is not None:
         g_rows[...] = sums.sum(axis=0)
 

@@ -37,12 +37,18 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
                 count += listed or near[x] > 0
             for x in asked[:count]:
                 for k in range(layers):
-                    if kept[k, y - 1, x]:
-                        t = np.uint32(triangle_ids[k, y - 1, x])
-                        piece = pieces[t] if len(pieces) > 1 else pieces[0]
-                        if piece > 0 and k == layers - 1:
-                            piece += more
-                        found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
+                    t, beyond = np.uint32(triangle_ids[k, y - 1, x]), more if k == layers - 1 else 0
+                    known = kept[k, y - 1, x] > 0
+                    found[k, y - 1, x] = _side(t, vertices, faces, pieces, eye, beyond) if known else 0
+
+
+@compiled
+def _side(t, vertices, faces, pieces, eye, more):
+    """The number of a triangle's piece, if it has one, and so many more; negative where its back is seen."""
+    piece = pieces[t] if len(pieces) > 1 else pieces[0]
+    if piece > 0:
+        piece += more
+    return piece if _front(vertices, faces, t, eye) else -piece
 
 
 @compiled

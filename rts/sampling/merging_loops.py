@@ -76,22 +76,19 @@ def _merge(
                 if b < deepest and (a == before or own_depth[b, y, x] < depth[a, y, x]):
                     merged_part[k, y, x], merged_row[k, y, x] = number, own_row[b, y, x]
                     merged_depth[k, y, x] = own_depth[b, y, x]
-                    if tells:
-                        merged_facing[k, y, x] = _of_part(own_facing[b, y, x], number, count, more)
+                    told = _of_part(own_facing[b, y, x], number, count, more) if tells else 0
                     b += 1
                 elif a < before:
                     merged_part[k, y, x] = part[a, y, x] if len(part) > 0 else 0
                     merged_row[k, y, x], merged_depth[k, y, x] = row[a, y, x], depth[a, y, x]
-                    if tells and len(part) > 0:
-                        merged_facing[k, y, x] = facing[a, y, x]
-                    elif tells:
-                        merged_facing[k, y, x] = _of_part(facing[a, y, x], 0, count, more)
+                    known = np.int64(facing[a, y, x]) if tells else 0
+                    told = known if len(part) > 0 else _of_part(known, 0, count, more)
                     a += 1
                 else:
                     merged_part[k, y, x] = merged_row[k, y, x] = -1
-                    merged_depth[k, y, x] = 0
-                    if tells:
-                        merged_facing[k, y, x] = 0
+                    merged_depth[k, y, x] = told = 0
+                if tells:
+                    merged_facing[k, y, x] = told
             if tells and number >= count - 1:
                 told = merged_facing[layers - 1, y, x]
                 if 0 < abs(told) < more:

@@ -101,6 +101,14 @@ def _pixels(line, side, apron):
 
 
 @compiled
+def _begin(marks, first):
+    """Where the first run of marks begins that is not before `first`; the number of marks without one."""
+    while first < len(marks) and not marks[first]:
+        first += 1
+    return first
+
+
+@compiled
 def _end(marks, first):
     """The end of the run of marks that begins at `first`."""
     end = first + 1
@@ -133,10 +141,10 @@ def count(start, stop, active, pieces, firsts, side, apron, high, width, counts)
         (begin, end), found = _strips(line, side, apron, high, len(firsts) - 1), 0
         for p in range(firsts[begin], firsts[end]):
             strip, first, columns = pieces[p, 0], pieces[p, 1], pieces[p, 2]
-            if _needs(needs, active, line, strip, first, columns, side, apron, high):
-                for j in range(columns):
-                    if needs[j]:
-                        seen[(first + j) * side : (first + j + 1) * side + 2 * apron] = 1
+            some = _needs(needs, active, line, strip, first, columns, side, apron, high)
+            for j in range(columns if some else 0):
+                if needs[j]:
+                    seen[(first + j) * side : (first + j + 1) * side + 2 * apron] = 1
         for u in range(width if begin < end else 0):
             found += np.int64(seen[u])
             seen[u] = 0
@@ -184,15 +192,13 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
             if again:
                 _repeat(place[down, over : over + right - left], place[down - 1, over : over + right - left], more)
             elif _needs(needs, active, line, strip, first, columns, side, apron, high):
-                j, until = 0, 0
+                j, until = _begin(needs[:columns], 0), 0
                 while j < columns:
-                    if not needs[j]:
-                        j += 1
-                        continue
                     u, j = max(j * side, until), _end(needs[:columns], j)
                     until = j * side + 2 * apron
                     n = _number(numbers[left + u : left + until], cells, line * width + left + u, n)
                     _copy(place[down, over + u : over + until], numbers[left + u : left + until])
+                    j = _begin(needs[:columns], j)
             if alike and line > strip * high * side:
                 _copy(kinds[down, over : over + right - left], kinds[down - 1, over : over + right - left])
             else:

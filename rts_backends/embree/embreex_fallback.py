@@ -13,10 +13,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from rts import Camera
-from rts.plugin_api.loops import loop
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
-from rts_backends.exact_hits import corner_lists, look, places
+from rts_backends.exact_hits import corner_lists, holds, look, places
 from rts_backends.triangles import facing, pixel_matrix
 
 STEP = 1e-6
@@ -123,22 +123,20 @@ def _take(
             for m in range(offsets[v], offsets[v + 1]):
                 t = members[m]
                 inside, _, z, a, b = look(t, x, y, matrix, row, keep, vertices, faces, corners)
-                known = not inside
-                for k in range(layers):
-                    known = known or ids[pixel, k] == t
-                if known:
-                    continue
-                at = layers
-                while at > 0 and (
-                    ids[pixel, at - 1] < 0
-                    or z < nearest[pixel, at - 1, 0]
-                    or (z == nearest[pixel, at - 1, 0] and t < ids[pixel, at - 1])
-                ):
-                    at -= 1
-                for k in range(layers - 1, at, -1):
-                    ids[pixel, k] = ids[pixel, k - 1]
-                    for i in range(3):
-                        nearest[pixel, k, i] = nearest[pixel, k - 1, i]
-                if at < layers:
-                    ids[pixel, at] = t
-                    nearest[pixel, at, 0], nearest[pixel, at, 1], nearest[pixel, at, 2] = z, a, b
+                if inside and not holds(ids[pixel], layers, t):
+                    _insert(ids[pixel], nearest[pixel], t, z, a, b)
+
+
+@compiled
+def _insert(ids, nearest, t, z, a, b):
+    """Put a hit among a pixel's nearest, if it is one of them."""
+    at = layers = len(ids)
+    while at > 0 and (ids[at - 1] < 0 or z < nearest[at - 1, 0] or (z == nearest[at - 1, 0] and t < ids[at - 1])):
+        at -= 1
+    for k in range(layers - 1, at, -1):
+        ids[k] = ids[k - 1]
+        for i in range(3):
+            nearest[k, i] = nearest[k - 1, i]
+    if at < layers:
+        ids[at] = t
+        nearest[at, 0], nearest[at, 1], nearest[at, 2] = z, a, b

@@ -21,6 +21,7 @@ from rts_backends.fused import layer_pairing as listing
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
+from rts_backends.fused.rows import Grid
 from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
@@ -155,9 +156,14 @@ class Cells:
         parallel(paint, images.shape[1], self.settled, self.border, read_only(colors), images, work=images.size // 8)
 
     @property
-    def plain_arguments(self) -> tuple:
-        """Arguments of the stencil's loops. In `visible` no plain target takes a hidden layer."""
-        return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
+    def grid(self) -> Grid:
+        """The samples as loops take them."""
+        return Grid(self.positions, self.rgba, self.row, *self._numbers)
+
+    @property
+    def plain_grid(self) -> Grid:
+        """The samples for the stencil's loops. In `visible` no plain target takes a hidden layer."""
+        return self.grid._replace(row=self.row[:1]) if self.visible else self.grid
 
     @property
     def _plain_work(self) -> int:
@@ -173,7 +179,7 @@ class Cells:
     def mixed_arguments(self) -> tuple:
         """Arguments of the loops of mixed targets."""
         choices = self.choices
-        return self.positions, self.rgba, self.row, *self._numbers, choices.offsets, choices.columns, choices.ranges
+        return self.grid, choices.offsets, choices.columns, choices.ranges
 
     @property
     def _mixed_sums(self) -> tuple:
@@ -221,8 +227,7 @@ class Cells:
             # An argument, since compiled code that is cached would keep its value.
             continued = kind.type(Visible.CONTINUED)
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
-            arrays = self.positions, self.rgba, self.row, *self._numbers
-            parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
+            parallel(listing.choose, height, self.grid, *given, work=500 * len(columns))
         return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent)
 
     @cached_property
@@ -247,10 +252,9 @@ class Cells:
         )
         if len(found.columns):
             rules = outlines.Rules(*map(kind.type, Visible.RIMS))
-            arrays = self.positions, self.rgba, self.row, *self._numbers
             decide = self.part, self.one_part, self.exits, kind.type(choices.extent), rules, self._pairs[0]
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
-            given = *arrays, *decide, *listed, ends
+            given = self.grid, *decide, *listed, ends
             parallel(outlines.fill, height, *given, found, work=90 * len(found.columns))
             if self._crossed:
                 self.crossings.still(found.offsets, found.columns, found.changes)
@@ -272,8 +276,7 @@ class Cells:
         bits, some = self._pairs
         if not len(bits):
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
-        arrays = self.positions, self.rgba, self.row, *self._numbers
-        return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), bits, some)
+        return crossings.listed(self.grid, self.choices, self.positions.dtype.type(self.choices.extent), bits, some)
 
     @property
     def _crossed(self) -> bool:
@@ -283,7 +286,7 @@ class Cells:
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
         if out.size:
-            given = *self.plain_arguments, self.choices.states, self.border
+            given = self.plain_grid, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(
@@ -328,7 +331,7 @@ class Cells:
         if self._crossed:
             states = states.copy()
             states[self.crossings.cells()] = EMPTY
-        plain = *self.plain_arguments, states, self.border
+        plain = self.plain_grid, states, self.border
         parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
         self._pull_mixed(g, *found)
         if self._crossed:
@@ -360,7 +363,7 @@ class Cells:
             read_only(np.empty((len(out), 0, size), out.dtype) if t is None else t)
             for t, size in ((t_positions, 3), (t_rgba, 4))
         )
-        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out)
+        parallel(stencil.push, out.shape[1], self.plain_grid, *tangents, self.choices.states, self.border, out)
         if len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed_targets.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
@@ -368,8 +371,7 @@ class Cells:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
         if count := len(self.crossings.columns):
-            arrays = self.positions, self.rgba, self.row, *self._numbers
-            given = *arrays, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
+            given = self.grid, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
             parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
         if len(self._settled):
             self._paint(tangents[1], out)

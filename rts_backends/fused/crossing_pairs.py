@@ -205,23 +205,29 @@ def _find(start, stop, z, gap, most, rules, candidates, bits, some):
             for x in range(left, right):
                 suspected |= marks[x]
             for x in range(left, right if suspected else left):
-                # The cell as the first and as the second of pairs. Calls with arrays are dear: few come so far.
-                for n in range(8 if marks[x] else 0):
-                    u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
-                    qy, at = (y - v, x - u + BORDER) if n > 3 else (y, x + BORDER)
-                    gaps = gap[qy - v, at - u], gap[qy, at], gap[qy + v, at + u], gap[qy + 2 * v, at + 2 * u]
-                    if not _grows(*gaps, candidates):
-                        continue
-                    inside = BORDER <= qy < rows - BORDER and BORDER <= at < width + BORDER
-                    if not inside:
-                        continue
-                    if candidates:
-                        found = _may_cross(z, gap, rules, qy, at - BORDER, v, u)
-                    else:
-                        found = _crosses(z, gap, rules, qy, at - BORDER, v, u)
-                    if found:
-                        bits[start + qy - BORDER, at - BORDER] |= np.uint8(1 << (n & 3))
-                        some[start + qy - BORDER] = True
+                if marks[x]:  # Calls with arrays are dear: few come so far.
+                    _find_around(start, y, x, z, gap, rules, candidates, bits, some)
+
+
+@compiled
+def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
+    """Find pairs, or `candidates`, whose first or second cell is this one of a window of rows."""
+    rows, width = z.shape[1:]
+    for n in range(8):
+        u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
+        qy, qx = (y - v, x - u) if n > 3 else (y, x)
+        at = qx + BORDER
+        gaps = gap[qy - v, at - u], gap[qy, at], gap[qy + v, at + u], gap[qy + 2 * v, at + 2 * u]
+        inside = BORDER <= qy < rows - BORDER and 0 <= qx < width
+        if not _grows(*gaps, candidates) or not inside:
+            continue
+        if candidates:
+            found = _may_cross(z, gap, rules, qy, qx, v, u)
+        else:
+            found = _crosses(z, gap, rules, qy, qx, v, u)
+        if found:
+            bits[start + qy - BORDER, qx] |= np.uint8(1 << (n & 3))
+            some[start + qy - BORDER] = True
 
 
 @compiled
@@ -357,14 +363,13 @@ def _keep(covered, bits, some, reach, kept):
         for x in range(width if some[y] else 0):
             for i in range(4 if bits[y, x] else 0):
                 if bits[y, x] >> i & 1:
-                    for step in range(2):
-                        px, py = x + step * STEPS[i, 0], y + step * STEPS[i, 1]
-                        for row in range(max(py - reach, 0), min(py + reach + 1, height)):
-                            _keep_around(kept[0, row], covered[0, row], px, reach)
-                            _keep_around(kept[1, row], covered[1, row], px, reach)
+                    _keep_around(kept, covered, y, x, reach)
+                    _keep_around(kept, covered, y + STEPS[i, 1], x + STEPS[i, 0], reach)
 
 
 @compiled
-def _keep_around(kept, covered, x, reach):
-    for i in range(max(x - reach, 0), min(x + reach + 1, len(kept))):
-        kept[i] |= covered[i]
+def _keep_around(kept, covered, y, x, reach):
+    for k in range(2):
+        for v in range(max(y - reach, 0), min(y + reach + 1, kept.shape[1])):
+            for u in range(max(x - reach, 0), min(x + reach + 1, kept.shape[2])):
+                kept[k, v, u] |= covered[k, v, u]

@@ -14,6 +14,7 @@ from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, Rules, gather, has_two, steps
 from rts_backends.fused.mixed_targets import splat, tint_of
+from rts_backends.fused.rows import Grid
 from rts_backends.fused.uniform_cells import BUSY, SETTLED
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
@@ -75,17 +76,17 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
     return Crossings(offsets, *listed, *arrays)
 
 
-def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray, some: np.ndarray) -> Crossings:
+def listed(grid: Grid, choices: Any, extent: np.floating, bits: np.ndarray, some: np.ndarray) -> Crossings:
     """The targets beside lines.
 
     Args:
-        arrays: positions (N, 3), rgba (N, 4), row (K, H, W), and the splatter's scale, peak and gamma.
+        grid: the samples.
         choices: see `rts_backends.fused.cells.Choices`.
         extent: of the fronts' depths, the camera's included.
         bits: the pairs of `crossing_pairs.py`.
         some: (H,) bool, whether there are any in a row.
     """
-    positions, _, row = arrays[:3]
+    positions, row = grid.positions, grid.row
     height, width = bits.shape
     kind, rules = positions.dtype, Rules.of(extent)
     rows = height + 2 * BORDER
@@ -95,7 +96,7 @@ def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray, s
     seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
     parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
     found = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
-    parallel(_fill, height, *arrays, *seen[1:], rules, around, found, work=1000 * len(found.columns))
+    parallel(_fill, height, grid, *seen[1:], rules, around, found, work=1000 * len(found.columns))
     return found
 
 
@@ -145,12 +146,7 @@ def _place(columns, m, mixed, y, x):
 def _fill(
     start,
     stop,
-    positions,
-    rgba,
-    row,
-    scale,
-    peak,
-    gamma,
+    grid,
     mixed,
     firsts,
     columns,
@@ -162,7 +158,8 @@ def _fill(
     found,
 ):
     """Fill the lists of the targets of rows [start, stop)."""
-    slopes = np.empty(4, positions.dtype)
+    row = grid.row
+    slopes = np.empty(4, grid.positions.dtype)
     for y in range(start, stop):
         d, m = found.offsets[y], firsts[y]
         for x in range(row.shape[2] if found.offsets[y + 1] > d else 0):
@@ -170,7 +167,7 @@ def _fill(
                 m = _place(columns, m, mixed, y, x)
                 found.mixed[d] = m if mixed[y, x] else -1
                 _decide(found.sheets[d], slopes, row, mixed, ranges, m, z, gap, rules, around[y, x], y, x)
-                _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma)
+                _weigh(d, found, slopes, grid, y, x)
                 d += 1
 
 
@@ -244,17 +241,17 @@ def _complete(sheets, slopes, z, gap, fit, y, x):
 
 
 @compiled
-def _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma):
+def _weigh(d, found, slopes, grid, y, x):
     """Fill what the derivative of a target is made of."""
-    kind = positions.dtype.type
-    zero, one, slope = kind(0), kind(1), kind(2) * scale * gamma
+    rgba, row, kind = grid.rgba, grid.row, grid.positions.dtype.type
+    zero, one, slope = kind(0), kind(1), kind(2) * grid.scale * grid.gamma
     weights, colors, sheets = found.weights[d], found.colors[d], found.sheets[d]
     colors[:] = zero
     wa, wb, ax, ay, bx, by = zero, zero, zero, zero, zero, zero
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1
         i = row[0, y - v, x - u]
-        w, dx, dy = splat(positions, i, y - v, x - u, u, v, scale, peak, gamma)
+        w, dx, dy = splat(grid, i, y - v, x - u, u, v)
         weights[n, 0], weights[n, 1], weights[n, 2] = w, slope * w * dx, slope * w * dy
         for c in range(4):
             colors[sheets[n], c] += w * rgba[i, c]
@@ -288,9 +285,9 @@ def rate(slopes, t_positions, i, j):
 
 
 @compiled
-def change_of(pixel, d, found, positions, rgba, row, scale, peak, gamma, ranges, sums, y, t_positions, t_rgba):
+def change_of(pixel, d, found, grid, ranges, sums, y, t_positions, t_rgba):
     """The derivative (4,) of a listed target along tangents (N, 3) and (N, 4), or of no rows: zeros."""
-    x, m = found.columns[d], found.mixed[d]
+    rgba, row, x, m = grid.rgba, grid.row, found.columns[d], found.mixed[d]
     colors, moves = found.colors[d], pixel.dtype.type(0)
     if len(t_positions) > 0:
         moves = found.slopes[d, 0] * rate(found.slopes[d], t_positions, row[0, y, x], row[1, y, x])
@@ -302,38 +299,21 @@ def change_of(pixel, d, found, positions, rgba, row, scale, peak, gamma, ranges,
         for c in range(4):
             pixel[c] += change * (rgba[i, c] - own[c])
     if len(t_rgba) > 0 and m >= 0:
-        tint_of(pixel, sums[m], positions, row, y, x, ranges[m], scale, peak, gamma, t_rgba)
+        tint_of(pixel, sums[m], grid, y, x, ranges[m], t_rgba)
     for n in range(9 if len(t_rgba) > 0 and m < 0 else 0):
         for c in range(4):
             pixel[c] += found.weights[d, n, 0] * t_rgba[row[0, y + 1 - n // 3, x + 1 - n % 3], c]
 
 
 @loop
-def push(
-    start,
-    stop,
-    positions,
-    rgba,
-    row,
-    scale,
-    peak,
-    gamma,
-    ranges,
-    sums,
-    found,
-    t_positions,
-    t_rgba,
-    border,
-    out,
-):
+def push(start, stop, grid, ranges, sums, found, t_positions, t_rgba, border, out):
     """Put the derivatives of listed targets into rows [start, stop) of the tangents (T, H, W, 4)."""
-    given = positions, rgba, row, scale, peak, gamma, ranges, sums
     for y in range(start + border, stop + border):
         for d in range(found.offsets[y], found.offsets[y + 1]):
             x = found.columns[d] - border
             if 0 <= x < out.shape[2]:
                 for t in range(len(out)):
-                    change_of(out[t, y - border, x], d, found, *given, y, t_positions[t], t_rgba[t])
+                    change_of(out[t, y - border, x], d, found, grid, ranges, sums, y, t_positions[t], t_rgba[t])
 
 
 @loop
@@ -360,12 +340,11 @@ def pull(rgba, row, found, border, g, g_positions, g_rgba):
                     g_positions[i, 2] += sign
             for n in range(9):
                 i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], found.weights[d, n], colors[found.sheets[d, n]]
+                change = zero
+                for c in range(4):
+                    change += h[c] * (rgba[i, c] - own[c])
                 if len(g_positions) > 0:
-                    change = zero
-                    for c in range(4):
-                        change += h[c] * (rgba[i, c] - own[c])
                     g_positions[i, 0] += weights[1] * change
                     g_positions[i, 1] += weights[2] * change
-                if len(g_rgba) > 0 and found.mixed[d] < 0:
-                    for c in range(4):
-                        g_rgba[i, c] += weights[0] * h[c]
+                for c in range(4 if len(g_rgba) > 0 and found.mixed[d] < 0 else 0):
+                    g_rgba[i, c] += weights[0] * h[c]

@@ -72,23 +72,17 @@ def narrow(start, stop, mixed, wanted, kept, counts):
         counts[y] = 0
         for x in range(width):
             kept[y, x] = 0
-            if mixed[y, x]:
-                for v in range(max(y - 2, 0), min(y + 3, height)):
-                    for u in range(max(x - 2, 0), min(x + 3, width)):
-                        kept[y, x] |= wanted[v, u]
-                counts[y] += kept[y, x]
+            for v in range(max(y - 2, 0), min(y + 3, height) if mixed[y, x] else 0):
+                for u in range(max(x - 2, 0), min(x + 3, width)):
+                    kept[y, x] |= wanted[v, u]
+            counts[y] += kept[y, x]
 
 
 @loop
 def choose(
     start,
     stop,
-    positions,
-    rgba,
-    row,
-    scale,
-    peak,
-    gamma,
+    grid,
     facing,
     visible,
     continued,
@@ -106,6 +100,7 @@ def choose(
     Marks go by depths alone. Where `facing` (K, H, W) is told, which else has no layers, more fronts may pair. In
     `ends` (H, W) of `survey.survey`, which may have no rows, come the directions in which fronts end before others.
     """
+    positions, row = grid.positions, grid.row
     layers, height, width = row.shape
     z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
     sides = np.zeros((layers, 9), np.int64)
@@ -142,7 +137,7 @@ def choose(
                     choices[d, n, 0, 1] = max(s, 0)
                     choices[d, n, 1, 0], choices[d, n, 1, 1] = max(s, 0), max(s + 1, 0)
                     choices[d, n, 2, 0], choices[d, n, 2, 1] = max(s + 1, 0), layers
-            sums_of(sums[d], positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            sums_of(sums[d], grid, y, x, choices[d])
             if len(ends) > 0:
                 ends[y, x] |= _ends_before_others(choices[d], row, y, x)
             d += 1

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts_backends.fused.rows import compiled, exp, loop
+from rts_backends.fused.rows import Grid, compiled, exp, loop
 
 
 @compiled
-def splat(positions, i, y, x, u, v, scale, peak, gamma):
+def splat(grid, i, y, x, u, v):
     """Weight of sample i of cell (y, x) at offset (u, v), and how far the target lies from it along x and y."""
+    positions, peak, gamma = grid.positions, grid.peak, grid.gamma
     kind, half = positions.dtype.type, positions.dtype.type(0.5)
     dx = kind(u) - gamma * (positions[i, 0] - (kind(x) + half))
     dy = kind(v) - gamma * (positions[i, 1] - (kind(y) + half))
-    return peak * peak * exp(-(dx * dx + dy * dy) * scale), dx, dy
+    return peak * peak * exp(-(dx * dx + dy * dy) * grid.scale), dx, dy
 
 
 @compiled
-def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
+def sums_of(total, grid, y, x, choice):
     """Sums (3, 5) of a target's buffers, their colours over the weight, taken as at least one."""
+    rgba, row = grid.rgba, grid.row
     _, height, width = row.shape
     one = total.dtype.type(1)
     total[:] = total.dtype.type(0)
@@ -30,11 +32,12 @@ def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
         for b in range(3):
             for k in range(choice[n, b, 0], choice[n, b, 1]):
                 i = row[k, py, px]
-                if i >= 0:
-                    w, _, _ = splat(positions, i, py, px, u, v, scale, peak, gamma)
-                    for c in range(4):
-                        total[b, c] += w * rgba[i, c]
-                    total[b, 4] += w
+                if i < 0:
+                    continue
+                w, _, _ = splat(grid, i, py, px, u, v)
+                for c in range(4):
+                    total[b, c] += w * rgba[i, c]
+                total[b, 4] += w
     for b in range(3):
         over = one / max(total[b, 4], one)
         for c in range(4):
@@ -93,37 +96,42 @@ def _any(adjoints, d):
 
 
 @loop
-def pull(
-    start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, adjoints, g_positions, g_rgba
-):
+def pull(start, stop, grid, offsets, columns, choices, adjoints, g_positions, g_rgba):
     """Add to the gradients of the samples of source rows [start, stop) what mixed targets give."""
-    _, height, width = row.shape
-    slope = positions.dtype.type(2) * scale * gamma
+    height = grid.row.shape[1]
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
-                for u in range(-1, 2 if _any(adjoints, d) else -1):
-                    x, n = columns[d] - u, 3 * (v + 1) + u + 1
-                    if not 0 <= x < width:
-                        continue
-                    for b in range(3):
-                        for k in range(choices[d, n, b, 0], choices[d, n, b, 1]):
-                            i = row[k, y, x]
-                            if i < 0:
-                                continue
-                            w, dx, dy = splat(positions, i, y, x, u, v, scale, peak, gamma)
-                            h = adjoints[d, b, 4]
-                            for c in range(4):
-                                h += adjoints[d, b, c] * rgba[i, c]
-                                if len(g_rgba) > 0:
-                                    g_rgba[i, c] += w * adjoints[d, b, c]
-                            if len(g_positions) > 0:
-                                g_positions[i, 0] += slope * w * h * dx
-                                g_positions[i, 1] += slope * w * h * dy
+                if _any(adjoints, d):
+                    _pull_target(d, columns[d], v, grid, y, choices, adjoints, g_positions, g_rgba)
+
+
+@compiled
+def _pull_target(d, column, v, grid, y, choices, adjoints, g_positions, g_rgba):
+    """`pull` of what a target v rows farther on gives to the sources of row y."""
+    rgba, row, slope = grid.rgba, grid.row, grid.positions.dtype.type(2) * grid.scale * grid.gamma
+    for u in range(-1, 2):
+        x, n = column - u, 3 * (v + 1) + u + 1
+        if not 0 <= x < row.shape[2]:
+            continue
+        for b in range(3):
+            for k in range(choices[d, n, b, 0], choices[d, n, b, 1]):
+                i = row[k, y, x]
+                if i < 0:
+                    continue
+                w, dx, dy = splat(grid, i, y, x, u, v)
+                h = adjoints[d, b, 4]
+                for c in range(4):
+                    h += adjoints[d, b, c] * rgba[i, c]
+                for c in range(4 if len(g_rgba) > 0 else 0):
+                    g_rgba[i, c] += w * adjoints[d, b, c]
+                if len(g_positions) > 0:
+                    g_positions[i, 0] += slope * w * h * dx
+                    g_positions[i, 1] += slope * w * h * dy
 
 
 @loop
-def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, sums, tangents, border, out):
+def push(start, stop, grid, offsets, columns, choices, sums, tangents, border, out):
     """Fill mixed targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
     changes = np.empty((len(out), 3, 5), out.dtype)
     for y in range(start + border, stop + border):
@@ -131,7 +139,7 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns
             x, total = columns[d], sums[d]
             if not 0 <= x - border < out.shape[2]:
                 continue
-            changes_of(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, *tangents)
+            changes_of(changes, total, grid, y, x, choices[d], *tangents)
             for t in range(len(out)):
                 for c in range(4):
                     out[t, y - border, x - border, c] = composited(total, changes[t], c)
@@ -147,21 +155,23 @@ def composited(total, change, c):
 
 
 @compiled
-def tint_of(pixel, total, positions, row, y, x, choice, scale, peak, gamma, t_rgba):
+def tint_of(pixel, total, grid, y, x, choice, t_rgba):
     """Add to a pixel (4,) what a target changes by along a tangent (N, 4) of colours."""
     # Weights do not change with colours: sums of their tangents are as those of colours.
     change = np.empty((3, 5), total.dtype)
-    sums_of(change, positions, t_rgba, row, y, x, choice, scale, peak, gamma)
+    tinted = Grid(grid.positions, t_rgba, grid.row, grid.scale, grid.peak, grid.gamma)
+    sums_of(change, tinted, y, x, choice)
     for c in range(4):
         pixel[c] += composited(total, change, c)
 
 
 @compiled
-def changes_of(changes, total, positions, rgba, row, y, x, choice, scale, peak, gamma, t_positions, t_rgba):
+def changes_of(changes, total, grid, y, x, choice, t_positions, t_rgba):
     """Tangents (T, 3, 5) of the normalised sums of a target's buffers."""
+    rgba, row = grid.rgba, grid.row
     _, height, width = row.shape
     zero, one = total.dtype.type(0), total.dtype.type(1)
-    slope = total.dtype.type(2) * scale * gamma
+    slope = total.dtype.type(2) * grid.scale * grid.gamma
     moved, tinted = t_positions.shape[1] > 0, t_rgba.shape[1] > 0
     changes[:] = zero
     for n in range(9):
@@ -174,11 +184,13 @@ def changes_of(changes, total, positions, rgba, row, y, x, choice, scale, peak, 
                 i = row[k, py, px]
                 if i < 0:
                     continue
-                w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
+                w, dx, dy = splat(grid, i, py, px, u, v)
                 for t in range(len(changes)):
                     dw = slope * w * (dx * t_positions[t, i, 0] + dy * t_positions[t, i, 1]) if moved else zero
-                    for c in range(4):
-                        changes[t, b, c] += dw * rgba[i, c] + (w * t_rgba[t, i, c] if tinted else zero)
+                    changes[t, b, 0] += dw * rgba[i, 0] + (w * t_rgba[t, i, 0] if tinted else zero)
+                    changes[t, b, 1] += dw * rgba[i, 1] + (w * t_rgba[t, i, 1] if tinted else zero)
+                    changes[t, b, 2] += dw * rgba[i, 2] + (w * t_rgba[t, i, 2] if tinted else zero)
+                    changes[t, b, 3] += dw * rgba[i, 3] + (w * t_rgba[t, i, 3] if tinted else zero)
                     changes[t, b, 4] += dw
     for b in range(3):
         over = one / max(total[b, 4], one)

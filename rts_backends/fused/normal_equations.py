@@ -28,7 +28,6 @@ from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
     PITCH,
     SOURCE,
-    SUM,
     SUMS,
     TILE,
     busy,
@@ -37,9 +36,8 @@ from rts_backends.fused.rows import (
     fill,
     loop,
     normalised_sums,
-    slot,
 )
-from rts_backends.fused.stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_around, load_tangent, tangent_row
+from rts_backends.fused.stencil import ALPHA, COLORS, TANGENT, change_row, load_tangents
 from rts_backends.fused.uniform_cells import BUSY, FLAT
 
 BAND = 16
@@ -113,7 +111,7 @@ def normal_equations(
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
-    drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines, cells.crossings, cells.settled
+    drawn = cells.plain_grid, cells.grid, cells.choices, cells.outlines, cells.crossings, cells.settled
     given = *drawn, tangents, tuple(fields), in_numbers(loss, dtype), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
@@ -133,17 +131,17 @@ def _any(tangents: np.ndarray) -> bool:
 
 @loop
 def _accumulate(
-    start, stop, planes, plain, row, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
+    start, stop, planes, plain, grid, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
 ):
     """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
 
     Of rows of pixels that are means of `fine` rows and columns of cells.
     """
-    positions, rgba, fronts, scale, peak, gamma = plain
+    positions, rgba, row = grid.positions, grid.rgba, grid.row
     t_positions, t_rgba = tangents
-    target, layers, many = fields[0], len(fronts), len(t_positions)
+    target, layers, many = fields[0], len(plain.row), len(t_positions)
     height, width, channels = target.shape
-    kind, slope = positions.dtype.type, positions.dtype.type(2) * scale * gamma
+    kind = positions.dtype.type
     sources, value = np.empty(3 * layers * SOURCE, positions.dtype), np.empty(SUMS, positions.dtype)
     moving, change = (
         np.empty((many, 3 * layers * TANGENT), positions.dtype),
@@ -171,46 +169,37 @@ def _accumulate(
                 moving_row = busy(choices.states, down, right, count, least)
                 moving_row |= busy(choices.mixed, down, right, count, 1)
                 if moving_row:
-                    first = load_around(
-                        sources, loaded, positions, rgba, fronts, down, right - 1, count + 2, scale, peak, gamma
-                    )
-                    for v in range(first, y + border + 2):
-                        for k in range(layers):
-                            s = slot(sources, k, v, SOURCE)
-                            for n in range(many):
-                                to, tangent = slot(moving[n], k, v, TANGENT), (t_positions[n], t_rgba[n])
-                                at = left + border - 1, count + 2
-                                load_tangent(to, s, *tangent, fronts, k, v, *at, slope, planes)
-                    normalised_sums(value, sources, layers, y + border, count)
-                    for n in range(many):
-                        to = change[n]
-                        to[: min(layers, 2) * SUM] = kind(0)
-                        for k in range(layers):
-                            for v in range(-1, 2):
-                                source = y + border - v
-                                s, tangent = slot(sources, k, source, SOURCE), slot(moving[n], k, source, TANGENT)
-                                add_tangent_row(to[SUM:] if k > 0 else to, s, tangent, v, count, planes)
-                        tangent_row(to, value, layers, count, planes)
-                    composite(value, layers, count)
-                    _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
+                    window = left + border - 1, count + 2
+                    load_tangents(moving, sources, loaded, plain, *tangents, y + border, *window, planes)
+                    _change(change, value, sources, moving, layers, y + border, count, planes)
+                    _mix(change, value, grid, choices, tangents, border, y, left, count, changes)
                     _move_outlines(change, row, outlines, t_positions, border, y, left, count)
-                    _move_lines(change, plain, row, choices, crossings, tangents, border, y, left, count)
+                    _move_lines(change, grid, choices, crossings, tangents, border, y, left, count)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
                 if len(settled) > 0:
                     cells = settled[y + border, border + left : border + left + count]
                     moving_row |= _settle(change, value, rgba, t_rgba, cells, moving_row)
+                if fine > 1 and y % fine == 0:
+                    mean[:] = kind(0)
+                    mean_change[:] = kind(0)
+                    changing = False
                 if fine > 1:
-                    if y % fine == 0:
-                        mean[:] = kind(0)
-                        mean_change[:] = kind(0)
-                        changing = False
                     _add_means(mean, value, fine, pixels)
-                    for n in range(many if moving_row else 0):
-                        _add_means(mean_change[n], change[n], fine, pixels)
+                for n in range(many if moving_row and fine > 1 else 0):
+                    _add_means(mean_change[n], change[n], fine, pixels)
                 changing = moving_row or (fine > 1 and changing)
                 if (y + 1) % fine == 0:
                     _multiply(sums[band], products, mean_change, mean, fields, loss, y // fine, own, pixels, changing)
+
+
+@compiled
+def _change(change, value, sources, moving, layers, y, count, planes):
+    """Values and tangents of a row of a tile as the stencil makes them."""
+    normalised_sums(value, sources, layers, y, count)
+    for n in range(len(change)):
+        change_row(change[n], moving[n], sources, value, layers, y, count, planes)
+    composite(value, layers, count)
 
 
 @compiled
@@ -226,9 +215,8 @@ def _add_means(to, row, fine, count):
 
 
 @compiled
-def _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes):
+def _mix(change, value, grid, choices, tangents, border, y, left, count, changes):
     """Values and tangents of the mixed targets of a row of a tile, in place of those of the stencil."""
-    positions, rgba, _, scale, peak, gamma = plain
     offsets, columns = choices.offsets, choices.columns
     one = value.dtype.type(1)
     for d in range(offsets[y + border], offsets[y + border + 1]):
@@ -236,8 +224,7 @@ def _mix(change, value, plain, row, choices, tangents, border, y, left, count, c
         if not 0 <= j < count:
             continue
         total = choices.sums[d]
-        given = positions, rgba, row, y + border, columns[d], choices.ranges[d], scale, peak, gamma
-        changes_of(changes, total, *given, *tangents)
+        changes_of(changes, total, grid, y + border, columns[d], choices.ranges[d], *tangents)
         for c in range(4):
             back = total[1, c] + (one - total[1, 3]) * total[2, c]
             value[c * PITCH + j] = total[0, c] + (one - total[0, 3]) * back
@@ -259,18 +246,16 @@ def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
 
 
 @compiled
-def _move_lines(change, plain, row, choices, crossings, tangents, border, y, left, count):
+def _move_lines(change, grid, choices, crossings, tangents, border, y, left, count):
     """The derivatives of targets beside lines of crossing in a row of a tile, in place of all others."""
-    positions, rgba, _, scale, peak, gamma = plain
     t_positions, t_rgba = tangents
-    given = positions, rgba, row, scale, peak, gamma, choices.ranges, choices.sums
     pixel = np.empty(4, change.dtype)
     for d in range(crossings.offsets[y + border], crossings.offsets[y + border + 1]):
         j = crossings.columns[d] - border - left
         if not 0 <= j < count:
             continue
         for n in range(len(change)):
-            change_of(pixel, d, crossings, *given, y + border, t_positions[n], t_rgba[n])
+            change_of(pixel, d, crossings, grid, choices.ranges, choices.sums, y + border, t_positions[n], t_rgba[n])
             for c in range(4):
                 change[n, c * PITCH + j] = pixel[c]
 
@@ -314,20 +299,18 @@ def _multiply(sums, products, change, value, fields, loss, y, left, count, chang
     for c in range(channels):
         p, own = (first + c) * PITCH, c * count
         for n in range(0 if changing else many, many + 1):
-            to = products[n, own : own + count]
+            to, shown = products[n, own : own + count], len(background) > 0
             if n < many:
                 # A loop, since for arrays that are assigned numba compiles an error that tells their shapes: a second.
                 for j in range(count):
                     to[j] = change[n, p + j]
-                if len(background) > 0:
-                    for j in range(count):
-                        to[j] -= change[n, OPACITY + j] * background[y, left + j, first + c]
+                for j in range(count if shown else 0):
+                    to[j] -= change[n, OPACITY + j] * background[y, left + j, first + c]
             else:
                 for j in range(count):
                     to[j] = value[p + j] - target[y, left + j, c]
-                if len(background) > 0:
-                    for j in range(count):
-                        to[j] += (one - value[OPACITY + j]) * background[y, left + j, first + c]
+                for j in range(count if shown else 0):
+                    to[j] += (one - value[OPACITY + j]) * background[y, left + j, first + c]
             if len(weights) > 0:
                 w = min(c, weights.shape[2] - 1)
                 for j in range(count):

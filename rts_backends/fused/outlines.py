@@ -105,13 +105,20 @@ def narrow(start, stop, ends, wanted, kept, counts):
         for x in range(width):
             bits = ends[y, x]
             if bits & LISTED and not wanted[y, x]:
-                bits &= DIRECTIONS
-                for n in range(9):
-                    v, u = y + n // 3 - 1, x + n % 3 - 1
-                    if 0 <= v < height and 0 <= u < width and ends[v, u] & LISTED and wanted[v, u]:
-                        bits |= BESIDE
+                bits = bits & DIRECTIONS | _beside(ends, wanted, y, x)
             kept[y, x] = bits
             counts[y] += bits & LISTED != 0
+
+
+@compiled
+def _beside(ends, wanted, y, x):
+    """BESIDE where a target is beside a wanted one that is listed, or no mark."""
+    height, width = ends.shape
+    for n in range(9):
+        v, u = y + n // 3 - 1, x + n % 3 - 1
+        if 0 <= v < height and 0 <= u < width and ends[v, u] & LISTED and wanted[v, u]:
+            return BESIDE
+    return 0
 
 
 # Helpers that are handed arrays have references to them counted, call by call, where the code has branches. So what is
@@ -129,17 +136,16 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     second = min(1, layers - 1)
     back = exits[y, x] if leaves else row[second, y, x]
     same = layers > 1 if one_part else len(part) > 1 and part[0, y, x] == part[1, y, x]
-    if back >= 0 and (leaves or same):
-        own, m = positions[back, 2] - front, 0
-        while OUTWARD[bits, m] >= 0:
-            py, px = y + 1 - OUTWARD[bits, m] // 3, x + 1 - OUTWARD[bits, m] % 3
-            if 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
-                j = exits[py, px] if leaves else row[second, py, px]
-                if j >= 0:
-                    inner = positions[j, 2] - positions[row[0, py, px], 2]
-                    if rules.converging * own * own <= inner * inner:
-                        return -rules.half, back
-            m += 1
+    own, m = positions[back, 2] - front, 0
+    while back >= 0 and (leaves or same) and OUTWARD[bits, m] >= 0:
+        py, px = y + 1 - OUTWARD[bits, m] // 3, x + 1 - OUTWARD[bits, m] % 3
+        j = -1
+        if 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
+            j = exits[py, px] if leaves else row[second, py, px]
+        inner = positions[j, 2] - positions[row[0, py, px], 2] if j >= 0 else zero
+        if j >= 0 and rules.converging * own * own <= inner * inner:
+            return -rules.half, back
+        m += 1
     beta, partner = zero, np.int32(-1)
     for m in range(9):
         n = OUTWARD[bits, m]
@@ -168,12 +174,7 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
 def fill(
     start,
     stop,
-    positions,
-    rgba,
-    row,
-    scale,
-    peak,
-    gamma,
+    grid,
     part,
     one_part,
     exits,
@@ -192,12 +193,7 @@ def fill(
     Args:
         start: first row.
         stop: end of the rows.
-        positions: (N, 3).
-        rgba: (N, 4).
-        row: (K, H, W).
-        scale: the exponent's factor.
-        peak: of the weights, along one axis.
-        gamma: the calibration.
+        grid: the samples.
         part: (K, H, W), the part of each sample, or no layers.
         one_part: whether all are known to be of one.
         exits: (H, W), where rays leave the part of the front, or no rows.
@@ -212,11 +208,12 @@ def fill(
         found: `Outlines`, to be filled but for its offsets.
     """
     beta, partner, offsets, columns, gives, slopes, changes = found
+    positions, row, peak = grid.positions, grid.row, grid.peak
     kind, width = positions.dtype.type, ends.shape[1]
     around, which, samples = np.empty((9, 3), positions.dtype), np.empty(9, np.int64), np.empty(9, np.int64)
     for n in range(9):
         u, v = kind(n % 3 - 1), kind(n // 3 - 1)
-        around[n, 0], around[n, 1], around[n, 2] = u, v, peak * peak * exp(-(u * u + v * v) * scale)
+        around[n, 0], around[n, 1], around[n, 2] = u, v, peak * peak * exp(-(u * u + v * v) * grid.scale)
     for y in range(start, stop):
         d, m = offsets[y], firsts[y]
         for b in range((width + BLOCK - 1) // BLOCK):
@@ -229,15 +226,15 @@ def fill(
                 covered = row[0, y, x] >= 0
                 if covered:
                     beta[y, x] = positions.dtype.type(0)
-                    if ends[y, x] & DIRECTIONS:
-                        rule = _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules)
-                        beta[y, x], partner[y, x] = rule
+                if covered and ends[y, x] & DIRECTIONS:
+                    rule = _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules)
+                    beta[y, x], partner[y, x] = rule
                 if not ends[y, x] & LISTED:
                     continue
                 columns[d] = x
                 while m < firsts[y + 1] and mixed[m] < x:
                     m += 1
-                own = _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples)
+                own = _weigh(gives, slopes, d, grid, y, x, around, which, samples)
                 if m < firsts[y + 1] and mixed[m] == x:
                     front, surface = _change_mixed(changes, d, sums, m)
                     _list(gives, d, ranges, m, front, surface)
@@ -260,11 +257,12 @@ def _any(ends):
 
 
 @compiled
-def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples):
+def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
     """List the slopes of the weights of the fronts around a target, and what each gives if none is mixed.
 
     Returns their sums, of colours and weights.
     """
+    positions, rgba, row, scale, _, gamma = grid
     _, height, width = row.shape
     kind, count, n = positions.dtype.type, 0, 0
     for v in range(-1, 2):
@@ -421,28 +419,33 @@ def _pull_rows(top, bottom, row, beta, partner, offsets, columns, gives, slopes,
             for c in range(4):
                 front += g[y - border, x - border, c] * changes[d, 0, c]
                 surface += g[y - border, x - border, c] * changes[d, 1, c]
-            if front == zero and surface == zero:
-                continue
-            joined_x, joined_y, n = zero, zero, 0
-            for v in range(-1, 2):
-                for u in range(-1, 2):
-                    given = gives[d, n]
-                    if given != NOTHING:
-                        h = front if given == FRONT else surface
-                        h_x, h_y = h * slopes[d, n, 0], h * slopes[d, n, 1]
-                        if given == JOINED:
-                            i = row[0, y - v, x - u]
-                            g_positions[i, 0] -= h_x
-                            g_positions[i, 1] -= h_y
-                            joined_x, joined_y = joined_x + h_x, joined_y + h_y
-                        else:
-                            _lead(g_positions, row, beta, partner, y - v, x - u, h_x, h_y)
-                    n += 1
-            if joined_x != zero or joined_y != zero:
-                i = row[0, y, x]
-                g_positions[i, 0] += joined_x
-                g_positions[i, 1] += joined_y
-                _lead(g_positions, row, beta, partner, y, x, joined_x, joined_y)
+            if front != zero or surface != zero:
+                _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front, surface)
+
+
+@compiled
+def _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front, surface):
+    """`pull` of a target, from the gradients of the coverage of its buffers in front and at the surface."""
+    zero = g_positions.dtype.type(0)
+    joined_x, joined_y = zero, zero
+    for n in range(9):
+        given, py, px = gives[d, n], y + 1 - n // 3, x + 1 - n % 3
+        if given == NOTHING:
+            continue
+        h = front if given == FRONT else surface
+        h_x, h_y = h * slopes[d, n, 0], h * slopes[d, n, 1]
+        if given == JOINED:
+            i = row[0, py, px]
+            g_positions[i, 0] -= h_x
+            g_positions[i, 1] -= h_y
+            joined_x, joined_y = joined_x + h_x, joined_y + h_y
+        else:
+            _lead(g_positions, row, beta, partner, py, px, h_x, h_y)
+    if joined_x != zero or joined_y != zero:
+        i = row[0, y, x]
+        g_positions[i, 0] += joined_x
+        g_positions[i, 1] += joined_y
+        _lead(g_positions, row, beta, partner, y, x, joined_x, joined_y)
 
 
 @compiled(inline="always")

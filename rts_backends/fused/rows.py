@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -67,6 +68,26 @@ def _exp(x):
     return single
 
 
+class Grid(NamedTuple):
+    """Samples in their cells, and the numbers of a splatter, as loops take them; all floats of one dtype.
+
+    Attributes:
+        positions: (N, 3).
+        rgba: (N, 4).
+        row: (K, H, W) int32, the sample of each cell, or −1.
+        scale: the exponent's factor.
+        peak: of the weights, along one axis.
+        gamma: the calibration.
+    """
+
+    positions: np.ndarray
+    rgba: np.ndarray
+    row: np.ndarray
+    scale: float
+    peak: float
+    gamma: float
+
+
 # Helpers get views, so that the compiler knows that no index is negative: it would have to count from the end.
 
 
@@ -97,8 +118,9 @@ def busy(states, y, first, count, least):
 
 
 @compiled
-def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
+def load(s, grid, k, y, first, count):
     """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
+    positions, rgba, row, scale, peak, gamma = grid
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     _, height, width = row.shape
     filled = False

@@ -35,20 +35,21 @@ X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 
 
 @compiled
-def load_around(sources, loaded, positions, rgba, row, y, first, count, scale, peak, gamma):
+def load_around(sources, loaded, grid, y, first, count):
     """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; returns the first row that was not."""
     start = y + 2
     for v in range(y + 1, y - 2, -1):
         if loaded[(v + 3) % 3] != v:
             loaded[(v + 3) % 3], start = v, v
-            for k in range(len(row)):
-                load(slot(sources, k, v, SOURCE), positions, rgba, row, k, v, first, count, scale, peak, gamma)
+            for k in range(len(grid.row)):
+                load(slot(sources, k, v, SOURCE), grid, k, v, first, count)
     return start
 
 
 @loop
-def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, border, image):
+def forward(start, stop, grid, states, border, image):
     """Fill rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
+    rgba, row = grid.rgba, grid.row
     layers, (_, width, _) = len(row), image.shape
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
     loaded = np.empty(3, np.int64)
@@ -58,7 +59,7 @@ def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, borde
         for y in range(start, stop):
             if busy(states, y + border, left + border, count, BUSY):
                 at = left + border - 1
-                load_around(sources, loaded, positions, rgba, row, y + border, at, count + 2, scale, peak, gamma)
+                load_around(sources, loaded, grid, y + border, at, count + 2)
                 normalised_sums(total, sources, layers, y + border, count)
                 composite(total, layers, count)
                 store(image, y, left, total, count)
@@ -162,13 +163,14 @@ def gather(to, s, above, level, below, count):
 
 
 @loop
-def pull(start, stop, positions, rgba, row, scale, peak, gamma, states, border, g, g_positions, g_rgba):
+def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
     """Gradients of what source rows [start, stop) give to targets that are not mixed; each cell collects its own."""
+    row = grid.row
     layers, _, width = row.shape
     sources, total = np.empty(3 * layers * SOURCE, g.dtype), np.empty(SUMS, g.dtype)
     adjoints, given, found = np.empty(3 * SUMS, g.dtype), np.empty(SUMS, g.dtype), np.empty(8 * PITCH, g.dtype)
     loaded, active = np.empty(3, np.int64), np.empty(3, np.bool_)
-    slope, least = g.dtype.type(2) * scale * gamma, FLAT if len(g_rgba) > 0 else BUSY
+    slope, least = g.dtype.type(2) * grid.scale * grid.gamma, FLAT if len(g_rgba) > 0 else BUSY
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
         loaded[:] = -9
@@ -180,7 +182,7 @@ def pull(start, stop, positions, rgba, row, scale, peak, gamma, states, border, 
                 some = _any(given, count + 2)
             active[(y + 3) % 3] = some
             if some:
-                load_around(sources, loaded, positions, rgba, row, y, left - 2, count + 4, scale, peak, gamma)
+                load_around(sources, loaded, grid, y, left - 2, count + 4)
                 normalised_sums(total, sources, layers, y, count + 2)
                 adjoint_row(adjoint, total, given, layers, count + 2)
             else:
@@ -231,6 +233,29 @@ def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope, pla
 
 
 @compiled
+def load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, y, first, count, planes=COLORS):
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet, and beside them those of tangents."""
+    slope = sources.dtype.type(2) * grid.scale * grid.gamma
+    for v in range(load_around(sources, loaded, grid, y, first, count), y + 2):
+        for k in range(len(grid.row)):
+            s = slot(sources, k, v, SOURCE)
+            for n in range(len(tangents)):
+                to = slot(tangents[n], k, v, TANGENT)
+                load_tangent(to, s, t_positions[n], t_rgba[n], grid.row, k, v, first, count, slope, planes)
+
+
+@compiled
+def change_row(to, tangents, sources, total, layers, y, count, planes=COLORS):
+    """The tangent of target row y, in the first planes of `to`, from the slots of sources and of their tangents."""
+    to[: min(layers, 2) * SUM] = to.dtype.type(0)
+    for k in range(layers):
+        for v in range(-1, 2):
+            s, tangent = slot(sources, k, y - v, SOURCE), slot(tangents, k, y - v, TANGENT)
+            add_tangent_row(to[SUM:] if k > 0 else to, s, tangent, v, count, planes)
+    tangent_row(to, total, layers, count, planes)
+
+
+@compiled
 def add_tangent_row(to, s, tangent, v, count, planes=COLORS):
     """The tangent of `add_row`."""
     wy, dv = s[WY + (v + 1) * PITCH :], s.dtype.type(v)
@@ -267,16 +292,16 @@ def tangent_row(to, total, layers, count, planes=COLORS):
 
 
 @loop
-def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, states, border, out):
+def push(start, stop, grid, t_positions, t_rgba, states, border, out):
     """Fill rows [start, stop) of the tangents (T, H, W, 4). Tangents that are zeros may be absent: (T, 0, ·)."""
-    layers, (many, _, width, _) = len(row), out.shape
+    layers, (many, _, width, _) = len(grid.row), out.shape
     sources, total, change = (
         np.empty(3 * layers * SOURCE, out.dtype),
         np.empty(SUMS, out.dtype),
         np.empty(SUMS, out.dtype),
     )
     tangents, loaded = np.empty((many, 3 * layers * TANGENT), out.dtype), np.empty(3, np.int64)
-    slope, least = out.dtype.type(2) * scale * gamma, FLAT if t_rgba.shape[1] > 0 else BUSY
+    least = FLAT if t_rgba.shape[1] > 0 else BUSY
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
         loaded[:] = -9
@@ -284,21 +309,9 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_r
             if not busy(states, y + border, left + border, count, least):
                 out[:, y, left : left + count] = out.dtype.type(0)
                 continue
-            down, right = y + border, left + border - 1
-            first = load_around(sources, loaded, positions, rgba, row, down, right, count + 2, scale, peak, gamma)
-            for v in range(first, y + border + 2):
-                for k in range(layers):
-                    s = slot(sources, k, v, SOURCE)
-                    for n in range(many):
-                        to = slot(tangents[n], k, v, TANGENT)
-                        load_tangent(to, s, t_positions[n], t_rgba[n], row, k, v, left + border - 1, count + 2, slope)
+            at = y + border, left + border - 1, count + 2
+            load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, *at)
             normalised_sums(total, sources, layers, y + border, count)
             for n in range(many):
-                change[: min(layers, 2) * SUM] = out.dtype.type(0)
-                for k in range(layers):
-                    for v in range(-1, 2):
-                        at = y + border - v
-                        s, tangent = slot(sources, k, at, SOURCE), slot(tangents[n], k, at, TANGENT)
-                        add_tangent_row(change[SUM:] if k > 0 else change, s, tangent, v, count)
-                tangent_row(change, total, layers, count)
+                change_row(change, tangents[n], sources, total, layers, y + border, count)
                 store(out[n], y, left, change, count)

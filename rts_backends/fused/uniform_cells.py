@@ -268,9 +268,8 @@ def paint(start, stop, settled, border, colors, images):
             cells = settled[y + border, border : border + len(image)]
             for x in range(len(image)):
                 i = cells[x]
-                if i >= 0:
-                    for c in range(4):
-                        image[x, c] = colors[n, i, c] if some else zero
+                for c in range(4 if i >= 0 else 0):
+                    image[x, c] = colors[n, i, c] if some else zero
 
 
 @loop

@@ -21,7 +21,7 @@ import numpy as np
 from rts import Camera, InputError, TriangleSampler, errors
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
-from rts_backends.exact_hits import corner_lists, places, settle
+from rts_backends.exact_hits import corner_lists, correct, places
 from rts_backends.opengl.worker import LESS, Worker
 from rts_backends.raster import Raster
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
@@ -121,7 +121,7 @@ class OpenGL(TriangleSampler):
         )
         proxy = prepared.proxy
         scene = pixel_matrix(camera, size), -camera.view[2], keep, proxy.vertices, proxy.faces, *prepared.corners
-        parallel(settle, height, *scene, *fragments)
+        parallel(correct, height, *scene, *fragments)
         return fragments
 
     def _warn(self) -> None:

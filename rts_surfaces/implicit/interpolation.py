@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
-
-import numpy as np
 
 from rts import engine_of, namespace
 from rts.plugin_api.arrays import Array
 from rts.plugin_api.operations import Operation, combine
-from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.implicit.lattice import Lattice
 
 Numbers = tuple[float, ...]
@@ -84,55 +81,14 @@ def _shape(values: tuple[int, ...], points: tuple[int, ...], **_: object) -> tup
     return points[0], 3
 
 
-def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
-    from rts_surfaces.implicit import interpolation_loops
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts_surfaces.implicit import interpolation_loops as loops
 
-    values, points = operands
-    parallel(interpolation_loops.value, len(points), values, points, low, step, out, work=150 * len(points))
-
-
-def _push(
-    operands: Sequence[np.ndarray],
-    tangents: Sequence[np.ndarray | None],
-    out: np.ndarray,
-    *,
-    low: Numbers,
-    step: Numbers,
-) -> None:
-    from rts_surfaces.implicit import interpolation_loops
-
-    (values, points), (t_values, t_points) = operands, tangents
-    out[...] = 0
-    if t_values is not None:
-        _forward((read_only(t_values), points), out, low=low, step=step)
-    if t_points is not None:
-        arguments = values, points, read_only(t_points), low, step, out
-        parallel(interpolation_loops.push_points, len(points), *arguments, work=300 * len(points))
-
-
-def _pull(
-    operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None], *, low: Numbers, step: Numbers
-) -> None:
-    from rts_surfaces.implicit import interpolation_loops
-
-    (values, points), (g_values, g_points), g = operands, results, read_only(g)
-    if g_values is not None:
-        interpolation_loops.pull_values(points, g, low, step, g_values)
-    if g_points is not None:
-        arguments = values, points, g, low, step, g_points
-        parallel(interpolation_loops.pull_points, len(points), *arguments, work=300 * len(points))
+    return loops.forward, loops.push, loops.pull
 
 
 _PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
-DIFFERENCES = Operation(
-    "rts_surfaces.differences",
-    _specification,
-    ranks=(3, 2),
-    shape=_shape,
-    forward=_forward,
-    push=_push,
-    pull=_pull,
-    differentiable=2,
-    **_PACKED,
+DIFFERENCES = Operation.of_loops(
+    "rts_surfaces.differences", _specification, (3, 2), _shape, _loops, differentiable=2, **_PACKED
 )
 """The operation of `differences`, on values and points; low and step are the lattice's."""

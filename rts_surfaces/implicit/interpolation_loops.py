@@ -5,6 +5,49 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
+from rts.plugin_api.threads import parallel
+
+Numbers = tuple[float, ...]
+
+
+def forward(values: np.ndarray, points: np.ndarray, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
+    """Fill the differences (N, 3) at points (N, 3)."""
+    parallel(_value, len(points), values, points, low, step, out, work=150 * len(points))
+
+
+def push(
+    values: np.ndarray,
+    points: np.ndarray,
+    t_values: np.ndarray | None,
+    t_points: np.ndarray | None,
+    out: np.ndarray,
+    *,
+    low: Numbers,
+    step: Numbers,
+) -> None:
+    """Fill their derivatives (N, 3) along tangents of values (X, Y, Z) and points, or None for zeros."""
+    out[...] = 0
+    if t_values is not None:
+        forward(t_values, points, out, low=low, step=step)
+    if t_points is not None:
+        parallel(_push_points, len(points), values, points, t_points, low, step, out, work=300 * len(points))
+
+
+def pull(
+    values: np.ndarray,
+    points: np.ndarray,
+    g: np.ndarray,
+    g_values: np.ndarray | None,
+    g_points: np.ndarray | None,
+    *,
+    low: Numbers,
+    step: Numbers,
+) -> None:
+    """Pull back the gradient `g` (N, 3): add to that of the values, and fill that of the points, where wanted."""
+    if g_values is not None:
+        _pull_values(points, g, low, step, g_values)
+    if g_points is not None:
+        parallel(_pull_points, len(points), values, points, g, low, step, g_points, work=300 * len(points))
 
 
 @compiled(inline="always")
@@ -39,7 +82,7 @@ def _difference(values, at, axis, step):
 
 
 @loop
-def value(start, stop, values, points, low, step, out):
+def _value(start, stop, values, points, low, step, out):
     """Fill the differences (N, 3) at points `start` to `stop`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     for n in range(start, stop):
@@ -69,7 +112,7 @@ def _share_slopes(i, near, slopes, out):
 
 
 @loop
-def push_points(start, stop, values, points, tangents, low, step, out):
+def _push_points(start, stop, values, points, tangents, low, step, out):
     """Add the derivatives along tangents (N, 3) of the points."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
@@ -87,7 +130,7 @@ def push_points(start, stop, values, points, tangents, low, step, out):
 
 
 @loop
-def pull_points(start, stop, values, points, g, low, step, results):
+def _pull_points(start, stop, values, points, g, low, step, results):
     """Fill the gradients (N, 3) of the points, from the gradients of the differences."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
@@ -107,7 +150,7 @@ def pull_points(start, stop, values, points, g, low, step, results):
 
 
 @loop
-def pull_values(points, g, low, step, results):
+def _pull_values(points, g, low, step, results):
     """Add the gradients (X, Y, Z) of the values, from the gradients of the differences."""
     shape = results.shape
     lowest, near, slopes = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3)

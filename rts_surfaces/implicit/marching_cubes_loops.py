@@ -46,6 +46,26 @@ def _codes(low, high, y, count, out):
         out[z] = below | above << 4
 
 
+@compiled
+def _mixed(codes, count, found):
+    """Fill `found` with the cells of a row that are mixed, looked for by eights; returns how many there are."""
+    words, full, many = codes.view(np.uint64), np.uint64(0xFFFFFFFFFFFFFFFF), 0
+    for w in range(len(words)):
+        if words[w] == 0 or words[w] == full:
+            continue
+        for z in range(8 * w, min(8 * w + 8, count)):
+            found[many] = z
+            many += codes[z] != 0 and codes[z] != 255
+    return many
+
+
+@compiled
+def _crossed(code):
+    """A bit for each axis along which the edge that a cell owns is crossed."""
+    own = code & 1
+    return (own != code >> 1 & 1) | np.int64(own != code >> 2 & 1) << 1 | np.int64(own != code >> 4 & 1) << 2
+
+
 @compiled(inline="always")
 def _is_real(x, y, z, shape, closed):
     """True if a cell, counted with the border, has triangles."""
@@ -60,28 +80,20 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
     planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
     cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
     codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    words = codes.view(np.uint64)
+    listed = np.empty(cells_z, np.int64)
     first = -1 if closed else 0
     _signs(values, isovalue, sign, closed, start + first, planes[0])
-    full = np.uint64(0xFFFFFFFFFFFFFFFF)
     for x in range(start, stop):
         low, high = planes[(x - start) % 2], planes[(x - start + 1) % 2]
         _signs(values, isovalue, sign, closed, x + first + 1, high)
         mixed = crossed = triangles = 0
         for y in range(cells_y):
             _codes(low, high, y, cells_z, codes)
-            for w in range(len(words)):
-                if words[w] == 0 or words[w] == full:
-                    continue
-                for z in range(8 * w, min(8 * w + 8, cells_z)):
-                    code = codes[z]
-                    if code == 0 or code == 255:
-                        continue
-                    mixed += 1
-                    own = code & 1
-                    crossed += (own != code >> 1 & 1) + (own != code >> 2 & 1) + (own != code >> 4 & 1)
-                    if _is_real(x, y, z, shape, closed):
-                        triangles += triangles_of[code]
+            for z in listed[: _mixed(codes, cells_z, listed)]:
+                mixed += 1
+                crossed += _bit_count(_crossed(codes[z]))
+                if _is_real(x, y, z, shape, closed):
+                    triangles += triangles_of[codes[z]]
         tally[x, 0], tally[x, 1], tally[x, 2] = mixed, crossed, triangles
 
 
@@ -114,49 +126,43 @@ def vertices(
     planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
     cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
     codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    words = codes.view(np.uint64)
+    listed = np.empty(cells_z, np.int64)
     shift = 1 if closed else 0
     _signs(values, isovalue, sign, closed, start - shift, planes[0])
-    full = np.uint64(0xFFFFFFFFFFFFFFFF)
-    a, b = np.empty(3, np.int64), np.empty(3, np.int64)
     for x in range(start, stop):
         low, high = planes[(x - start) % 2], planes[(x - start + 1) % 2]
         _signs(values, isovalue, sign, closed, x - shift + 1, high)
         cell, vertex = offsets[x, 0], offsets[x, 1]
         for y in range(cells_y):
             _codes(low, high, y, cells_z, codes)
-            for w in range(len(words)):
-                if words[w] == 0 or words[w] == full:
-                    continue
-                for z in range(8 * w, min(8 * w + 8, cells_z)):
-                    code = codes[z]
-                    if code == 0 or code == 255:
-                        continue
-                    cells[cell], codes_of[cell] = y * cells_z + z, code
-                    cell += 1
-                    own = code & 1
-                    crossed = (
-                        (own != code >> 1 & 1)
-                        | np.int64(own != code >> 2 & 1) << 1
-                        | np.int64(own != code >> 4 & 1) << 2
-                    )
-                    first_of[x, y, z] = 8 * vertex + crossed
-                    for axis in range(3):
-                        if not crossed >> axis & 1:
-                            continue
-                        a[0], a[1], a[2] = x - shift, y - shift, z - shift
-                        b[:] = a
-                        b[axis] += 1
-                        for i in range(3):
-                            a[i], b[i] = max(a[i], 0), min(b[i], shape[i] - 1)
-                        ends[vertex, 0] = (a[0] * shape[1] + a[1]) * shape[2] + a[2]
-                        ends[vertex, 1] = (b[0] * shape[1] + b[1]) * shape[2] + b[2]
-                        f_a, f_b = np.float64(values[a[0], a[1], a[2]]), np.float64(values[b[0], b[1], b[2]])
-                        apart[vertex] = abs(f_b - f_a)
-                        along = (isovalue - f_a) / (f_b - f_a) if f_a != f_b else 0.0
-                        for i in range(3):
-                            places[vertex, i] = origin[i] + step[i] * (a[i] + along * (b[i] - a[i]))
-                        vertex += 1
+            for z in listed[: _mixed(codes, cells_z, listed)]:
+                crossed = _crossed(codes[z])
+                cells[cell], codes_of[cell] = y * cells_z + z, codes[z]
+                cell += 1
+                first_of[x, y, z] = 8 * vertex + crossed
+                own = x - shift, y - shift, z - shift
+                vertex = _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart)
+
+
+@compiled
+def _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart):
+    """Fill in the vertices on the edges that a cell owns, from this number on; the number of the next."""
+    shape = values.shape
+    ax, ay, az = max(own[0], 0), max(own[1], 0), max(own[2], 0)
+    for axis in range(3):
+        if not crossed >> axis & 1:
+            continue
+        bx, by = min(own[0] + (axis == 0), shape[0] - 1), min(own[1] + (axis == 1), shape[1] - 1)
+        bz = min(own[2] + (axis == 2), shape[2] - 1)
+        ends[vertex, 0], ends[vertex, 1] = (ax * shape[1] + ay) * shape[2] + az, (bx * shape[1] + by) * shape[2] + bz
+        f_a, f_b = np.float64(values[ax, ay, az]), np.float64(values[bx, by, bz])
+        apart[vertex] = abs(f_b - f_a)
+        along = (isovalue - f_a) / (f_b - f_a) if f_a != f_b else 0.0
+        places[vertex, 0] = origin[0] + step[0] * (ax + along * (bx - ax))
+        places[vertex, 1] = origin[1] + step[1] * (ay + along * (by - ay))
+        places[vertex, 2] = origin[2] + step[2] * (az + along * (bz - az))
+        vertex += 1
+    return vertex
 
 
 @compiled(inline="always")

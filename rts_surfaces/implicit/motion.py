@@ -5,14 +5,13 @@ Both take values (M,), params (N, P) in their dtype, and rows (N, 6) int32: the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from rts import InputError, engine_of, namespace
 from rts.plugin_api.arrays import Array
 from rts.plugin_api.operations import Operation, combine, take
-from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.implicit.lattice import Lattice
 
 Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
@@ -32,8 +31,8 @@ def _shape(values: tuple[int, ...], params: tuple[int, ...], *_: object, **__: o
     return params[0], 3
 
 
-def _checked(operands: Sequence[np.ndarray], width: int) -> Sequence[np.ndarray]:
-    values, params, *numbers = operands
+def _check(values: np.ndarray, params: np.ndarray, *numbers: np.ndarray, **_: object) -> None:
+    width = 16 if len(numbers) == 1 else 4
     for rows in numbers:
         if rows.shape != (len(params), 6) or params.shape[1] != width:
             raise InputError(
@@ -45,45 +44,21 @@ def _checked(operands: Sequence[np.ndarray], width: int) -> Sequence[np.ndarray]
         raise InputError(
             f"samples refer to values from {rows.min()} to {rows.max()} of {len(values)}; sample this surface anew"
         )
-    return operands
 
 
-def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
-    from rts_surfaces.implicit import motion_loops
+def _loops_along() -> tuple[Callable, Callable, Callable]:
+    from rts_surfaces.implicit import motion_loops as loops
 
-    values, params, rows = _checked(operands, 16)
-    real = values.dtype.type
-    parallel(motion_loops.move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
+    return loops.along, loops.push_along, loops.pull_along
 
 
-def _push(
-    operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float
-) -> None:
-    from rts_surfaces.implicit import motion_loops
-
-    values, params, rows = _checked(operands, 16)
-    arguments = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
-    parallel(motion_loops.push, len(rows), *arguments, work=30 * len(rows))
-
-
-def _pull(
-    operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None], *, isovalue: float, sign: float
-) -> None:
-    from rts_surfaces.implicit import motion_loops
-
-    values, params, rows = _checked(operands, 16)
-    if results[0] is not None:
-        motion_loops.pull(read_only(g), params, rows, values.dtype.type(sign), results[0])
-
-
-ALONG_NORMAL = Operation(
+ALONG_NORMAL = Operation.of_loops(
     "rts_surfaces.along_normal",
     _by_level,
-    ranks=(1, 2, 2),
-    shape=_shape,
-    forward=_forward,
-    push=_push,
-    pull=_pull,
+    (1, 2, 2),
+    _shape,
+    _loops_along,
+    _check,
     packed=(1, 2),
     packed_result=True,
 )
@@ -123,48 +98,19 @@ def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
     return xp.where(singular, along - change / xp.where(singular, bounded, xp.ones_like(bounded)), exact)
 
 
-def _forward_edges(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges) -> None:
-    from rts_surfaces.implicit import motion_loops
+def _loops_crossing() -> tuple[Callable, Callable, Callable]:
+    from rts_surfaces.implicit import motion_loops as loops
 
-    values, params, rows, numbers = _checked(operands, 4)
-    arguments = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_loops.cross, len(rows), *arguments, work=60 * len(rows))
+    return loops.crossing, loops.push_crossing, loops.pull_crossing
 
 
-def _push_edges(
-    operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges
-) -> None:
-    from rts_surfaces.implicit import motion_loops
-
-    values, params, rows, numbers = _checked(operands, 4)
-    arguments = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_loops.push_crossings, len(rows), *arguments, work=60 * len(rows))
-
-
-def _pull_edges(
-    operands: Sequence[np.ndarray],
-    g: np.ndarray,
-    results: Sequence[np.ndarray | None],
-    *,
-    isovalue: float,
-    lattice: Edges,
-) -> None:
-    from rts_surfaces.implicit import motion_loops
-
-    values, params, rows, numbers = _checked(operands, 4)
-    if results[0] is not None:
-        arguments = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
-        motion_loops.pull_crossings(*arguments)
-
-
-ALONG_EDGES = Operation(
+ALONG_EDGES = Operation.of_loops(
     "rts_surfaces.along_edges",
     _by_crossings,
-    ranks=(1, 2, 2, 2),
-    shape=_shape,
-    forward=_forward_edges,
-    push=_push_edges,
-    pull=_pull_edges,
+    (1, 2, 2, 2),
+    _shape,
+    _loops_crossing,
+    _check,
     packed=(1, 2, 3),
     packed_result=True,
 )

@@ -5,10 +5,54 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
+from rts.plugin_api.threads import parallel
+
+
+def along(
+    values: np.ndarray, params: np.ndarray, rows: np.ndarray, out: np.ndarray, *, isovalue: float, sign: float
+) -> None:
+    """Fill the places (N, 3) of samples that move along the gradient."""
+    real = values.dtype.type
+    parallel(_move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
+
+
+def push_along(
+    values: np.ndarray, params: np.ndarray, rows: np.ndarray, moved: np.ndarray, out: np.ndarray, **given: float
+) -> None:
+    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    sign = values.dtype.type(given["sign"])
+    parallel(_push, len(rows), moved, params, rows, sign, out, work=30 * len(rows))
+
+
+def pull_along(
+    values: np.ndarray, params: np.ndarray, rows: np.ndarray, g: np.ndarray, result: np.ndarray, **given: float
+) -> None:
+    """Add to the gradient (M,) of the values, of that (N, 3) of the places."""
+    _pull(g, params, rows, values.dtype.type(given["sign"]), result)
+
+
+def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
+    """Fill the places (N, 3) of samples whose corners slide along edges."""
+    *given, out = rest
+    count, level = len(out), values.dtype.type(isovalue)
+    parallel(_cross, count, values, *given, level, *lattice, out, work=60 * count)
+
+
+def push_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
+    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    *given, moved, out = rest
+    count, level = len(out), values.dtype.type(isovalue)
+    parallel(_push_crossings, count, values, moved, *given, level, *lattice, out, work=60 * count)
+
+
+def pull_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
+    """Add to the gradient (M,) of the values, of that (N, 3) of the places."""
+    *given, g, result = rest
+    _pull_crossings(values, g, *given, values.dtype.type(isovalue), *lattice, result)
 
 
 @loop
-def move(start, stop, values, params, rows, isovalue, sign, out):
+def _move(start, stop, values, params, rows, isovalue, sign, out):
     """Fill the places (N, 3) of samples `start` to `stop`."""
     for n in range(start, stop):
         level = -params[n, 15]
@@ -19,7 +63,7 @@ def move(start, stop, values, params, rows, isovalue, sign, out):
 
 
 @loop
-def push(start, stop, tangents, params, rows, sign, out):
+def _push(start, stop, tangents, params, rows, sign, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
         level = tangents.dtype.type(0)
@@ -30,7 +74,7 @@ def push(start, stop, tangents, params, rows, sign, out):
 
 
 @loop
-def pull(g, params, rows, sign, results):
+def _pull(g, params, rows, sign, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
     for n in range(len(rows)):
         along = g[n, 0] * params[n, 12] + g[n, 1] * params[n, 13] + g[n, 2] * params[n, 14]
@@ -61,7 +105,7 @@ def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
 
 
 @loop
-def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
+def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
     """Fill the places (N, 3) of samples `start` to `stop` whose corners slide along edges."""
     for n in range(start, stop):
         x = y = z = 0.0
@@ -75,7 +119,7 @@ def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step
 
 
 @loop
-def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
+def _push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
         out[n] = 0
@@ -87,7 +131,7 @@ def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalu
 
 
 @loop
-def pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
+def _pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
     for n in range(len(rows)):
         if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
