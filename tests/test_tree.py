@@ -184,6 +184,30 @@ def test_the_architecture_has_a_line_for_every_file():
         assert any(path.stem == named for path in FILES.values()), f"docs/architecture.md names {named}.py"
 
 
+def long_lines(text):
+    """Numbers of the lines of Markdown over 120 characters, outside of tables and fenced code."""
+    fence, numbers = "", []
+    for number, line in enumerate(text.splitlines(), start=1):
+        mark = re.match(r"\s*(```+|~~~+)", line)
+        if mark and (not fence or mark[1].startswith(fence)):
+            fence = "" if fence else mark[1]
+        elif not fence and len(line) > 120 and not line.lstrip().startswith("|"):
+            numbers.append(number)
+    return numbers
+
+
+def test_lines_of_markdown_are_short():
+    folders = [ROOT / name for name in ("docs", "benchmarks", "examples", "tests")]
+    pages = [*ROOT.glob("*.md"), *(page for folder in folders for page in folder.rglob("*.md"))]
+    assert len(pages) > 10
+    assert not {str(p.relative_to(ROOT)): long for p in pages if (long := long_lines(p.read_text()))}
+
+
+def test_a_long_line_of_markdown_is_found():
+    long = 60 * "ab "
+    assert long_lines(f"{long}\n| {long}|\n```text\n{long}\n```\n- {long}\n") == [1, 6]
+
+
 def test_every_file_of_tests_has_one_area():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     areas = {line.partition(":")[0] for line in project["tool"]["pytest"]["ini_options"]["markers"]}
