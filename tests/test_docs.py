@@ -1,11 +1,11 @@
 """The code in README and docs runs, and does what the text beside it says."""
 
-import math
 import re
 import shlex
 import subprocess
 import tomllib
 import warnings
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from sybil.parsers.markdown import PythonCodeBlockParser
 from typer.testing import CliRunner
 
 import rts
+from rts import registry
 from rts.cli.demo import knot
 from rts.cli.main import app
 
@@ -28,8 +29,6 @@ ELSEWHERE = {
     "rts plugins --matrix": "test_compatibility.py",
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
-    'rts compare "stack of cards" --quick --sampler raster --sampler toy': "test_compare.py",
-    "rts compare my_scene.py": "test_compare.py",
 }
 """Commands that take long, and who runs them."""
 
@@ -69,47 +68,52 @@ def test_the_python_of_the_readme_does_what_it_says(model):
     assert float((found["residuals"](found["fit"].parameters) ** 2).mean()) < 1e-5  # Of `ImageResiduals`, too.
 
 
-def test_the_python_of_the_guide_to_plugins_does_what_it_says():
+GUIDE = {
+    "loft": "third_plugin/rts_third_plugin/loft.py",
+    "caster": "third_plugin/rts_third_plugin/caster.py",
+    "toon": "third_plugin/rts_third_plugin/toon.py",
+    "gauss5": "second_plugin/gauss5.py",
+}
+"""Plugins that the guide shows; the conformance kit tests these files."""
+
+
+@pytest.mark.parametrize("name", GUIDE)
+def test_the_guide_shows_plugins_that_are_tested(name):
+    assert (ROOT / "tests" / GUIDE[name]).read_text() in blocks("docs/plugins.md", "python")
+
+
+def test_the_python_of_the_guide_to_plugins_does_what_it_says(tmp_path, monkeypatch):
     torch = pytest.importorskip("torch")
-    package = pytest.importorskip("rts_plugin_example.heightfield")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "tests/third_plugin")
+    entry = EntryPoint("loft", "rts_third_plugin.loft:Loft", "rts.surfaces")
+    surfaces = {**registry._entries("rts.surfaces"), "loft": [entry]}
+    monkeypatch.setitem(registry._entry_points, "rts.surfaces", surfaces)
+    names, _ = run("docs/plugins.md")
+    assert issubclass(names["TestLoft"], rts.testing.SurfaceConformance)
+    # The first picture shows the loft, and its gradient is that of the covered area.
+    assert 0.02 < rts.load_image("loft.png")[..., 3].mean() < 0.5
+    part, camera, step = names["part"], names["camera"], 0.02
 
-    def distance(theta, points):
-        return rts.namespace(points).sum(points * points, axis=-1) ** 0.5 - theta["radius"]
+    def area(scale):
+        theta = {"curves": scale * part.theta["curves"]}
+        return rts.render(part.replace(theta=theta), camera, (256, 256), supersample=4)[..., 3].mean()
 
-    camera = rts.Camera.look_at((0.5, 2.5, 2), (0, 0, 0))
-    names = {"rts": rts, "np": np, "math": math, "camera": camera, "height": package.height, "distance": distance}
-    names |= {"position": np.ones((4, 3)), "scale": np.ones(3)}
-    found, first = run("docs/plugins.md", **names)
-    # The surface of the text is that of the package, in what it shows of it.
-    part = package.Heightfield.example()
-    samples = rts.sample(part, camera, (20, 30)).samples[0]
-    shown = first["Heightfield"].evaluate(None, part.theta, samples)
-    whole = part.surface.evaluate(part.theta, samples)
-    for name in ("position", "normal"):
-        np.testing.assert_array_equal(shown[name], whole[name])
-    # Marching meets a sphere where it is.
-    origins, directions = np.array([[0.0, 0.1, 3.0], [0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]])
-    np.testing.assert_allclose(
-        found["march"]({"radius": 1.0}, origins, directions, 10.0), [3 - math.sqrt(0.99), 2], atol=1e-4
-    )
-    # The splatter keeps a constant, and its ramp that moves has its true derivative.
-    wide = found["Wide"]()
+    slope = (names["curves"].grad * names["curves"].detach()).sum()
+    assert float(slope) == pytest.approx((area(1 + step) - area(1 - step)) / (2 * step), rel=0.1)
+    # The sampler sees what others see, and the splatter has the derivative of a ramp that moves.
+    images = [rts.render(part, camera, (64, 64), sampler=s) for s in (names["Caster"](), "reference")]
+    np.testing.assert_allclose(*images, atol=1e-4)
     y, x = np.indices((12, 12))
     positions = torch.tensor(np.stack([x + 0.5, y + 0.5, np.ones_like(x)], -1).reshape(-1, 3), dtype=torch.float64)
     row = torch.arange(144, dtype=torch.int32).reshape(1, 12, 12)
     ramp = torch.tensor((x / 12.0).reshape(-1, 1)).expand(-1, 4)
     along = torch.zeros_like(positions)
     along[:, 0] = 1
-    image, slope = torch.func.jvp(lambda p: wide.splat(p, ramp, row), (positions,), (along,))
+    splat = names["Gauss5"]().splat
+    image, slope = torch.func.jvp(lambda p: splat(p, ramp, row), (positions,), (along,))
     np.testing.assert_allclose(image[4:-4, 4:-4, 3], x[4:-4, 4:-4] / 12, atol=1e-6)
     np.testing.assert_allclose(slope[4:-4, 4:-4, 3], -1 / 12, rtol=1e-2)
-    # The operation has the derivatives that it says.
-    operands = [torch.randn(5, 3, dtype=torch.float64, requires_grad=True), torch.rand(3, dtype=torch.float64) + 1]
-    assert torch.autograd.gradcheck(lambda p: found["CLAMP"](p, operands[1]), operands[:1], check_forward_ad=True)
-    np.testing.assert_allclose(
-        found["CLAMP"](*operands).detach(), found["CLAMP"].specification(*operands).detach(), atol=1e-12
-    )
-    assert issubclass(found["TestHeightfield"], rts.testing.SurfaceConformance)
 
 
 def shifted_loss(image, target, part, camera, pose, step):
@@ -152,11 +156,12 @@ def test_the_task_in_mitsuba_runs_and_agrees(model):
     assert float(names["dr"].grad(names["shift"])[0][0]) == pytest.approx(-0.272, rel=0.05)
 
 
-def test_the_entry_points_of_the_guide_are_those_of_the_example():
-    written = {}
-    for block in blocks("docs/plugins.md", "toml"):
-        written |= tomllib.loads(block)["project"]
-    real = tomllib.loads((ROOT / "tests/plugin_example/pyproject.toml").read_text())["project"]
+def test_the_project_file_of_the_guide_is_that_of_the_example():
+    [block] = blocks("docs/plugins.md", "toml")
+    written = tomllib.loads(block)["project"]
+    real = tomllib.loads((ROOT / "tests/third_plugin/pyproject.toml").read_text())["project"]
+    points = written.pop("entry-points")
+    assert points and {name: real["entry-points"][name] for name in points} == points
     assert {name: real[name] for name in written} == written
 
 

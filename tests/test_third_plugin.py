@@ -1,4 +1,4 @@
-"""The plugins of `third_plugin`, a distribution written from docs/plugins.md alone, by the conformance kit."""
+"""The plugins of `third_plugin`, which docs/plugins.md shows, by the conformance kit."""
 
 import re
 import sys
@@ -12,14 +12,13 @@ from typer.testing import CliRunner
 
 from rts import registry
 from rts.cli.main import app
-from rts.testing import SamplerConformance, ShaderConformance, SplatterConformance, SurfaceConformance
+from rts.testing import SamplerConformance, ShaderConformance, SurfaceConformance
 
 sys.path.insert(0, str(Path(__file__).parent / "third_plugin"))  # Nothing installs it.
 
 from rts_third_plugin.caster import Caster
 from rts_third_plugin.loft import Loft
 from rts_third_plugin.toon import Toon
-from rts_third_plugin.wide import Wide
 
 pytestmark = pytest.mark.plugins
 
@@ -39,17 +38,11 @@ class TestCaster(SamplerConformance):
 class TestToon(ShaderConformance):
     @pytest.fixture
     def shader(self):
-        return Toon(levels=4, rim=0.8)
+        return Toon(levels=4)
 
     @pytest.fixture
     def theta(self):
         return {"tint": np.array([0.9, 0.6, 0.2])}
-
-
-class TestWide(SplatterConformance):
-    @pytest.fixture
-    def splatter(self):
-        return Wide()
 
 
 def test_its_command_is_listed_and_runs_beside_ours(tmp_path, monkeypatch):

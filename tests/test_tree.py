@@ -146,8 +146,9 @@ def test_the_toolkit_is_small_and_documented():
     assert not set(names) & set(rts.__all__)
     text = (ROOT / "docs/plugins.md").read_text()
     for place, listed in toolkit().items():
+        row = re.search(rf"^\| `{place.rpartition('.')[2]}` \|.*$", text, re.MULTILINE)
         for name in listed:
-            assert re.search(rf"^\| `{place.rpartition('.')[2]}` \| `{name}[`(]", text, re.MULTILINE), f"{place}.{name}"
+            assert row and re.search(rf"`{name}[`(]", row[0]), f"{place}.{name}"
 
 
 def test_old_names_tell_where_they_are():
@@ -181,6 +182,30 @@ def test_the_architecture_has_a_line_for_every_file():
             assert re.search(rf"\b{path.name}\b", tree), f"{name} is not in docs/architecture.md"
     for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_loops.py", "").replace("test_<what>.py", "")):
         assert any(path.stem == named for path in FILES.values()), f"docs/architecture.md names {named}.py"
+
+
+def long_lines(text):
+    """Numbers of the lines of Markdown over 120 characters, outside of tables and fenced code."""
+    fence, numbers = "", []
+    for number, line in enumerate(text.splitlines(), start=1):
+        mark = re.match(r"\s*(```+|~~~+)", line)
+        if mark and (not fence or mark[1].startswith(fence)):
+            fence = "" if fence else mark[1]
+        elif not fence and len(line) > 120 and not line.lstrip().startswith("|"):
+            numbers.append(number)
+    return numbers
+
+
+def test_lines_of_markdown_are_short():
+    folders = [ROOT / name for name in ("docs", "benchmarks", "examples", "tests")]
+    pages = [*ROOT.glob("*.md"), *(page for folder in folders for page in folder.rglob("*.md"))]
+    assert len(pages) > 10
+    assert not {str(p.relative_to(ROOT)): long for p in pages if (long := long_lines(p.read_text()))}
+
+
+def test_a_long_line_of_markdown_is_found():
+    long = 60 * "ab "
+    assert long_lines(f"{long}\n| {long}|\n```text\n{long}\n```\n- {long}\n") == [1, 6]
 
 
 def test_every_file_of_tests_has_one_area():

@@ -1,1 +1,1 @@
-"""Plugins of four kinds: a lofted surface, a ray caster, a toon shader, a wide splatter."""
+"""Plugins of four kinds: a lofted surface, a ray caster, a toon shader, a command."""

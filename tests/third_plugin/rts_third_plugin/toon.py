@@ -1,54 +1,30 @@
-"""A toon shader: bands of one colour, and a dark rim."""
+"""A toon shader: bands of one colour."""
 
 from dataclasses import dataclass
 
 import rts
 from rts.plugin_api.arrays import unit
-from rts.plugin_api.checks import check_numbers, is_count
+from rts.plugin_api.checks import check_numbers
 
 
 @dataclass(frozen=True)
 class Toon(rts.Shader):
-    """Lights θ["tint"] (3,) from the viewer, in bands, on both sides of the surface.
-
-    Bands meet in short ramps, so that the colour has a derivative, which is not zero there.
-
-    Attributes:
-        levels: how many bands there are, at least 1.
-        rim: how dark the surface becomes where it turns away from the viewer, from 0 to 1.
-    """
+    """Lights θ["tint"] (3,) from the viewer, in bands. They meet in short ramps, which have a derivative."""
 
     levels: int = 3
-    rim: float = 0.5
 
     opaque = True
-    takes_views = True
     reads = ("normal", "tint")
-
-    def __post_init__(self):
-        if not is_count(self.levels):
-            raise rts.InputError("A toon shader's levels must be a whole number of at least 1.")
-        check_numbers("rim", self.rim, ())
-        if not 0 <= self.rim <= 1:
-            raise rts.InputError("A toon shader's rim must be from 0 to 1.")
+    takes_views = True
 
     def __call__(self, theta, gbuffer, camera):
-        if "tint" not in theta:
-            raise rts.InputError('The toon shader needs θ["tint"].')
-        check_numbers('θ["tint"]', theta["tint"], (3,))
-        normal, position, tint = gbuffer["normal"], gbuffer["position"], theta["tint"]
-        xp = rts.namespace(normal, position, tint)
-        cosine = xp.sum(unit(normal) * unit(camera.toward(position)), axis=-1)[:, None]
-        light = cosine * cosine
-        steps = light * self.levels
-        band = xp.floor(steps)
-        shade = (0.5 + band + smooth_step(xp, (steps - band - 0.7) / 0.3)) / (self.levels + 0.5)
-        shade = shade * (1 - self.rim * (1 - smooth_step(xp, light / 0.2)))
-        rgb = xp.clip(shade, 0.0, 1.0) * tint
-        return xp.concat([rgb, xp.ones_like(rgb[:, :1])], axis=-1)
-
-
-def smooth_step(xp, x):
-    """0 below 0, 1 above 1, and a cubic between, whose slope is zero at both."""
-    x = xp.clip(x, 0.0, 1.0)
-    return x * x * (3 - 2 * x)
+        check_numbers('theta["tint"]', theta.get("tint"), (3,))
+        normal, toward = gbuffer["normal"], camera.toward(gbuffer["position"])
+        xp = rts.namespace(normal, theta["tint"])
+        cosine = xp.sum(unit(normal) * unit(toward), axis=-1, keepdims=True)
+        level = self.levels * cosine * cosine
+        band = xp.floor(level)
+        ramp = xp.clip((level - band - 0.7) / 0.3, 0.0, 1.0)
+        shade = (0.5 + band + ramp * ramp * (3 - 2 * ramp)) / (self.levels + 0.5)
+        rgb = xp.clip(shade, 0.0, 1.0) * theta["tint"]
+        return xp.concat([rgb, xp.ones_like(shade)], axis=-1)
