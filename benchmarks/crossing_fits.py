@@ -24,7 +24,7 @@ from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import rotation_xy
 from benchmarks.outline_fits import strip
 from benchmarks.report import table
-from rts.diagnostics.shapes import QUAD, box, icosphere, unlit
+from rts.diagnostics.example_shapes import QUAD, box, icosphere, unlit
 
 SIZE, STEPS = (128, 128), {"lm": 60, "adam": 300}
 SPHERE, CARD_AT, CARD_STARTS = 0.8, 0.45, (0.2, 0.3, 0.55, 0.65)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Part, load, namespace, plugin
-from rts.diagnostics.shapes import mesh
+from rts.diagnostics.example_shapes import mesh
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array, Tree
 from rts_compare import scene_shapes

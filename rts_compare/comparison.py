@@ -22,12 +22,12 @@ from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
 from rts_compare.interleaved_timing import ROUNDS, Calls, InterleavedTiming
 from rts_compare.kept_measurements import KeptMeasurements
-from rts_compare.left_out import one_line
 from rts_compare.measurements import Measurements
 from rts_compare.moving_scenes import Scene
 from rts_compare.other_renderers.renderer_input import Peer
 from rts_compare.pareto_front import Row, best_within, front, marked
 from rts_compare.scene_sources import engines_for, scene_of, some_modes
+from rts_compare.skip_reasons import one_line
 from rts_compare.true_derivatives import SAMPLES
 
 LAYERS = (1, 2, 4, "auto")

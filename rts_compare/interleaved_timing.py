@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rts_compare.kept_measurements import KeptMeasurements
-from rts_compare.left_out import limited, one_line
+from rts_compare.skip_reasons import limited, one_line
 
 ROUNDS, CONSECUTIVE = 3, 2
 """Turns that each function has, and calls timed in a turn."""

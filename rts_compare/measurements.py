@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Engine, Part, explain, namespace, render, sample
+from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.diagnostics.smoothing import low_pass
-from rts.diagnostics.steps import pixel_step
 from rts.errors import InputError, RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.compared_settings import Setting
 from rts_compare.derivative_scores import loss_weights, relative_l2, scores
 from rts_compare.interleaved_timing import LONGEST, Calls, InterleavedTiming
 from rts_compare.kept_measurements import KeptMeasurements
-from rts_compare.left_out import TooSlow, limited, one_line
 from rts_compare.measurement_keys import library_key, plugin_key, state_key
 from rts_compare.moving_scenes import Scene, is_constant, parts_of
+from rts_compare.skip_reasons import TooSlow, limited, one_line
 from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
 from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
 

@@ -22,8 +22,8 @@ from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import is_count, quoted
 from rts_compare import builtin_scenes
 from rts_compare.compared_settings import engines
-from rts_compare.left_out import one_line
 from rts_compare.moving_scenes import Scene, check_directions, is_constant, moving, parts_of
+from rts_compare.skip_reasons import one_line
 
 SIZE = (256, 256)
 FEW = 6

@@ -47,15 +47,15 @@ class Bicubic(Geometry):
 
     def meet(self, samples: Samples, rays: Rays) -> Samples:
         """See `Geometry`."""
-        from rts_surfaces import meeting_loops
+        from rts_surfaces import ray_patch_loops
 
         bounds = np.empty((len(self.nets), 3))
-        meeting_loops.bounds(self.nets, bounds)
+        ray_patch_loops.bounds(self.nets, bounds)
         ids, params, row, depth = (np.array(x) for x in (samples.ids, samples.params, samples.row, samples.depth))
         lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
         arguments = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
-        parallel(meeting_loops.meet, len(lines[0]), *arguments, work=200 * len(samples.ids))
+        parallel(ray_patch_loops.meet, len(lines[0]), *arguments, work=200 * len(samples.ids))
         return samples.replace(ids=ids, params=params, row=row, depth=depth)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import rts
-from rts.sampling import settling
+from rts.sampling import layer_order
 from rts.sampling.packing import lift
 
 SIZE = (24, 28)
@@ -24,8 +24,8 @@ def stages(part, camera, layers, size=SIZE):
     sampler, inputs = rts.plugin("samplers", "raster")(), part.theta["points"]
     proxy = part.surface.proxy(inputs, camera, size)
     lifted = lift(sampler.rasterize(sampler.prepare(proxy), camera, size, layers, "none"), proxy)
-    moved, rays = settling.refined(part.surface, inputs, lifted, camera, {})
-    return lifted, moved, settling.settle(moved, camera, rays.spread)
+    moved, rays = layer_order.refined(part.surface, inputs, lifted, camera, {})
+    return lifted, moved, layer_order.settle(moved, camera, rays.spread)
 
 
 WEIGHTS = np.random.default_rng(0).normal(size=(*SIZE, 4)).astype(np.float32)

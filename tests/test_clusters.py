@@ -18,10 +18,10 @@ pytestmark = pytest.mark.sampling
 
 pytest.importorskip("numba")
 
-from rts_backends import raster  # noqa: E402
-from rts_backends.raster import Raster  # noqa: E402
-from rts_backends.raster_cells import Blocks  # noqa: E402
-from rts_backends.raster_clusters import BACKS, FRONTS, Clusters  # noqa: E402
+from rts_backends.raster import sampler as raster_sampler  # noqa: E402
+from rts_backends.raster.cells import Blocks  # noqa: E402
+from rts_backends.raster.clusters import BACKS, FRONTS, Clusters  # noqa: E402
+from rts_backends.raster.sampler import Raster  # noqa: E402
 from rts_backends.triangles import facing, pixel_matrix  # noqa: E402
 
 KINDS = ("ball", "bumpy", "copies", "rounded", "with NaN", "soup", "nasty")
@@ -222,7 +222,7 @@ VIEW = Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=40)
 @pytest.fixture
 def few(monkeypatch):
     """Few triangles are many."""
-    monkeypatch.setattr(raster, "MANY", 1000)
+    monkeypatch.setattr(raster_sampler, "MANY", 1000)
 
 
 def moves():

@@ -24,9 +24,9 @@ from rts_compare.compared_settings import Setting, _no_worse, as_text, engines, 
 from rts_compare.comparison import Comparison
 from rts_compare.derivative_scores import loss_weights, scores
 from rts_compare.kept_measurements import KeptMeasurements
-from rts_compare.left_out import limited
 from rts_compare.moving_scenes import moving
 from rts_compare.settings_search import Search
+from rts_compare.skip_reasons import limited
 from rts_compare.tuning import tune
 
 pytestmark = pytest.mark.rendering

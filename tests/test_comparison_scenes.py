@@ -6,7 +6,7 @@ from helpers import derivative
 
 import rts
 from rts.arrays.engines import engine_named
-from rts.diagnostics.shapes import QUAD, unlit
+from rts.diagnostics.example_shapes import QUAD, unlit
 from rts.errors import InputError, PluginError
 from rts_compare import scene_shapes
 from rts_compare.builtin_scenes import BUILTIN, builtin, names

@@ -154,7 +154,7 @@ ORDINARY_CALLS = """
 import sys
 from numba.core.dispatcher import Dispatcher
 from benchmarks.cold_start import TASKS
-from rts.compiling import ordinary_calls, warmup
+from rts.compiling import warmup_calls, warmup
 
 def compiled():
     ours = ("rts", "rts_backends", "rts_surfaces")
@@ -163,7 +163,7 @@ def compiled():
     return {f"{x.__module__}.{x.__name__} {sig}" for x in found.values() for sig in x.overloads}
 
 for name in warmup.FIRST + warmup.OTHERS:
-    getattr(ordinary_calls, name)()
+    getattr(warmup_calls, name)()
 before = compiled()
 assert len(before) > 40
 for task in TASKS.values():

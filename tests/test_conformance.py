@@ -147,9 +147,7 @@ class TestClusters(SamplerConformance):
 
     @pytest.fixture
     def sampler(self, monkeypatch):
-        from rts_backends import raster
-
-        monkeypatch.setattr(raster, "MANY", 1)
+        monkeypatch.setattr("rts_backends.raster.sampler.MANY", 1)
         return "raster"
 
 

@@ -11,7 +11,7 @@ from rts.sampling.exits import beside_outlines
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells
-from rts_backends.raster import Raster
+from rts_backends.raster.sampler import Raster
 
 pytestmark = pytest.mark.sampling
 

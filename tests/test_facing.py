@@ -9,7 +9,7 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, spla
 
 import rts
 from rts import splatting
-from rts.contracts.pieces import pieces
+from rts.contracts.oriented_pieces import pieces
 from rts.contracts.records import Cells
 from rts.sampling.facing import eye
 from rts_backends.fused.splatters import Visible

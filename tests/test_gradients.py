@@ -5,7 +5,7 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, quad
 
 import rts
-from rts.diagnostics import gradients, steps
+from rts.diagnostics import finite_difference_steps, gradients
 
 pytestmark = pytest.mark.rendering
 
@@ -73,8 +73,8 @@ def test_only_some_numbers_of_large_arrays_are_looked_at():
 def test_a_step_moves_what_moves_fastest_by_a_pixel():
     check = rts.check_gradient(card, parameters_of("torch-cpu"), SIZE, samples=2)
     by_name = {s.name: s for s in check.slopes}
-    assert by_name["shift[0]"].step == pytest.approx(steps.STEP_PIXELS, rel=1e-4)
-    assert by_name["color[0]"].step == pytest.approx(steps.STEP_COLOR, rel=1e-4)
+    assert by_name["shift[0]"].step == pytest.approx(finite_difference_steps.STEP_PIXELS, rel=1e-4)
+    assert by_name["color[0]"].step == pytest.approx(finite_difference_steps.STEP_COLOR, rel=1e-4)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

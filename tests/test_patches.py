@@ -14,7 +14,7 @@ from rts import Camera, InputError, Part
 from rts.compiling.threads import read_only
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
-from rts.sampling import settling
+from rts.sampling import layer_order
 from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON
 from rts_surfaces import bicubic, tiles
@@ -140,7 +140,7 @@ def test_rays_of_packed_samples_are_those_of_the_camera(camera):
     row[row >= 50] = -1
     none = np.zeros((50, 2), np.float32)
     samples = Samples(np.zeros((50, 1), np.int32), none, Cells(row, np.zeros(row.shape, np.float32)), np.int32(0))
-    found, expected = settling.rays_of(samples, camera, size), camera.rays(size)
+    found, expected = layer_order.rays_of(samples, camera, size), camera.rays(size)
     for layer in range(2):
         there = row[layer] >= 0
         for part in ("origins", "directions"):
@@ -152,7 +152,7 @@ def test_rays_of_packed_samples_are_those_of_the_camera(camera):
 def test_without_a_covered_cell_there_is_a_ray_of_the_first_pixel():
     size, row = (2, 3), np.full((1, 2, 3), -1, np.int32)
     samples = Samples(np.zeros((1, 1), np.int32), np.zeros((1, 2), np.float32), Cells(row, 0.0 * row), np.int32(0))
-    found, expected = settling.rays_of(samples, CAMERA.for_size(size), size), CAMERA.rays(size)
+    found, expected = layer_order.rays_of(samples, CAMERA.for_size(size), size), CAMERA.rays(size)
     np.testing.assert_allclose(found.directions[0], expected.directions[0, 0], atol=1e-12)
 
 

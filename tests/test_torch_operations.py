@@ -148,7 +148,7 @@ def test_points_without_an_image_are_finite_with_finite_gradients():
 
 
 def test_without_private_names_values_and_gradients_are_the_same(monkeypatch):
-    private = pytest.importorskip("rts_backends.torch_engine.private")
+    private = pytest.importorskip("rts_backends.torch_engine.torch_internals")
     vertices, faces = icosphere(1)
 
     def found():

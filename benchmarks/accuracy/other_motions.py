@@ -21,7 +21,7 @@ from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh, rotation_xy
 from benchmarks.outline_fits import TILT, around_axis, vase
 from benchmarks.report import table
-from rts.diagnostics.shapes import icosphere
+from rts.diagnostics.example_shapes import icosphere
 from rts.diagnostics.smoothing import low_pass
 from rts_compare.derivative_scores import all_scores
 

@@ -17,7 +17,7 @@ import numpy as np
 import rts
 from benchmarks.camera import DISTANCE, camera, regular_grid
 from benchmarks.meshes import DATA, mesh, rotation_xy
-from rts.diagnostics.shapes import QUAD, box, icosphere, unlit
+from rts.diagnostics.example_shapes import QUAD, box, icosphere, unlit
 from rts.plugin_api.arrays import constants, exemplar
 from rts_compare import moving_scenes, scene_shapes
 from rts_compare.scene_shapes import CARD_DEPTH, grid, on_screen, pixel, rectangle

@@ -26,7 +26,7 @@ import rts
 from benchmarks.camera import regular_grid
 from benchmarks.meshes import DATA
 from benchmarks.report import table
-from rts.diagnostics.shapes import QUAD
+from rts.diagnostics.example_shapes import QUAD
 from rts.files.srgb import encode_srgb
 from rts_compare.failures import table_columns as failures
 from rts_compare.kept_measurements import KeptMeasurements

@@ -1,6 +1,6 @@
 """warmup: loops of ordinary renders and fits, compiled ahead by making such calls.
 
-numba's compiler has one lock a process, so several processes share the calls (`rts.compiling.ordinary_calls`).
+numba's compiler has one lock a process, so several processes share the calls (`rts.compiling.warmup_calls`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _call(name: str) -> None:
     own = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1"}
     if kept := getattr(getattr(sys.modules.get("numba"), "config", None), "CACHE_DIR", ""):
         own["NUMBA_CACHE_DIR"] = str(kept)
-    command = [sys.executable, "-P", "-m", "rts.compiling.ordinary_calls", name]
+    command = [sys.executable, "-P", "-m", "rts.compiling.warmup_calls", name]
     done = subprocess.run(command, env=os.environ | own, stdin=subprocess.DEVNULL, capture_output=True, text=True)
     if done.returncode:
         errors = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.files.damage import warn
+from rts.files.damaged_files import warn
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}

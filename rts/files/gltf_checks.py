@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.damage import unreadable, warn
+from rts.files.damaged_files import unreadable, warn
 from rts.files.gltf_accessors import QUANTIZATION, TYPES, check_accessor, check_attributes, count_of, rows_of
 from rts.files.gltf_scenes import check_scenes
 from rts.files.images import is_image

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.files.damage import warn
+from rts.files.damaged_files import warn
 from rts.files.gltf_accessors import count_of
-from rts.files.pieces import fault_of
+from rts.files.model_pieces import fault_of
 
 _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 

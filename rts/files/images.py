@@ -19,7 +19,7 @@ from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.contracts.checks import MEMORY, is_real
 from rts.errors import EngineError, FileWarning, InputError, PluginError, warn
-from rts.files.damage import gathered
+from rts.files.damaged_files import gathered
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 

@@ -14,10 +14,10 @@ import numpy as np
 from rts import registry
 from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
-from rts.files.damage import gathered
+from rts.files.damaged_files import gathered
+from rts.files.model_pieces import Piece, check_piece
 from rts.files.obj_reader import read_obj
 from rts.files.paths import as_path
-from rts.files.pieces import Piece, check_piece
 from rts.files.srgb import decode_srgb
 from rts.files.trimesh_reader import read_with_trimesh
 from rts.scene.parts import Part

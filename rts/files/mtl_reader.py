@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.damage import contents, lines_of
+from rts.files.damaged_files import contents, lines_of
 from rts.files.paths import inside
 
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.

@@ -11,11 +11,11 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files import polygons
-from rts.files.damage import contents, is_plain, lines_of, warn, without_comment
+from rts.files.damaged_files import contents, is_plain, lines_of, warn, without_comment
 from rts.files.images import read_texture
+from rts.files.model_pieces import Piece
 from rts.files.mtl_reader import Material, read_mtl
 from rts.files.paths import inside
-from rts.files.pieces import Piece
 from rts.files.srgb import decode_srgb
 
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.damage import COUNT, lines_of, unreadable, warn, without_comment
+from rts.files.damaged_files import COUNT, lines_of, unreadable, warn, without_comment
 from rts.files.ply_tables import Fail, Mesh, numbers_of, written
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|\.\d+(?:e[-+]?\d+)?|nan|inf(?:inity)?)"

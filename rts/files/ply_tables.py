@@ -16,7 +16,7 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files import polygons
-from rts.files.damage import COUNT, is_plain, lines_of, unreadable, warn
+from rts.files.damaged_files import COUNT, is_plain, lines_of, unreadable, warn
 from rts.files.images import is_image
 
 Lists = tuple[np.ndarray, np.ndarray]

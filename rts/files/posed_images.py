@@ -17,7 +17,7 @@ import numpy as np
 from rts.arrays.argument_checks import ROTATION_TOLERANCE, check_numbers, quoted
 from rts.contracts.checks import is_count, is_real
 from rts.errors import FileWarning, InputError, warn
-from rts.files.damage import contents, gathered
+from rts.files.damaged_files import contents, gathered
 from rts.files.images import load_image, read_image
 from rts.files.paths import as_path, inside
 from rts.scene.camera import Camera

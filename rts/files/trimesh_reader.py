@@ -10,12 +10,12 @@ from urllib.parse import unquote
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.damage import contents, unreadable
+from rts.files.damaged_files import contents, unreadable
 from rts.files.gltf_checks import sound_glb, sound_gltf
 from rts.files.images import pixels
+from rts.files.model_pieces import Piece
 from rts.files.off_and_stl import plain_off, sound_stl
 from rts.files.paths import inside
-from rts.files.pieces import Piece
 from rts.files.ply_tables import plain_ply
 
 LINEAR_COLORS = {"glb", "gltf"}

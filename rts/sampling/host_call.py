@@ -14,8 +14,8 @@ from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
+from rts.sampling.layer_order import rays_of
 from rts.sampling.sample_checks import check_camera
-from rts.sampling.settling import rays_of
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

@@ -22,9 +22,9 @@ from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
+from rts.sampling.layer_order import on_surface, refined
 from rts.sampling.packing import lift, repack
 from rts.sampling.sample_checks import check_faces, check_fragments, checked_pieces, checked_proxy
-from rts.sampling.settling import on_surface, refined
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

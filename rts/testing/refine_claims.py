@@ -9,8 +9,8 @@ from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.records import Proxy
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
+from rts.sampling.layer_order import refined
 from rts.sampling.packing import lift
-from rts.sampling.settling import refined
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes

@@ -23,7 +23,7 @@ from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
 from rts_backends.exact_hits import corner_lists, correct, places
 from rts_backends.opengl.worker import LESS, Worker
-from rts_backends.raster import Raster
+from rts_backends.raster.sampler import Raster
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4

@@ -15,7 +15,7 @@ from rts import Engine, InputError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
-from rts_backends.torch_engine import operations, private
+from rts_backends.torch_engine import operations, torch_internals
 from rts_backends.torch_engine.functions import applied, foreign, quiet_forward_mode, tangent_alike, transformed
 
 for _cls, _split, _join in Engine.records():
@@ -131,7 +131,7 @@ class TorchEngine(Engine):
 
     def plain(self, x: torch.Tensor) -> bool:
         """True for a dense tensor of real numbers that has values, and no tangent."""
-        return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and private.forward_level() < 0
+        return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and torch_internals.forward_level() < 0
 
     def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
         """`x`, its tangent in its own dtype. Sparse, quantized and complex tensors, and "meta", are refused."""
@@ -142,22 +142,22 @@ class TorchEngine(Engine):
             raise InputError(f"{name} is a tensor on the device 'meta', which has no values; expected one that has")
         if x.dtype.is_complex:
             raise InputError(f"{name} has dtype {x.dtype}; expected real numbers")
-        return tangent_alike(x) if private.forward_level() >= 0 else x
+        return tangent_alike(x) if torch_internals.forward_level() >= 0 else x
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
         """The value, for all items of a batch; None while `torch.compile` looks on."""
         if torch.compiler.is_compiling() or foreign(x):
             return None
-        if not private.transforms_active():
+        if not torch_internals.transforms_active():
             return _to_host(x)
-        while private.is_wrapped(x):
-            x = private.get_unwrapped(x)
-        with private.untransformed():  # Else what is made of it would be wrapped.
+        while torch_internals.is_wrapped(x):
+            x = torch_internals.get_unwrapped(x)
+        with torch_internals.untransformed():  # Else what is made of it would be wrapped.
             return _to_host(x)
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under `torch.func` transforms: under `torch.vmap` each item has as many rows as the largest."""
-        return private.maybe_current_level() is not None
+        return torch_internals.maybe_current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
         """By selection; ones where no cell refers to any row."""
@@ -194,8 +194,8 @@ class TorchEngine(Engine):
         for _ in range(most):
             on = going(state)
             whole = on
-            while private.is_wrapped(whole):
-                whole = private.get_unwrapped(whole)
+            while torch_internals.is_wrapped(whole):
+                whole = torch_internals.get_unwrapped(whole)
             if not bool(whole.any()):
                 break
             new = iter(list(leaves(body(state))))

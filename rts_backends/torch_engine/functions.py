@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 
-from rts_backends.torch_engine import private
+from rts_backends.torch_engine import torch_internals
 
 
 def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
@@ -20,19 +20,19 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
 
     Outside of transforms it spares torch's search for defaults, which takes longer than a small kernel.
     """
-    if private.transforms_active():
+    if torch_internals.transforms_active():
         return function.apply(*args)
     # What torch does with all arguments, in one loop.
-    arguments = [private.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
+    arguments = [torch_internals.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
     # Torch's stubs leave out the class above `Function`.
     return super(torch.autograd.Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def transformed() -> bool:
     """True while a transform of torch, forward mode or a compilation traces the computation."""
-    if torch.compiler.is_compiling() or private.forward_level() >= 0:
+    if torch.compiler.is_compiling() or torch_internals.forward_level() >= 0:
         return True
-    return private.maybe_current_level() is not None
+    return torch_internals.maybe_current_level() is not None
 
 
 _loaded: list[bool] = []
@@ -50,7 +50,7 @@ def quiet_forward_mode() -> None:
 def foreign(*tensors: Tensor | None) -> bool:
     """True if a tensor is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which hides its values."""
     for t in tensors:
-        if t is not None and private.is_legacy_batchedtensor(t):
+        if t is not None and torch_internals.is_legacy_batchedtensor(t):
             return True
     return False
 
@@ -74,7 +74,7 @@ def on_host(x: Tensor) -> np.ndarray:
     """The value of a tensor in the memory of the host, without a copy."""
     x = x.detach()
     # Zeros that torch's forward mode makes up have no memory.
-    return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if private.is_zero(x) else x.numpy()
+    return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if torch_internals.is_zero(x) else x.numpy()
 
 
 _NUMPY = {torch.float32: np.float32, torch.float64: np.float64}

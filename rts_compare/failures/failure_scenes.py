@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import Camera, Part, engine_of, rigid
-from rts.diagnostics import shapes
-from rts.diagnostics.shapes import QUAD, unlit
+from rts.diagnostics import example_shapes
+from rts.diagnostics.example_shapes import QUAD, unlit
 from rts.plugin_api.arrays import Tree
 from rts_compare import scene_shapes
 from rts_compare.builtin_scenes import data_file, read_mesh
@@ -90,7 +90,7 @@ def card(center: Sequence[float], half: Sequence[float], depth: float, color: An
 
 def sphere(radius: float = 0.6, center: Any = (0, 0, 0), color: Any = GREEN, detail: int = 3, **options: Any) -> Part:
     """A sphere, brighter towards a light."""
-    vertices, faces = shapes.icosphere(detail)
+    vertices, faces = example_shapes.icosphere(detail)
     shade = 0.35 + 0.6 * np.maximum(0, vertices @ [0.4, 0.5, 0.77])[:, None]
     return unlit(radius * vertices + center, faces, shade * color, **options)
 
@@ -110,7 +110,7 @@ def box_pose() -> Scene:
 
 def colored_box() -> Scene:
     """That box with a colour a corner, its eight corners shared, as other renderers want them."""
-    vertices, faces = shapes.box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
+    vertices, faces = example_shapes.box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
     corners, became = np.unique(vertices, axis=0, return_inverse=True)
     hues = 0.5 + 0.45 * np.cos(np.arange(8)[:, None] * [1.7, 2.6, 4.1] + [0, 2, 4])
     box = unlit(corners @ scene_shapes.rotation_xy(0.5, 0.6).T, became.reshape(-1)[faces], hues)
@@ -273,7 +273,7 @@ def covered() -> Scene:
 
 def turning_ball() -> Scene:
     """A sphere of one colour, which turns about its middle: nothing changes. The other mode moves it."""
-    vertices, faces = shapes.icosphere(5)
+    vertices, faces = example_shapes.icosphere(5)
     return posed("turning ball", unlit(0.6 * vertices, faces, GREEN), ("ry", "tx"))
 
 

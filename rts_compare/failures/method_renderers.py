@@ -18,10 +18,10 @@ from rts.errors import RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.derivative_scores import loss_weights
 from rts_compare.failures.table_columns import Method
-from rts_compare.left_out import one_line
 from rts_compare.moving_scenes import Scene, parts_of
 from rts_compare.other_renderers.installed_renderers import Deodr, Mitsuba, MitsubaScene
 from rts_compare.other_renderers.renderer_input import Peer, Unsuited, renderer_input
+from rts_compare.skip_reasons import one_line
 
 Weigh = Callable[[np.ndarray], np.ndarray]
 """An image (H, W, 3) → the derivative of a loss with respect to it."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rts import Engine
-from rts_compare.left_out import one_line
 from rts_compare.moving_scenes import Scene
 from rts_compare.other_renderers.deodr_renderer import Deodr
 from rts_compare.other_renderers.mitsuba_renderer import Mitsuba, MitsubaScene
 from rts_compare.other_renderers.renderer_input import Peer, RendererInput, Unsuited, renderer_input
+from rts_compare.skip_reasons import one_line
 
 SPP = (1, 4, 16)
 """Samples a pixel of Mitsuba."""

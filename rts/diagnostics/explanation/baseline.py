@@ -11,10 +11,10 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Tree, leaves, map_leaves
+from rts.diagnostics.example_shapes import box, icosphere, unlit
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.slopes import Number, measured
 from rts.diagnostics.explanation.subject import Subject
-from rts.diagnostics.shapes import box, icosphere, unlit
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

@@ -16,7 +16,7 @@ from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import CheckedPart, check_colors, check_scene, check_splatter
 from rts.contracts.records import Sampled
 from rts.diagnostics.explanation.thin_features import Fineness, fineness
-from rts.diagnostics.steps import pixel_step
+from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves
 from rts.rendering.image import render

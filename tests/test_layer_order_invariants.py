@@ -8,7 +8,7 @@ from strategies import PROPERTIES, masks, rows_of, table, told_apart
 
 from rts import Camera
 from rts.compiling import threads
-from rts.sampling.settling import SAME_ROOT, SAME_ROOT_PIXELS, settle
+from rts.sampling.layer_order import SAME_ROOT, SAME_ROOT_PIXELS, settle
 
 pytestmark = pytest.mark.sampling
 

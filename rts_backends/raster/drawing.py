@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
-from rts_backends import raster_cells
-from rts_backends.raster_cells import touching
+from rts_backends.raster import cells
+from rts_backends.raster.cells import touching
 from rts_backends.triangles import owns
 
-BAND_ROWS = raster_cells.SIDE
+BAND_ROWS = cells.SIDE
 BLOCK = 64
 
 LISTED = 8

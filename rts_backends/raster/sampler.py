@@ -1,7 +1,7 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
 Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, rounded, and
-lists those that may cover one; of a mesh that stays it passes over whole clusters (`rts_backends.raster_clusters`). The
+lists those that may cover one; of a mesh that stays it passes over whole clusters (`rts_backends.raster.clusters`). The
 second draws the image in bands of rows, each by one thread. The result depends neither on the number of threads nor on
 the order of the list. For blocks of listed triangles it works out, in
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`, finds the pixels that they may cover, and
@@ -23,9 +23,9 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.raster_cells import EVERYTHING, Blocks, touching
-from rts_backends.raster_clusters import BACKS, FRONTS, SIZE, Clusters
-from rts_backends.raster_drawing import BAND_ROWS, LISTED, clear, draw, draw_cells
+from rts_backends.raster.cells import EVERYTHING, Blocks, touching
+from rts_backends.raster.clusters import BACKS, FRONTS, SIZE, Clusters
+from rts_backends.raster.drawing import BAND_ROWS, LISTED, clear, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
 LONG_BLOCK = SIZE

@@ -14,7 +14,7 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.raster_cells import EVERYTHING, SIDE, Blocks
+from rts_backends.raster.cells import EVERYTHING, SIDE, Blocks
 
 SIZE = 256
 """Triangles of a cluster, and vertices of a block."""

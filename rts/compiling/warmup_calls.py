@@ -1,4 +1,4 @@
-"""Ordinary calls on small pictures, each made by `python -m rts.compiling.ordinary_calls NAME`: loops get compiled."""
+"""Ordinary calls on small pictures, each made by `python -m rts.compiling.warmup_calls NAME`: loops get compiled."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from seen import CAMERA, SIZE, VIEWS, rays_spread
 import rts
 from rts.contracts.records import Cells
 from rts.plugin_api.records import ArraySpec, Samples
-from rts.sampling import packing, settling
+from rts.sampling import layer_order, packing
 
 pytestmark = pytest.mark.sampling
 
@@ -31,7 +31,7 @@ def column(*depths, camera=PLANES):
     """(rows, depths) of one cell once settled, of layers at these depths; None for a row of −1."""
     row = [-1 if z is None else i for i, z in enumerate(depths)]
     given = made(np.reshape(row, (-1, 1, 1)), np.reshape([0 if z is None else z for z in depths], (-1, 1, 1)))
-    found = settling.settle(given, camera, rays_spread(camera))
+    found = layer_order.settle(given, camera, rays_spread(camera))
     return found.row[:, 0, 0].tolist(), found.depth[:, 0, 0].tolist()
 
 
@@ -106,7 +106,7 @@ def test_settling_changes_rows_and_depths_only():
     given = made([[[0, 1]], [[2, -1]]], [[[5, 3]], [[2, 0]]], tables={"a": np.arange(3.0)}, by_sample=("a",))
     given = replace(given, overflow=np.int32(4))
     row, depth = given.row.copy(), given.depth.copy()
-    found = settling.settle(given, PLANES, rays_spread(PLANES))
+    found = layer_order.settle(given, PLANES, rays_spread(PLANES))
     np.testing.assert_array_equal(found.row, [[[2, 1]], [[0, -1]]])
     np.testing.assert_array_equal(found.depth, [[[2, 3]], [[5, 0]]])
     assert found.row.dtype == np.int32 and found.depth.dtype == np.float32
@@ -129,7 +129,7 @@ def test_settling_is_what_one_does_by_hand(view, shape):
         depth = z + width * rng.choice([0.0, 0.4, -0.4, 1.5, -1.5], shape)
         row = np.where(rng.random(shape) < 0.8, rng.permutation(depth.size).reshape(shape), -1)
         given = made(row, depth)
-        found = settling.settle(given, camera, spread)
+        found = layer_order.settle(given, camera, spread)
         row, depth = settled_by_hand(given, camera, spread)
         np.testing.assert_array_equal(found.depth, depth)
         np.testing.assert_array_equal(found.row, row)

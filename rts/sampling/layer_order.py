@@ -105,7 +105,7 @@ def refined(
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
     """The rays of packed samples (N, 3). A single row that no cell refers to gets the ray of the first pixel."""
-    from rts.sampling import settling_loops
+    from rts.sampling import layer_order_loops
 
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
     ends = np.empty((len(samples.ids), 3)), np.empty((len(samples.ids), 3))
@@ -113,13 +113,13 @@ def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.n
     arguments = (height, width), *matrices, *ends
     if len(samples.ids) == 1:
         none = np.zeros(1, np.int64)
-        settling_loops.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *arguments)
+        layer_order_loops.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *arguments)
     if cells is not None:
         lines, columns = np.divmod(cells.reshape(-1), width)
-        settling_loops.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *arguments)
+        layer_order_loops.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *arguments)
     else:
         lines = read_only(samples.row, np.int32).reshape(-1, width)
-        parallel(settling_loops.rays_of, len(lines), lines, *arguments, work=20 * len(samples.ids))
+        parallel(layer_order_loops.rays_of, len(lines), lines, *arguments, work=20 * len(samples.ids))
     return Rays(*ends, camera.spread((height, width)))
 
 
@@ -134,14 +134,14 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     Returns:
         Samples with another `row` and `depth`; those before the near or beyond the far plane are dropped.
     """
-    from rts.sampling import settling_loops
+    from rts.sampling import layer_order_loops
 
     row, depth = np.empty_like(samples.row), np.empty_like(samples.depth)
     # Depths are in the camera's units, the spread in the surface's: the view scales by this cube root.
     near, slope = SAME_ROOT_PIXELS * np.abs(np.linalg.det(camera.view[:3, :3])) ** (1 / 3) * spread
     limits = np.array([*_planes(camera), near, slope + SAME_ROOT])
     arguments = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
-    parallel(settling_loops.settle_lines, row.shape[1], *arguments, limits, row, depth, work=10 * row.size)
+    parallel(layer_order_loops.settle_lines, row.shape[1], *arguments, limits, row, depth, work=10 * row.size)
     return samples.replace(row=row, depth=depth)
 
 

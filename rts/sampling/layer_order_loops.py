@@ -7,7 +7,7 @@ from rts.compiling.loops import compiled, loop
 
 @loop
 def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
-    """Settle lines [start, stop) of the image; see `rts.sampling.settling.settle`.
+    """Settle lines [start, stop) of the image; see `rts.sampling.layer_order.settle`.
 
     Args:
         start: the first line.
