@@ -6,6 +6,7 @@ OLDEST ?= .venv-oldest
 BIN := $(VENV)/bin
 # Each takes up to 5 GB, most of it compiled jax programs.
 WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
@@ -16,17 +17,28 @@ BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || co
 SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++ $(BROWSER)
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
-.PHONY: check demo test lint types wheel oldest clean system
+.PHONY: check demo test test-all test-xla warmup lint types wheel oldest clean system
 
-check: lint types test wheel oldest
+check: lint types test test-all test-xla wheel oldest
 
 demo: $(VENV)/.demo
 	$(BIN)/rts demo -o out
 
+# NumPy, torch, every plugin through its kit, and one file of jax.
+test: warmup
+	$(PYTEST) -m "not thorough"
+
+# The rest: jax, builds, other processes, and many examples of each property.
+test-all: warmup
+	$(PYTEST) -m "thorough or hypothesis" --hypothesis-profile many
+
+# jax as users have it: XLA improves programs, which elsewhere in the tests would take longer than it saves.
+test-xla: warmup
+	XLA_FLAGS= $(PYTEST) tests/test_jax.py
+
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
-test: system $(VENV)/.test
+warmup: system $(VENV)/.test
 	-$(BIN)/rts warmup
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 # Ruff: rules and format of Python, in Markdown too.
 lint: $(VENV)/.dev

@@ -1,6 +1,8 @@
 import os
+import re
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 # Idle threads of OpenMP otherwise spin, which on a busy machine makes small renders many times slower.
@@ -10,6 +12,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# The same examples every time, however busy the machine is. `make test-all` asks for many.
+for name, examples in {"few": 10, "many": 60}.items():
+    hypothesis.settings.register_profile(name, deadline=None, derandomize=True, max_examples=examples)
+hypothesis.settings.load_profile("few")
+
+COMPILING = re.compile("jax|engines_agree|every_engine", re.IGNORECASE)
+"""Names of tests that have jax compile programs, which takes seconds each."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Leave to `make test-all` tests of jax, but for those of `test_jax.py`."""
+    for item in items:
+        if COMPILING.search(item.nodeid) and item.path.name != "test_jax.py":
+            item.add_marker("thorough")
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,13 @@ from rts import Camera
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
 
-PROPERTIES = settings(deadline=None, derandomize=True, max_examples=60)
-"""What all properties are tried with: the same examples every time, however busy the machine is."""
+PROPERTIES = settings()
+"""Settings of the profile that is in force: `conftest.py` names them."""
+
+
+def examples(share: float) -> settings:
+    """Settings for a share of the profile's examples, at least one."""
+    return settings(PROPERTIES, max_examples=max(1, round(share * PROPERTIES.max_examples)))
 
 
 # --------------------------------------------------------------------------------------------------- arrays

@@ -469,6 +469,7 @@ def test_without_torch_and_jax_the_error_says_what_to_install(monkeypatch):
 # ---------------------------------------------------------------------------------------------------- demo
 
 
+@pytest.mark.thorough
 def test_demo_recovers_the_pose_and_writes_its_report(tmp_path):
     pytest.importorskip("torch")
     output = succeed("demo", "-o", tmp_path / "out", "--engine", "torch")

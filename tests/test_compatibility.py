@@ -62,8 +62,12 @@ def shown(surface, sampler):
     return compatibility.attempt(EXAMPLES[surface], sampler, "numpy")
 
 
-@pytest.mark.parametrize("engine", rts.plugins("engines"))
-@pytest.mark.parametrize("sampler", rts.plugins("samplers"))
+PAIRS = [(sampler, "numpy") for sampler in rts.plugins("samplers")]
+PAIRS += [("auto", engine) for engine in rts.plugins("engines") if engine != "numpy"]
+"""Samples are NumPy arrays whatever the engine, so that each sampler with one engine tells as much as with all."""
+
+
+@pytest.mark.parametrize("sampler, engine", PAIRS)
 @pytest.mark.parametrize("surface", EXAMPLES)
 def test_a_pair_shows_the_surface_or_says_why_not(surface, sampler, engine):
     part = EXAMPLES[surface]

@@ -128,6 +128,7 @@ def checked(x):
 """
 
 
+@pytest.mark.thorough
 def test_helpers_may_print_and_raise_errors_with_values(tmp_path):
     (tmp_path / "needy.py").write_text(NEEDY)
     code = NEEDS_PYTHON.format(folder=str(tmp_path))
@@ -136,6 +137,7 @@ def test_helpers_may_print_and_raise_errors_with_values(tmp_path):
         assert done.stdout.splitlines() == ["('below zero', -3.0)", "checked 3.0", "6.0"]
 
 
+@pytest.mark.thorough
 def test_warmup_makes_the_calls_and_says_what_failed(monkeypatch, tmp_path):
     """Kept loops are in a folder of its own, and a second time all are there."""
     monkeypatch.setattr(warmup, "OTHERS", ("picture",))
@@ -172,6 +174,7 @@ print(*(compiled() - before), sep="\\n")
 """
 
 
+@pytest.mark.thorough
 def test_warmup_makes_all_that_ordinary_calls_need():
     for package in ("torch", "jax"):
         pytest.importorskip(package)
@@ -198,6 +201,7 @@ double(np.zeros(3, np.{kind}))
 
 
 @pytest.mark.skipif(compiling.fcntl is None, reason="the system has no such locks")
+@pytest.mark.thorough
 def test_loops_are_written_by_one_process_at_a_time(tmp_path):
     (tmp_path / "several.py").write_text(
         "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"

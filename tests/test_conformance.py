@@ -204,12 +204,6 @@ class TestTorchEngine(EngineConformance):
         return "torch"
 
 
-class TestJaxEngine(EngineConformance):
-    @pytest.fixture
-    def engine(self):
-        return "jax"
-
-
 class ShaderOfBuiltIn(ShaderConformance):
     __test__ = False
 

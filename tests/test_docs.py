@@ -57,6 +57,7 @@ def run(page, **names):
     return document.namespace, first
 
 
+@pytest.mark.thorough
 def test_the_python_of_the_readme_does_what_it_says(model):
     pytest.importorskip("torch")
     found, _ = run("README.md")
@@ -166,6 +167,7 @@ def test_the_project_file_of_the_guide_is_that_of_the_example():
 
 
 @pytest.mark.parametrize("page", PAGES)
+@pytest.mark.thorough
 def test_every_command_line_works(page, model):
     pytest.importorskip("torch")
     lines = [line.partition("#")[0].strip() for block in blocks(page, "sh") for line in block.splitlines()]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import moved
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
-from strategies import PROPERTIES, reals, sizes, steps, table
+from strategies import PROPERTIES, examples, reals, sizes, steps, table
 
 import rts
 from rts.contracts.records import Cells
@@ -21,7 +21,7 @@ from rts.plugin_api.records import Samples
 
 pytestmark = pytest.mark.files
 
-FEW, MANY = settings(PROPERTIES, max_examples=15), settings(PROPERTIES, max_examples=120)
+FEW, MANY = examples(0.25), examples(2)
 HALF = 0.5 / 255 + 1e-6
 """By how much eight bits are off."""
 

@@ -120,6 +120,7 @@ def lit(target):
 
 
 @pytest.mark.parametrize("known", [True, False])
+@pytest.mark.thorough
 def test_lm_does_not_run_away_along_the_length_of_a_light(known):
     residuals, start = lit("torch-cpu")
     fit = rts.fit(residuals if known else lambda p: residuals(p), start, method="lm")
@@ -180,6 +181,7 @@ def silhouette(supersample):
     return rts.ImageResiduals(moved, camera, (128, 128), goal[..., 3], supersample=supersample)
 
 
+@pytest.mark.thorough
 def test_the_floor_of_point_sampling_is_told_from_a_minimum():
     # From some starts the last gradient happens to promise nothing, and then it is called a minimum.
     point, told = silhouette(1), "no step lowers the loss: it is at the floor of point sampling; supersample=2, 3"

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from strategies import PROPERTIES, masks, rows_of, table, told_apart
+from strategies import examples, masks, rows_of, table, told_apart
 
 from rts import Camera
 from rts.compiling import threads
@@ -12,7 +12,7 @@ from rts.sampling.layer_order import SAME_ROOT, SAME_ROOT_PIXELS, settle
 
 pytestmark = pytest.mark.sampling
 
-EXAMPLES = settings(PROPERTIES, max_examples=100)
+EXAMPLES = examples(1.7)
 
 SIZE = (24, 28)
 NEAR, FAR = 1.0, 9.0

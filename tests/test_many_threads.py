@@ -81,6 +81,7 @@ def pairs(engine):
 
 
 @pytest.mark.parametrize("name", ["numpy", "torch", "jax"])
+@pytest.mark.thorough
 def test_eight_threads_compute_what_one_does(name):
     if name != "numpy":
         pytest.importorskip(name)

@@ -365,6 +365,7 @@ def check(found, expected, jump=0.0):
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.thorough
 def test_the_public_interface_agrees_with_the_reference(public, camera):
     parts = [triangles(kind) for kind in KINDS if kind != "huge"] + [soup(1000, 3, size=0.2)]
     offsets = np.cumsum([0, *(len(v) for v, _ in parts)])

@@ -325,23 +325,31 @@ def named(call, message):
 
 
 FUNCTIONS = "ImageResiduals.scene fit.loss fit.callback check_gradient.scene gradient_image.image".split()
-# A class is a function, too, and its own error is its author's.
-TRIED = [(call, value) for call in CALLS for value in WRONG if value != "a class" or call not in FUNCTIONS]
+"""A class is a function, too, and its own error is its author's."""
+
+
+def complaint(call, value):
+    """What is wrong with the error that a wrong value gets; or None."""
+    try:
+        CALLS[call](WRONG[value])
+    except rts.RtsError as error:
+        message = str(error)
+    else:
+        return "no error"
+    short = "\n" not in message and len(message) < 300
+    return None if short and named(call, message) else message
 
 
 @pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
-@pytest.mark.parametrize("call, value", TRIED)
-def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, value, tmp_path, monkeypatch):
+@pytest.mark.parametrize("call", CALLS)
+def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if call in ACCEPTED.get(value, ()):
+    values = {value for value in WRONG if value != "a class" or call not in FUNCTIONS}
+    accepted = {value for value in values if call in ACCEPTED.get(value, ())}
+    for value in accepted:
         CALLS[call](WRONG[value])
-        return
-    with pytest.raises(rts.RtsError) as caught:
-        CALLS[call](WRONG[value])
-    message = str(caught.value)
-    assert "\n" not in message
-    assert len(message) < 300, message
-    assert named(call, message)
+    complaints = {value: complaint(call, value) for value in values - accepted}
+    assert not {value: said for value, said in complaints.items() if said}
 
 
 @pytest.mark.filterwarnings("ignore::rts.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")

@@ -34,6 +34,7 @@ def install(folder):
     (info / "entry_points.txt").write_text("".join(lines))
 
 
+@pytest.mark.thorough
 def test_new_plugins_pass_the_kit_as_they_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folders = []

@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 from helpers import rotation
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from strategies import PROPERTIES
+from strategies import PROPERTIES, examples
 
 import rts
 from rts.files.polygons import cut
@@ -72,7 +72,7 @@ def stars(random, count):
 
 
 SEEDS = st.integers(0, 10**6)
-MANY = settings(PROPERTIES, max_examples=200)
+MANY = examples(3.3)
 
 
 @MANY

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from analytic import Ellipsoid
-from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, soup, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, quick, soup, to_numpy
 
 import rts
 from rts import splatting
@@ -331,7 +331,7 @@ def both_ways(parts, camera, splatter):
 
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("splatter", ["multi", "visible"])
-@pytest.mark.parametrize("offset", [0.0, 10.0, 1e2, 1e3, 1e4, 1e5])
+@pytest.mark.parametrize("offset", quick([10.0, 0.0, 1e2, 1e3, 1e4, 1e5]))
 def test_nothing_that_counts_is_dropped_however_far_off_the_origin(offset, splatter, count):
     fewer = 0
     for seed in range(40):

@@ -316,6 +316,7 @@ def test_shaded_views_move_with_cameras_and_lights_as_in_a_loop(shader):
 
 
 @pytest.mark.parametrize("capacity", [None, 700])
+@pytest.mark.thorough
 def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, monkeypatch):
     jax = pytest.importorskip("jax")
     torch = pytest.importorskip("torch")

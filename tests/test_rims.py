@@ -4,7 +4,19 @@ import math
 
 import numpy as np
 import pytest
-from helpers import TORCH, arrays, derivative, gradient, icosphere, low_passed, mesh_part, quad, splats_of, to_numpy
+from helpers import (
+    TORCH,
+    arrays,
+    derivative,
+    gradient,
+    icosphere,
+    low_passed,
+    mesh_part,
+    quad,
+    quick,
+    splats_of,
+    to_numpy,
+)
 from loops import STEPS, Pairing
 
 import rts
@@ -418,7 +430,7 @@ def moving(pixels):
 
 @pytest.mark.parametrize(
     "fine, layers, least, most",
-    [(1, 1, 0.1, 0.02), (2, 1, 0.07, 0.01), (4, 1, 0.05, 0.005), (1, 2, 0.1, 0.008), (1, EXITS, 0.1, 0.008)],
+    quick([(1, 1, 0.1, 0.02), (1, 2, 0.1, 0.008), (1, EXITS, 0.1, 0.008), (2, 1, 0.07, 0.01), (4, 1, 0.05, 0.005)], 3),
 )
 def test_the_outline_of_a_sphere_that_turns_stands_still(fine, layers, least, most):
     size, kind = 256, Visible if fine < 4 else fused.Visible  # Array code takes a minute, then.

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers import box, icosphere, quad, rotation, soup
+from helpers import box, icosphere, quad, quick, rotation, soup
 from test_raster import CAMERAS, KINDS, PIXELS, cast, grid, triangles
 
 import rts
@@ -173,7 +173,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("camera", quick(CAMERAS))
 @pytest.mark.parametrize("scene", SCENES)
 def test_soups_and_spheres_are_sampled_as_by_the_reference(sampler, scene, camera):
     for cull in ("none", "back"):

@@ -153,6 +153,7 @@ def test_the_derivative_of_a_balls_area_in_its_radius_is_the_closed_form(supersa
     assert float(radius.grad) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=0.03)
 
 
+@pytest.mark.thorough
 def test_images_and_derivatives_agree_between_engines():
     torch, jax = pytest.importorskip("torch"), pytest.importorskip("jax")
     weights = np.random.default_rng(0).normal(size=(24, 24, 4)).astype(np.float32)

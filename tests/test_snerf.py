@@ -174,6 +174,7 @@ def test_scores_are_those_of_their_definitions():
     assert snerf.ssim(small, noisy) == pytest.approx(np.mean(expected), abs=1e-6)
 
 
+@pytest.mark.thorough
 def test_tables_and_pictures_are_written(scene, grid, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(snerf.Scene, "grid", lambda self, keep: grid)

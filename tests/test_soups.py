@@ -8,7 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
-from helpers import to_numpy
+from helpers import quick, to_numpy
 from soups import deepened, differences, hits_of, soup_of
 
 import rts
@@ -22,7 +22,7 @@ pytest.importorskip("numba")
 
 FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_SOUPS", "180")).split(":")[-2:])
 STEP = 30
-groups = pytest.mark.parametrize("first", range(FIRST, LAST, STEP))
+groups = pytest.mark.parametrize("first", quick(range(FIRST, LAST, STEP)))
 MESH = rts.plugin("rts.surfaces", "mesh")
 _samplers = {}
 

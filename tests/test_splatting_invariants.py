@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, to_numpy
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from strategies import PROPERTIES, masks, steps
+from strategies import examples, masks, steps
 
 from rts import splatting
 from rts_backends.fused import splatters as fused
@@ -19,7 +19,7 @@ EVERY = [splatting.Single, splatting.Multi, splatting.Visible, *COMPILED]
 of_every_kind = pytest.mark.parametrize("kind", EVERY, ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
 of_compiled_kinds = pytest.mark.parametrize("kind", COMPILED, ids=lambda kind: kind.__name__)
 
-FEW, MANY = settings(PROPERTIES, max_examples=10), settings(PROPERTIES, max_examples=24)
+FEW, MANY = examples(0.2), examples(0.4)
 TOLERANCE = {np.float32: 1e-5, np.float64: 1e-12}
 REALS = st.sampled_from([np.float32, np.float64])
 

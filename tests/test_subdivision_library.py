@@ -53,6 +53,7 @@ def printed(process):
     return out.strip()
 
 
+@pytest.mark.thorough
 def test_two_processes_may_compile_at_once(opensubdiv, tmp_path):
     both = [started(PROGRAM, XDG_CACHE_HOME=tmp_path) for _ in range(2)]
     names = {printed(process) for process in both}
@@ -71,6 +72,7 @@ def test_a_cache_that_cannot_be_written_to_is_done_without(opensubdiv, tmp_path)
     assert not path.exists()  # It went with its process.
 
 
+@pytest.mark.thorough
 def test_without_a_compiler_the_table_of_plugins_says_what_to_install(opensubdiv, tmp_path):
     for environment in ({"PATH": str(tmp_path), "CXX": ""}, {"CXX": "no-such-compiler -O2"}):
         line = printed(started(SURVEY, **environment))
@@ -80,6 +82,7 @@ def test_without_a_compiler_the_table_of_plugins_says_what_to_install(opensubdiv
     assert "'no-such-compiler', is not found" in line
 
 
+@pytest.mark.thorough
 def test_without_headers_the_table_of_plugins_says_what_to_install(tmp_path):
     hide = "from rts_surfaces.subdivision import library; library.PREFIXES = ()"
     line = printed(started(f"{hide}\n{SURVEY}", RTS_OPENSUBDIV=tmp_path, CONDA_PREFIX=""))
@@ -107,6 +110,7 @@ def test_a_compiler_that_fails_is_one_line(opensubdiv, compiler, tmp_path, monke
     assert "\n" not in str(error.value) and not list((tmp_path / "rts").iterdir())
 
 
+@pytest.mark.thorough
 def test_a_library_that_is_damaged_is_made_anew(opensubdiv, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     path = library._compiled(library.find(), library.cache_folder())
@@ -115,6 +119,7 @@ def test_a_library_that_is_damaged_is_made_anew(opensubdiv, tmp_path, monkeypatc
     assert path.stat().st_size > 10_000
 
 
+@pytest.mark.thorough
 def test_a_damaged_library_that_cannot_be_removed_is_made_elsewhere(opensubdiv, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     library._compiled(library.find(), library.cache_folder()).write_bytes(b"cut short")

@@ -328,6 +328,7 @@ def resident():
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.thorough
 def test_hundreds_of_renders_leave_no_memory_behind(name):
     sampler, part = made(name), scene(name, 0)
     original = {key: value.copy() for key, value in part.theta.items()}
@@ -348,6 +349,7 @@ def test_hundreds_of_renders_leave_no_memory_behind(name):
 
 
 @pytest.mark.parametrize("name", ["embree", "opengl"])
+@pytest.mark.thorough
 def test_hundreds_of_meshes_leave_no_memory_behind(name):
     # Each of 5120 triangles: without release, 100 of them would be seen.
     sampler, (vertices, faces) = made(name), icosphere(4)
@@ -392,6 +394,7 @@ class Counted:
             setattr(self._context, attribute, value)
 
 
+@pytest.mark.thorough
 def test_hundreds_of_renders_leave_no_opengl_object_behind(monkeypatch):
     made("opengl")
     from rts_backends.opengl import worker as opengl_worker

@@ -216,6 +216,7 @@ KIT = ["pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider", "tests/plugin
 @pytest.mark.parametrize(
     "command", [["-c", RESIDUALS], ["-m", *KIT, "TestHeightfield and agree"]], ids=["residuals", "a plugin's kit"]
 )
+@pytest.mark.thorough
 def test_what_torch_or_numpy_calls_deprecated_is_not_used(command):
     root = Path(__file__).parents[1]
     given = {"capture_output": True, "text": True, "cwd": root, "env": {**os.environ, "PYTHONPATH": str(root)}}

@@ -161,6 +161,7 @@ def test_a_loop_in_a_program_of_jax_is_one_loop():
         assert program.count("while[") == 1
 
 
+@pytest.mark.thorough
 def test_images_of_the_torus_agree_compiled_and_batched():
     radii = np.stack([RADII, (0.8, 0.3)]).astype(np.float32)
 

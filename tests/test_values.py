@@ -98,6 +98,7 @@ def test_what_is_not_finite_is_refused_by_name(what, target, value):
 
 
 @pytest.mark.parametrize("what", HOLED)
+@pytest.mark.thorough
 def test_in_a_compiled_program_what_is_not_a_number_stays_so(what):
     jax = pytest.importorskip("jax")
     part = HOLED[what](np.nan)
