@@ -10,6 +10,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
+LOOPS := $(shell grep -rl --include=*.py -E '@loop|numba' rts rts_backends rts_surfaces)
 
 # What opens the pages of comparisons, where no other browser that the tests know is there.
 BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || command -v google-chrome),,chromium)
@@ -37,8 +38,10 @@ test-xla: warmup
 	XLA_FLAGS= $(PYTEST) tests/test_jax.py
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
-warmup: system $(VENV)/.test
-	-$(BIN)/rts warmup
+warmup: system $(VENV)/.test $(VENV)/.warm
+
+$(VENV)/.warm: $(VENV)/.test $(LOOPS)
+	-$(BIN)/rts warmup && touch $@
 
 # Ruff: rules and format of Python, in Markdown too.
 lint: $(VENV)/.dev

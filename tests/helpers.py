@@ -27,10 +27,9 @@ ALL = ["numpy", *DIFFERENTIABLE]
 
 def quick(values, count=1):
     """Parameters of a test, of which `make test` tries the first ones and `make test-all` the rest."""
-    values = list(values)
     return [
-        *values[:count],
-        *(pytest.param(*(v if isinstance(v, tuple) else (v,)), marks=pytest.mark.thorough) for v in values[count:]),
+        pytest.param(*(v if isinstance(v, tuple) else (v,)), marks=[pytest.mark.thorough] * (number >= count))
+        for number, v in enumerate(values)
     ]
 
 

@@ -285,6 +285,7 @@ def test_normal_equations_in_a_compiled_program():
         np.testing.assert_allclose(to_numpy(a), to_numpy(b), rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_fits_take_fewer_samples():
     vertices = 0.9 * BALL * [1, 0.7, 0.5]
 

@@ -92,6 +92,7 @@ def program(*arguments, cwd=None):
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
 
 
+@pytest.mark.thorough
 def test_as_a_module_it_is_the_same_program(tmp_path):
     shown = program("render", "--help").stdout
     assert "Usage: rts render [OPTIONS]" in shown and "-m" not in shown and "__main__" not in shown

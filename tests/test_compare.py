@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import quad, quick
+from helpers import quad
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -483,7 +483,8 @@ def modelled(monkeypatch):
 
 
 class TestTune:
-    @pytest.mark.parametrize("tolerance", quick([0.6, 1.5, 0.25, 0.1]))
+    @pytest.mark.parametrize("tolerance", [0.6, 1.5, 0.25, 0.1])
+    @pytest.mark.thorough
     def test_cheapest(self, modelled, kept, tolerance):
         modes = ["translation", "shape"]
         options = dict(splatters=["none", "single", "multi", "visible"], samplers=["raster", "reference"], truths=kept)
@@ -764,6 +765,7 @@ class TestCommandLine:
             table = summary(Comparison({"name": "s"}, {}, {"x": {}}, [row], []))
             assert [*table.columns[1].cells] == [f"visible K=2 raster torch\n{text}"]
 
+    @pytest.mark.thorough
     def test_tune(self, model):
         code, told = run("tune", model, "--size", SIDE, "--mode", "translation", "--tolerance", 0.5)
         assert code == 0, told

@@ -197,6 +197,7 @@ def test_rows_without_time_are_not_drawn_and_others_are(tmp_path):
     assert not np.array_equal(images[1], images[2])
 
 
+@pytest.mark.thorough
 def test_any_names_and_modes_without_rows_are_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     toys = [f"{NASTY}{i}" for i in range(7)]
@@ -411,6 +412,7 @@ def used(browse):
     return given, read
 
 
+@pytest.mark.thorough
 def test_the_page_names_the_fastest_settings_within_an_error(used):
     given, read = used
     rows = rows_of(given, "color")
@@ -432,6 +434,7 @@ def test_the_page_names_the_fastest_settings_within_an_error(used):
     assert next(lines, None) is None and any(line[1] == "none" for line in read["first"]["table"])
 
 
+@pytest.mark.thorough
 def test_points_are_hovered_over_clicked_on_and_hidden(used):
     given, read = used
     assert read["first"]["mode"] == "color"

@@ -4,6 +4,7 @@ import threading
 
 import numpy as np
 import pytest
+from helpers import quick
 
 import rts
 from rts import Camera, Part
@@ -26,7 +27,7 @@ SURFACES = {
 THREADS, ROUNDS = 8, 3
 
 
-@pytest.mark.parametrize("name", ["sdf", "isosurface"])
+@pytest.mark.parametrize("name", quick(["sdf", "isosurface"]))
 def test_threads_at_once_find_the_images_and_gradients_of_one(name):
     torch = pytest.importorskip("torch")
     surfaces = [SURFACES[name](swept_sphere) for _ in range(THREADS)]

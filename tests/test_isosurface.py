@@ -269,6 +269,7 @@ def test_a_band_shows_what_the_lattice_shows(target):
         assert len(extracted.faces) == len(function(40).surface.extract(theta).faces)
 
 
+@pytest.mark.thorough
 def test_a_band_cannot_be_traced():
     jax = pytest.importorskip("jax")
     part = function(20, band=NarrowBand(lipschitz=1.0))

@@ -126,6 +126,7 @@ def test_without_optax_jax_renders():
     without("optax", "", jax=True)
 
 
+@pytest.mark.thorough
 def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
     printed = without(
         "matplotlib",
@@ -139,6 +140,7 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
     assert "pip install 'rasterize-then-splat[plots]'" in " ".join(printed.split())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "package, plugin",
     [("embreex", "rasterize-then-splat[embree]"), ("jax", "rasterize-then-splat[jax]")],

@@ -353,7 +353,9 @@ def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, tmp
 
 
 @pytest.mark.filterwarnings("ignore::rts.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")
-@pytest.mark.parametrize("call", misuses.CALLS)
+@pytest.mark.parametrize(
+    "call", [pytest.param(c, marks=[pytest.mark.thorough] * c.startswith("tune.")) for c in misuses.CALLS]
+)
 def test_a_wrong_value_is_one_line_or_works(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     raw = []

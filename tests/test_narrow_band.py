@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import quick
 
 from rts import InputError
 from rts_surfaces.implicit.distinct_loops import distinct
@@ -115,7 +116,7 @@ FIELDS = {name: (level, bound) for name, level, bound in fields()}
 
 
 @pytest.mark.parametrize("name", FIELDS)
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", quick([True, False]))
 def test_with_a_lipschitz_bound_all_cells_are_found(name, closed):
     level, bound = FIELDS[name]
     for shape in SHAPES:

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers import arrays, box, icosphere, quad
+from helpers import arrays, box, icosphere, quad, quick
 
 import rts
 from rts.arrays.engines import engine_of
@@ -316,7 +316,7 @@ def test_what_is_broken_is_named(make):
             assert f"{reason.color} = {reason.kind}" in str(found)
 
 
-@pytest.mark.parametrize("make", SCENES)
+@pytest.mark.parametrize("make", quick(SCENES, 8))
 def test_what_is_mended_is_not_named(make):
     assert SCENES[make] not in {r.kind for r in check(make, mended=True).reasons}
 

@@ -267,6 +267,7 @@ def test_engines_and_dtypes_agree_and_stay(energy):
             np.testing.assert_allclose((residuals.astype(np.float64) ** 2).sum(), expected, rtol=tolerance)
 
 
+@pytest.mark.thorough
 def test_levenberg_marquardt_finds_the_shape_at_rest_again():
     torch = pytest.importorskip("torch")
     vertices, faces = icosphere(0)

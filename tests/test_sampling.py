@@ -255,6 +255,7 @@ def test_parts_are_interleaved_alike_on_the_host_and_in_array_code(target, monke
                 np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
+@pytest.mark.thorough
 def test_the_parts_of_batched_samples_are_those_of_each():
     jax = pytest.importorskip("jax")
     vertices, faces = icosphere(1)

@@ -179,6 +179,7 @@ def comb(teeth=7, pixel=1 / 16):
     return rts.ImageResiduals(moved, camera, (32, 64), goal, supersample=4)
 
 
+@pytest.mark.thorough
 @torch_targets
 def test_a_pyramid_finds_the_tooth_that_fine_ones_miss(target):
     residuals, start = comb(), arrays(target, np.array([8 / 16]))

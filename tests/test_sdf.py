@@ -104,6 +104,7 @@ def test_cameras_far_away_and_slopes_of_any_size_do_not_matter():
     )
 
 
+@pytest.mark.thorough
 def test_rays_are_clipped_to_boxes_as_to_balls():
     origins, directions, roots = some_rays()
     directions[0] *= (1, 0, 1)
@@ -242,6 +243,7 @@ def test_points_move_along_the_normal():
     np.testing.assert_allclose(after["position"] - before["position"], 0.01 * before["normal"], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_function_without_derivative_at_the_origin_does_no_harm():
     jax = pytest.importorskip("jax")
 

@@ -11,6 +11,7 @@ import weakref
 import numpy as np
 import pytest
 from cages import ball, cube, prism, sheet, somewhere
+from helpers import quick
 
 import rts
 from rts import InputError
@@ -225,7 +226,7 @@ def broken(rng, faces, creases, corners):
     return faces, creases, corners
 
 
-@pytest.mark.parametrize("first", range(0, COUNT, STEP))
+@pytest.mark.parametrize("first", quick(range(0, COUNT, STEP)))
 def test_random_cages_give_a_clear_line_or_finite_points(first):
     refused = made = 0
     for number in range(first, min(first + STEP, COUNT)):
@@ -265,6 +266,7 @@ def test_random_cages_give_a_clear_line_or_finite_points(first):
     assert made > STEP / 8 and refused > STEP / 8
 
 
+@pytest.mark.thorough
 def test_cages_that_are_made_and_freed_leave_nothing_behind():
     vertices, faces = cube()
     cage = checked_cage(faces, "catmark", [(0, 1, 2.5), (1, 3, 10)])

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import quick
 
 import rts
 from rts import PluginError
@@ -65,6 +66,7 @@ def test_two_processes_may_compile_at_once(opensubdiv, tmp_path):
     assert kept[0].stat().st_mtime_ns == before and list((tmp_path / "rts").iterdir()) == kept
 
 
+@pytest.mark.thorough
 def test_a_cache_that_cannot_be_written_to_is_done_without(opensubdiv, tmp_path):
     (tmp_path / "file").write_text("no folder")
     path = Path(printed(started(PROGRAM, XDG_CACHE_HOME=tmp_path / "file")))
@@ -101,7 +103,7 @@ def test_a_version_without_bfr_is_told_from_none(tmp_path, monkeypatch):
         library.find()
 
 
-@pytest.mark.parametrize("compiler", ["false", "c++ -nostdinc++", "c++ -lno-such-library"])
+@pytest.mark.parametrize("compiler", quick(["false", "c++ -nostdinc++", "c++ -lno-such-library"]))
 def test_a_compiler_that_fails_is_one_line(opensubdiv, compiler, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", compiler)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

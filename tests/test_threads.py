@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import Ellipsoid
-from helpers import icosphere, soup
+from helpers import icosphere, quick, soup
 
 import rts
 from rts import Camera, Part, PluginError
@@ -63,7 +63,7 @@ def pictures(name, sampler, kind, count, size, moving):
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["poses", "vertices"])
-@pytest.mark.parametrize("shared", [True, False], ids=["one sampler", "two samplers"])
+@pytest.mark.parametrize("shared", quick([True, False]), ids=["one sampler", "two samplers"])
 def test_two_threads_render_what_one_does_after_the_other(name, shared, moving):
     first = made(name)
     samplers = (first, first if shared else made(name))
@@ -304,6 +304,7 @@ np.testing.assert_allclose(np.asarray(rts.render(handles[0], camera, (12, 15))),
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this system")
+@pytest.mark.thorough
 def test_a_forked_child_is_told_that_opengl_was_in_use():
     made("opengl")
     environment = os.environ | {"RTS_NUM_THREADS": "2"}

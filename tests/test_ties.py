@@ -19,8 +19,8 @@ pytestmark = pytest.mark.sampling
 
 torch = pytest.importorskip("torch")
 
-FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_TIES", "84")).split(":")[-2:])
-STEP = 2 * len(KINDS)
+FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_TIES", "63")).split(":")[-2:])
+STEP = len(KINDS)
 MESH = rts.plugin("rts.surfaces", "mesh")
 SPECIFICATIONS = {"multi": splatting.Multi(), "visible": splatting.Visible()}
 # On the same cells: with a wider apron, rays through edges are rounded to either side.

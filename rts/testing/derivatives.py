@@ -17,7 +17,8 @@ from rts.testing.claims import claim, claim_close, claim_finite, no_error
 from rts.testing.compatibility import single
 
 ENGINES = registry.plugins("rts.engines")
-DIFFERENTIABLE = [name for name in ENGINES if name != "numpy"]
+DIFFERENTIABLE = sorted((name for name in ENGINES if name != "numpy"), key=lambda name: name == "jax")
+"""Names of the engines with derivatives; jax comes last, since its programs take seconds to compile."""
 
 
 def engine_or_skip(name: str) -> Engine:

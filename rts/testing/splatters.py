@@ -15,7 +15,7 @@ from rts.plugin_base import overrides, promised
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance
-from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, installed
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
@@ -112,7 +112,7 @@ class SplatterConformance(Conformance):
         claim(not (kept & ~covered).any(), "needed asks for samples that are not there")
         pruned = splats.replace(row=np.where(kept, splats.row, -1).astype(np.int32))
         claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
-        for engine in map(differentiating, DIFFERENTIABLE[:1]):
+        for engine in installed()[:1]:
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
             found, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
             claim_close(found, expected, 1e-4, "the derivative of needed samples")
@@ -131,7 +131,7 @@ class SplatterConformance(Conformance):
         row = np.where(loose, splats.row, -1).astype(np.int32)
         known = splats.replace(row=row, settled=settled)
         claim_close(_splat(splatter, known), _splat(splatter, splats), TOLERANCE, "the image of settled cells")
-        for engine in map(differentiating, DIFFERENTIABLE[:1]):
+        for engine in installed()[:1]:
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
             found, expected = (_along(engine, splatter, s, along) for s in (known, splats))
             claim_close(found, expected, 1e-4, "the derivative of settled cells")
