@@ -20,7 +20,7 @@ pytestmark = pytest.mark.sampling
 
 pytest.importorskip("numba")
 
-FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_SOUPS", "180")).split(":")[-2:])
+FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_SOUPS", "120")).split(":")[-2:])
 STEP = 30
 groups = pytest.mark.parametrize("first", quick(range(FIRST, LAST, STEP)))
 MESH = rts.plugin("rts.surfaces", "mesh")

@@ -328,7 +328,7 @@ def resident():
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", ["embree", "opengl"])
 @pytest.mark.thorough
 def test_hundreds_of_renders_leave_no_memory_behind(name):
     sampler, part = made(name), scene(name, 0)

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.sampling
 
 torch = pytest.importorskip("torch")
 
-FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_TIES", "63")).split(":")[-2:])
+FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_TIES", "42")).split(":")[-2:])
 STEP = len(KINDS)
 MESH = rts.plugin("rts.surfaces", "mesh")
 SPECIFICATIONS = {"multi": splatting.Multi(), "visible": splatting.Visible()}

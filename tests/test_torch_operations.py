@@ -210,11 +210,11 @@ for target in (np.ones((12, 16), np.float32), torch.ones(12, 16)):
     assert compare(np.zeros(6, np.float32)).shape == (12, 16)
     rts.fit(compare, torch.zeros(6), steps=1)
 """
-KIT = ["pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider", "tests/plugin_example/tests", "-k"]
+KIT = ["pytest", "-q", "-o", "filterwarnings=", "-p", "no:cacheprovider", "tests/plugin_example/tests", "-k"]
 
 
 @pytest.mark.parametrize(
-    "command", [["-c", RESIDUALS], ["-m", *KIT, "TestHeightfield and agree"]], ids=["residuals", "a plugin's kit"]
+    "command", [["-c", RESIDUALS], ["-m", *KIT, "TestHeightfield and frozen"]], ids=["residuals", "a plugin's kit"]
 )
 @pytest.mark.thorough
 def test_what_torch_or_numpy_calls_deprecated_is_not_used(command):
