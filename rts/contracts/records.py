@@ -355,6 +355,7 @@ class Splats(_OnCells):
         wanted: (H, W) bool, the targets whose colour is used; others may have any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
         one_part: whether all samples are of one part.
+        opaque: a promise that alpha is 1 at all samples.
     """
 
     positions: Array
@@ -365,6 +366,7 @@ class Splats(_OnCells):
     wanted: Array | None = None
     border: int = 0
     one_part: bool = False
+    opaque: bool = True
 
     @property
     def parts(self) -> Array | None:

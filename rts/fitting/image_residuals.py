@@ -313,7 +313,8 @@ class ImageResiduals(Residuals):
         sampled = sample(parts, window(camera), size, sampler=self._sampler, settles=True, **vars(self._settings))
         checked, _ = _checked(parts, camera)
         self._refuse_other(checked[0].shader.channels)
-        colored = self._channels > 1 or not all(part.shader.opaque for part in checked)
+        opaque = all(part.shader.opaque for part in checked)
+        colored = self._channels > 1 or not opaque
         band = slice(top, top + rows)
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
@@ -338,14 +339,14 @@ class ImageResiduals(Residuals):
             )
 
         part = None if sampled.one_part else sampled.part
-        known = Splats(None, None, replace(sampled.cells, depth=None), part, one_part=sampled.one_part)
+        known = Splats(None, None, replace(sampled.cells, depth=None), part, one_part=sampled.one_part, opaque=opaque)
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, replace(known, border=sampled.apron))
         # A pixel counts on one of the grids alone.
         fine = sampled.fine
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
         outside = replace(known, wanted=fine.coarse, border=sampled.apron)
-        placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron)
+        placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron, opaque=opaque)
         grids = (
             swept(partial(to_splats, sampled), coarse, outside),
             swept(lambda parts, camera, _, own: to_fine_splats(fine, parts, camera, own), finer, placed),

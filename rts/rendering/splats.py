@@ -43,7 +43,7 @@ def to_splats(
     grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
     sampled = _owned(sampled, sampled.row, context)
     positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, grid, context))
-    return _splats(sampled, positions, rgba, context, border=apron)
+    return _splats(sampled, parts, positions, rgba, context, border=apron)
 
 
 def _owned(tree: Tree, row: Array, context: Context) -> Tree:
@@ -86,7 +86,7 @@ def views_to_splats(
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = _together(*zip(*of_parts, strict=True))
         wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
-        splats.append(_splats(whole, positions, rgba, context, wanted=wanted))
+        splats.append(_splats(whole, parts, positions, rgba, context, wanted=wanted))
     return splats
 
 
@@ -114,12 +114,15 @@ def _places_of(pictures: Sequence[Views], context: Context) -> Array:
     return xp.concat([context.constants(corners), xp.concat(scales)[:, None]], axis=1)
 
 
-def _splats(sampled: Sampled, positions: Array, rgba: Array, context: Context, **more: Any) -> Splats:
+def _splats(
+    sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, **more: Any
+) -> Splats:
     """The splats of samples with these positions and colours; `more` are further fields of `Splats`."""
     cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
     if not context.engine.owns(rgba):
         cells, part = context_of(positions, rgba).constants((cells, part))
-    return Splats(positions, rgba, cells, part, one_part=sampled.one_part, **more)
+    opaque = all(p.shader.opaque for p in parts)
+    return Splats(positions, rgba, cells, part, one_part=sampled.one_part, opaque=opaque, **more)
 
 
 def to_fine_splats(fine: Fine, parts: Sequence[CheckedPart], camera: Camera, context: Context) -> Splats:
@@ -130,7 +133,7 @@ def to_fine_splats(fine: Fine, parts: Sequence[CheckedPart], camera: Camera, con
     arrays = fine.index, fine.shift, fine.cells, fine.part, fine.wanted
     index, shift, cells, part, wanted = context_of(positions, rgba).constants(arrays)
     moved = take_shifted(positions, index, namespace(positions).astype(shift, positions.dtype))
-    return Splats(moved, take(rgba, index), cells, part, wanted=wanted, border=fine.apron)
+    return Splats(moved, take(rgba, index), cells, part, wanted=wanted, border=fine.apron, opaque=all(p.shader.opaque for p in parts))
 
 
 def _shown(

@@ -77,6 +77,10 @@ class Depths:
         """Depths of the sources' layers, K times (H, W)."""
         return [self.at(z, u, v) for z in self._depth]
 
+    def sides(self, u: int, v: int) -> list[Array] | None:
+        """`Splats.facing` of the sources' layers, K times (H, W); or None."""
+        return None if self._facing is None else [self.at(f, u, v) for f in self._facing]
+
     def covers(self, u: int, v: int) -> Array:
         """True where the sources have any layer, (H, W)."""
         return self.at(self.covered[0], u, v)
@@ -93,10 +97,10 @@ class Depths:
             cells = [(self.at(f, u, v), self.at(f, 0, 0)) for f in self._facing]
             (front, target), *hidden = cells
             for k, (p, q) in enumerate(hidden, start=1):
-                ahead[k] = xp.where(_opposite(p, target, self.target[0] > source[k]), xp.inf, ahead[k])
-                below[k] = xp.where(_opposite(q, front, source[0] > self.target[k]), xp.inf, below[k])
-        a, best_a = _first_minimum(ahead, xp)
-        b, best_b = _first_minimum(below, xp)
+                ahead[k] = xp.where(opposite_sides(p, target, self.target[0] > source[k]), xp.inf, ahead[k])
+                below[k] = xp.where(opposite_sides(q, front, source[0] > self.target[k]), xp.inf, below[k])
+        a, best_a = first_minimum(ahead, xp)
+        b, best_b = first_minimum(below, xp)
         return xp.where(best_b < best_a, -b, a), xp.minimum(best_a, best_b)
 
     def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
@@ -250,14 +254,14 @@ def fronts(covered: np.ndarray) -> np.ndarray:
     return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
 
-def _opposite(hidden: Array, front: Array, behind: Array) -> Array:
+def opposite_sides(hidden: Array, front: Array, behind: Array) -> Array:
     """True where a hidden layer is the other side of a front's piece, and stands for no unknown layers behind it."""
     xp, bit = namespace(front), Cells.MORE_BEHIND
     other = (front != 0) & (hidden == -front)
     return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, bit, -bit)))
 
 
-def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
+def first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
     """Index and value of the smallest of several images, per cell; the first of equal ones."""
     best, index = values[0], xp.zeros_like(values[0], dtype=xp.int32)
     for k, value in enumerate(values[1:], start=1):

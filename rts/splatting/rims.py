@@ -81,7 +81,7 @@ def gains(
 
 
 def spread(total: Array, gain: Array) -> Array:
-    """The change of a buffer's colours (H, W, 4) with its coverage: their mean, where they do not fill the target.
+    """The change of a buffer (H, W, 5) with its coverage: its mean, where it does not fill the target.
 
     Args:
         total: the buffer's sums (H, W, 5), colours and weight.
@@ -89,7 +89,7 @@ def spread(total: Array, gain: Array) -> Array:
     """
     xp, weight = namespace(total), total[..., 4]
     partial = (weight > 0) & (weight < 1)
-    return (xp.where(partial, gain, 0.0) / xp.where(partial, weight, 1.0))[..., None] * total[..., :4]
+    return (xp.where(partial, gain, 0.0) / xp.where(partial, weight, 1.0))[..., None] * total
 
 
 class Back(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.contracts.records import Splats
-from rts.splatting import crossings, rims
+from rts.splatting import crossings, rims, stacks
 from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 
@@ -96,6 +96,17 @@ class Visible(Kernel):
         still = None if lines is None else lines.target
         revealed = sum(xp.where(m == k, z, 0.0) for k, z in enumerate(layers.target))
 
+        def changes(totals: list[Array]) -> list[Array]:
+            """The change of coverage of the first two buffers, as outlines move."""
+            if not (self.rims and differentiates):
+                return [0.0, 0.0]
+            moved = rims.gains(self, layers, shift, splats.parts, crossed)
+            moved = moved if still is None else [xp.where(still, 0.0, gain) for gain in moved]
+            return [rims.spread(total, gain) for total, gain in zip(totals, moved, strict=True)]
+
+        if not splats.opaque:
+            image = stacks.image(layers, shift, self.sigma, still, changes)
+            return image if lines is None else image + crossings.motion(self, layers, lines)
         front, surface, behind = 0.0, 0.0, 0.0
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
@@ -106,10 +117,8 @@ class Visible(Kernel):
                 surface = surface + xp.where((s == k)[..., None], own, 0.0)
                 behind = behind + xp.where((hidden == k)[..., None], own, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
-        if self.rims and differentiates:
-            gains = rims.gains(self, layers, shift, splats.parts, crossed)
-            for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
-                colors[i] = colors[i] + rims.spread(total, gain if still is None else xp.where(still, 0.0, gain))
+        for i, change in enumerate(changes([front, surface])):
+            colors[i] = colors[i] + (change if isinstance(change, float) else change[..., :4])
         image = over(colors[0], over(*colors[1:]))
         return image if lines is None else image + crossings.motion(self, layers, lines)
 

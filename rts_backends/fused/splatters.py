@@ -55,13 +55,13 @@ class _Fused(SummingSplatter):
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if splats.rgba.shape[0] == 0:
+        if splats.rgba.shape[0] == 0 or self._left_out(splats):
             return self.array_code.image(splats)
         return self._of(splats.replace(border=0))
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if not self._own_image or splats.rgba.shape[0] == 0:
+        if not self._own_image or splats.rgba.shape[0] == 0 or self._left_out(splats):
             return super().cropped(splats)
         return self._of(splats)
 
@@ -77,6 +77,10 @@ class _Fused(SummingSplatter):
         none = splats.row[0, :0, :]
         known = splats.wanted, splats.settled, self._exits(splats)
         return splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
+
+    def _left_out(self, splats: Splats) -> bool:
+        """True where the specification makes the image: of translucent stacks."""
+        return self.kind == "visible" and not splats.opaque
 
     def _facing(self, splats: Splats) -> Array | None:
         return splats.facing if "facing" in self.reads else None
@@ -117,7 +121,7 @@ class _Fused(SummingSplatter):
         loss: Loss | None = None,
     ) -> tuple[Array, Array, Array] | None:
         """See `rts.Splatter`."""
-        if not self._sweeps:
+        if not self._sweeps or self._left_out(splats):
             return None
         from rts_backends.fused import normal_equations
 
