@@ -25,7 +25,7 @@ class Bezier(Patches):
 
     Args:
         indices: (n, 16) integers into θ["points"]: the 4 × 4 points of each patch, first along u, then along v.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
         InputError: indices of another shape, or a tolerance that is not positive.

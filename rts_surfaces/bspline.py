@@ -96,7 +96,7 @@ class Revolution(BSpline):
         heights: (n,) numbers, the y of the profile's control points, at least 4.
         count: the number of control points around the axis, at least 4.
         ends: "clamped" or "open", of the profile.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
         InputError: fewer than 4 control points, other ends, or a tolerance that is not positive.
