@@ -238,7 +238,7 @@ BLOCKS = (ast.For, ast.While, ast.If, ast.With, ast.Try)
 
 
 def nesting(nodes, depth=0):
-    """How deep blocks are nested in these statements; `elif` is as deep as its `if`, functions within count apart."""
+    """The depth of nested blocks in statements; `elif` is as deep as its `if`, inner functions count apart."""
     deepest = depth
     for node in nodes:
         if not isinstance(node, BLOCKS):
