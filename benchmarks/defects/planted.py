@@ -95,10 +95,10 @@ LOOPS = [
         "operations camera",
     ),
     Defect(
-        "reverse mode of the projection leaves gradients of what does not count unset",
+        "reverse mode of the projection forgets how depth shrinks",
         "rts/operations/projection_loops.py",
-        "g_points[n, 0] = g_points[n, 1] = g_points[n, 2] = zero",
-        "g_points[n, 0] = g_points[n, 1] = zero",
+        "c = zero if w == 0 else -(g[n, 0] * u + g[n, 1] * v) * over",
+        "c = zero if w == 0 else -(g[n, 0] * u + g[n, 0] * v) * over",
         "operations rendering",
     ),
     Defect(
@@ -109,10 +109,10 @@ LOOPS = [
         "operations rigid",
     ),
     Defect(
-        "gradients of patches forget the last weight",
+        "gradients of a row that two samples share do not add up",
         "rts/operations/combine_loops.py",
-        "w = weights[n, i] if not affine or i < count - 1 else rest",
-        "w = weights[n, i] if not affine or i < count - 1 else 0 * rest",
+        "g_rows[ids[n, column + i], c] += w * g[n, c]",
+        "g_rows[ids[n, column + i], c] = w * g[n, c]",
         "operations patches subdivision",
     ),
     Defect(
