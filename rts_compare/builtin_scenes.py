@@ -27,7 +27,7 @@ SIZE = (256, 256)
 VARIABLE, FOLDER = "RTS_DATA", Path("../shared/data")
 """The variable that names the folder of the test data, and where that is without."""
 EXACT = 0.02
-"""Pixels that triangles of exact surfaces may be off the surface at outlines: a fifth of what they usually may."""
+"""The largest distance of exact surfaces' triangles from the surface at outlines, pixels: a fifth of the usual one."""
 
 
 class Builtin(NamedTuple):

@@ -33,7 +33,7 @@ from rts_compare.true_derivatives import SAMPLES
 LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4, Adaptive(4))
 QUICK_CELLS = 40
-"""The most settings that are looked at with `quick`."""
+"""The most settings that are measured with `quick`."""
 PEER_ROUNDS = 2
 """Turns of other renderers."""
 PACKAGES = ("rasterize-then-splat", "numpy", "numba", "torch", "jax", "embreex", "moderngl", "deodr", "mitsuba")
@@ -46,12 +46,12 @@ class Comparison:
     Attributes:
         scene: "name", "note" and "size" (height, width).
         environment: date, machine and versions.
-        modes: mode → {"truth_error": what the truth itself may be off}.
+        modes: mode → {"truth_error": error of the truth itself}.
         rows: one for each mode and setting: "mode", "settings", "error" (relative L2 through a Gaussian of 2 pixels),
             "gain", "loss_error", "ms" (median, quartiles and number of calls, or None where only the error was
             measured) and "front", whether nothing is both faster and more accurate. Rows of other renderers have
             "peer", too.
-        left_out: what could not be measured, and why; a line each.
+        left_out: a line for each measurement that failed, with the reason.
     """
 
     scene: Mapping[str, Any]
@@ -62,7 +62,7 @@ class Comparison:
 
     @property
     def data(self) -> dict[str, Any]:
-        """All of it as dicts and lists, as it is written to JSON."""
+        """The comparison as dicts and lists, in the form of its JSON file."""
         return dict(vars(self))
 
     def best(self, mode: str, error: float) -> Row | None:
@@ -89,7 +89,7 @@ class Comparison:
         return written
 
     def files(self, folder: Path | str) -> list[Path]:
-        """The files of the comparison that there are in a folder."""
+        """The files of the comparison that exist in a folder."""
         return [file for file in self._files(folder) if file.exists()]
 
     def _files(self, folder: Path | str) -> list[Path]:
@@ -103,17 +103,17 @@ def file_name(scene: str) -> str:
 
 
 class Plan(NamedTuple):
-    """A plan of what is measured.
+    """A plan of measurements.
 
     Attributes:
         splatters: names.
-        samplers: names of those that suit the scene, the usual one first; each with the one whose errors it shares:
+        samplers: names of samplers that suit the scene, the usual one first; each with the one whose errors it shares:
             "" for the usual one.
-        engines: the one that errors are measured with first.
+        engines: the first measures errors.
         layers: K or "auto".
         supersample: as `Setting.supersample`.
         rates: whether the rates that surfaces offer are tried.
-        most: how many settings are looked at, at most; None for all.
+        most: the most settings to measure; None for all.
         peers: other renderers.
     """
 
@@ -214,15 +214,15 @@ def compare(
 
 
 def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()) -> list:
-    found = list(usual) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
-    if not found or not all(is_count(n) or (isinstance(n, str) and n in others) for n in found):
+    numbers = list(usual) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
+    if not numbers or not all(is_count(n) or (isinstance(n, str) and n in others) for n in numbers):
         expected = " or ".join(["integers of at least 1", *map(repr, others)])
         raise InputError(f"{name} is {quoted(given)}; expected {expected}")
-    return [n if isinstance(n, str) else int(n) for n in found]
+    return [n if isinstance(n, str) else int(n) for n in numbers]
 
 
 def _samples(given: Any) -> list[int | str]:
-    """Values of `Setting.supersample`, of what a user gave."""
+    """Values of `Setting.supersample` for a user's argument."""
     wanted = list(SUPERSAMPLE) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
     if not wanted or not all(is_count(finest(s)) for s in wanted):
         raise InputError(f"supersample is {quoted(given)}; expected integers of at least 1 or rts.Adaptive")
@@ -287,19 +287,21 @@ def _compared(measured: Measurements, plan: Plan, phase: Phase) -> Comparison:
 
 
 def _counted(f: Callable, *args: Any, done: Callable[[], None]) -> Any:
-    """The result of a call, which counts as a step."""
-    found = f(*args)
+    """The result of a call, counted as a step of progress."""
+    result = f(*args)
     done()
-    return found
+    return result
 
 
 def _cells(measured: Measurements, plan: Plan, group: str) -> list[Setting]:
     kinds = dict.fromkeys(plan.samplers.values())
-    found = measured.settings(group, plan.splatters, plan.layers, plan.supersample, kinds, plan.rates)
-    if plan.most is not None and len(found) > plan.most:
-        measured.left_out.append(f"{len(found) - plan.most} settings beyond the {plan.most} that are quick to measure")
-        found = found[: plan.most]
-    return found
+    settings = measured.settings(group, plan.splatters, plan.layers, plan.supersample, kinds, plan.rates)
+    if plan.most is not None and len(settings) > plan.most:
+        measured.left_out.append(
+            f"{len(settings) - plan.most} settings beyond the {plan.most} that are quick to measure"
+        )
+        settings = settings[: plan.most]
+    return settings
 
 
 def _timed(
@@ -307,9 +309,9 @@ def _timed(
 ) -> dict[Setting, dict[str, float]]:
     """Times of settings.
 
-    Of each splatter, and each sampler with errors of its own, the front of errors is timed, with one sampler and the
-    first engine; what is then on the front of errors and times, with all samplers that share these errors, and with all
-    other engines.
+    For each splatter, and each sampler with errors of its own, the front of errors is timed first, with one sampler and
+    the first engine. Settings on the front of errors and times are then timed with all samplers that share these
+    errors, and with all other engines.
     """
     engine = plan.engines[0].name
     usual = {kind: next(name for name, k in plan.samplers.items() if k == kind) for kind in plan.samplers.values()}
@@ -333,7 +335,7 @@ def _timed(
         for name, kind in plan.samplers.items()
         if kind == s.sampler and name != usual[kind]
     ]
-    # Compiled programs have to know how many layers there are.
+    # Compiled programs have to know the number of layers.
     more += [first[s]._replace(engine=e.name) for s in best for e in plan.engines[1:] if s.layers != "auto"]
     return times | _taken(measured, group, more, phase, "times, other samplers and engines")
 
@@ -342,9 +344,9 @@ def _taken(
     measured: Measurements, group: str, settings: Sequence[Setting], phase: Phase, what: str
 ) -> dict[Setting, dict[str, float]]:
     timing = measured.timing(group, {s: lambda s=s: measured.call(group, s) for s in settings})
-    found = timing.run(done=phase(what, ROUNDS * len(settings)))
+    times = timing.run(done=phase(what, ROUNDS * len(settings)))
     measured.left_out += [f"{', '.join(str(v) for v in s if v != '')}: {why}" for s, why in timing.failed.items()]
-    return {Setting(*s): ms for s, ms in found.items()}
+    return {Setting(*s): ms for s, ms in times.items()}
 
 
 def _peer_key(peer: Peer) -> tuple:
@@ -367,7 +369,7 @@ def _peer_scores(measured: Measurements, mode: str, peer: Peer) -> dict[str, flo
 def _peer_times(
     measured: Measurements, mode: str, peers: Sequence[Peer], phase: Phase
 ) -> dict[tuple, dict[str, float]]:
-    """Times of peers in a mode: they have to be told anew where a mode changes other vertices or colours."""
+    """Times of peers in a mode; taken anew if a mode changes other vertices or colours."""
     if not peers:
         return {}
     calls: Calls = {_peer_key(p): lambda p=p: p.gradient(mode) for p in peers}

@@ -25,11 +25,11 @@ from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
 from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
 
 PATIENCE = 8.0
-"""Seconds after which a sampler that has not answered is left out."""
+"""Seconds after which a sampler that has not finished is left out."""
 PROBE, SLOWEST = 8, 3.0
-"""Side of the first image that samplers are tried on, pixels; the most seconds that one of the scene's size takes."""
+"""Side of the first image that samplers are tried on, pixels; and the most seconds for an image of the scene's size."""
 ALIKE = 0.002
-"""Samplers whose derivatives differ by less, relative L2, share their errors."""
+"""Samplers whose derivatives differ by less than this, relative L2, share their errors."""
 
 TOGETHER = "all"
 """The group of all modes, where they are differentiated at once."""
@@ -38,21 +38,21 @@ Done = Callable[[], None]
 
 
 class Measurements:
-    """A scene, and what has been measured of it.
+    """A scene and its measurements.
 
     Args:
         scene: the scene.
-        kept: where measurements are kept.
-        engines: those that have derivatives; errors are measured with the first.
+        kept: the store of measurements.
+        engines: engines with derivatives; errors are measured with the first.
         truths: the folder of truths; None for that of caches.
-        samples: of the truth, the square root of their number a pixel, where `refine_truths` takes no others.
+        samples: of the truth, along each side of a pixel, unless `refine_truths` takes others.
         together: whether the parameters of all modes are differentiated at once.
         count_at: samples along each side of a pixel with which layers are counted, once for all settings of a splatter;
             None to count them with those of each setting.
         slowest: the most seconds that a sampler may take for an image of the scene's size.
 
     Attributes:
-        left_out: what could not be measured, a line each.
+        left_out: a line for each measurement that failed.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class Measurements:
         return [mode for mode in self.scene.directions if self.group(mode) == group]
 
     def pixel(self, mode: str) -> float:
-        """How far along a mode what moves fastest moves by a pixel.
+        """The step along a mode that moves the fastest point by a pixel.
 
         Raises:
-            InputError: nothing changes with it.
+            InputError: the mode changes nothing.
         """
         if mode not in self._pixels:
             engine, scene = self.engine, self.scene
@@ -115,21 +115,21 @@ class Measurements:
         return self._pixels[mode]
 
     def leave_out_what_rests(self) -> None:
-        """Go on with those modes that change something.
+        """Drop the modes that change nothing.
 
         Raises:
-            InputError: there are none.
+            InputError: no mode is left.
         """
         self._keep(self.pixel)
 
     def truths(self, done: Done) -> None:
-        """Make the truths, and go on with those modes in which the image changes.
+        """Make the truths, and drop the modes in which the image does not change.
 
         Args:
             done: see `truth`.
 
         Raises:
-            InputError: there are none.
+            InputError: no mode is left.
         """
 
         def changes(mode: str) -> None:
@@ -151,7 +151,7 @@ class Measurements:
             self.truth(mode, done)
 
     def _keep(self, check: Callable[[str], Any]) -> None:
-        """Go on with the modes that a check does not refuse."""
+        """Keep the modes that a check does not refuse."""
         kept, why = [], []
         for mode in self.scene.directions:
             try:
@@ -175,7 +175,7 @@ class Measurements:
         return self.engine.constant(np.asarray(value, np.float32), like)
 
     def truth(self, mode: str, done: Done = lambda: None) -> Truth:
-        """How the image truly changes along a mode; see `truth`."""
+        """The true change of the image along a mode; see `truth`."""
         if mode not in self._truths:
             samples = self._truth_samples.get(mode, self.samples)
             options: dict[str, Any] = dict(samples=samples, engine=self._still, folder=self.folder, done=done)
@@ -184,7 +184,7 @@ class Measurements:
 
     @property
     def _still(self) -> Engine | None:
-        """The engine of scenes without derivatives: None for NumPy, where the scene takes it."""
+        """The engine of scenes without derivatives; None for NumPy, if the scene takes it."""
         return None if self.scene.separate else self.engine
 
     def state(self, mode: str) -> tuple[str, ...]:
@@ -207,7 +207,7 @@ class Measurements:
     # -------------------------------------------------------------------------------------------------- samplers
 
     def samplers(self, names: Iterable[str]) -> list[str]:
-        """Samplers that can sample all parts, the one that "auto" takes first; "auto" itself where it takes several."""
+        """Samplers that can sample all parts, "auto"'s choice first; "auto" itself if it chooses several."""
         found = self.scene.at(self.start(self.group(next(iter(self.scene.directions)))))
         parts = parts_of(found)
         auto = {choice.sampler for choice in explain(parts, found[1])}
@@ -226,7 +226,7 @@ class Measurements:
         return sorted(suited, key=lambda name: (name not in auto, name != "auto"))
 
     def kinds(self, samplers: Sequence[str]) -> dict[str, str]:
-        """Each sampler, with the one that its errors are shared with: "" for the usual one, itself where it differs."""
+        """Each sampler, with the one whose errors it shares: "" for the usual one, or itself if it differs."""
         group = self.group(next(iter(self.scene.directions)))
         found = {}
         for name in samplers:
@@ -238,7 +238,7 @@ class Measurements:
         return found
 
     def _agrees(self, name: str, usual: str, group: str) -> bool:
-        """True where a sampler gives the derivatives that the usual one gives."""
+        """True if a sampler gives the same derivatives as the usual one."""
         for mode in self.modes(group):
             setting = Setting("auto", 2, 1)
             try:
@@ -280,15 +280,15 @@ class Measurements:
         kinds: Iterable[str] = ("",),
         rates: bool = True,
     ) -> list[Setting]:
-        """Settings that may differ in their error, of those that can be had.
+        """Possible settings that may differ in their error.
 
         Args:
             group: of modes.
             splatters: names.
             layers: numbers, or "auto".
             samples: as `Setting.supersample`.
-            kinds: samplers that have errors of their own, and "" for all others.
-            rates: whether the rates that surfaces offer are among them.
+            kinds: samplers with errors of their own, and "" for all others.
+            rates: whether settings include the rates that surfaces offer.
         """
         all_of = (
             Setting(splatter, count, supersample, rate, kind)
@@ -301,7 +301,7 @@ class Measurements:
         return [setting for setting in all_of if self.counting(group, setting) is not None]
 
     def counting(self, group: str, setting: Setting) -> int | None:
-        """How many layers count in a setting: beyond those that "auto" takes there are none. None where that fails."""
+        """The number of layers that count in a setting: at most those of "auto". None if "auto" fails."""
         counted = setting._replace(layers="auto", engine="")
         if self.count_at is not None:
             counted = counted._replace(supersample=self.count_at, rate="")
@@ -311,7 +311,7 @@ class Measurements:
         return most if setting.layers == "auto" else min(int(setting.layers), most)
 
     def _layers(self, group: str, setting: Setting) -> int | None:
-        """How many layers "auto" takes, None where it takes none."""
+        """The number of layers that "auto" takes; None if it fails."""
         key = "layers", group, *setting, *self._identity(self.modes(group)[0], setting)
         if key in self._failed:
             return None
@@ -320,19 +320,19 @@ class Measurements:
             parts, camera = self.at_rates(group)[setting.rate].at(self.start(group))
             try:
                 with limited(LONGEST):
-                    found = _quietly(lambda: sample(parts, camera, self.scene.size, **setting.options))
-                kept = self.kept.put(int(found.row.shape[0]), *key)
+                    sampled = _quietly(lambda: sample(parts, camera, self.scene.size, **setting.options))
+                kept = self.kept.put(int(sampled.row.shape[0]), *key)
             except Exception as error:
                 self._failed[key] = one_line(f"{type(error).__name__}: {error}")
                 self._leave_out(f'splatter {setting.splatter!r}, layers="auto": {self._failed[key]}')
         return kept
 
     def scores(self, mode: str, setting: Setting) -> dict[str, float] | None:
-        """How far the derivative along a mode is off; see `rts_compare.derivative_scores`. None where it fails.
+        """Errors of the derivative along a mode; see `rts_compare.derivative_scores`. None if it fails.
 
         Args:
             mode: of the scene.
-            setting: its `sampler` is one that has errors of its own, or "".
+            setting: its `sampler` has errors of its own, or is "".
         """
         count = self.counting(self.group(mode), setting)
         if count is None:
@@ -362,20 +362,20 @@ class Measurements:
         return scores(derivative, self.truth(mode).derivative)
 
     def _derivative(self, mode: str, setting: Setting) -> np.ndarray:
-        """The derivative image (H, W, 3) along a mode, a pixel of motion."""
+        """The derivative image (H, W, 3) along a mode, for a motion of one pixel."""
         at, pixel = self.at_rates(self.group(mode))[setting.rate].at, self.pixel(mode)
 
         def image(t: Array) -> Array:
             return render(*at(self.scene.moved(mode, t, self.engine)), self.scene.size, **setting.options)[..., :3]
 
         with limited(LONGEST):
-            found = _quietly(lambda: self.engine.jvp(image, self._number(0.0), self._number(pixel))[1])
-        return self.engine.to_numpy(found).astype(np.float64)
+            derivative = _quietly(lambda: self.engine.jvp(image, self._number(0.0), self._number(pixel))[1])
+        return self.engine.to_numpy(derivative).astype(np.float64)
 
     # ----------------------------------------------------------------------------------------------------- times
 
     def work(self, group: str, setting: Setting) -> tuple[float, ...]:
-        """The cost of a setting, in respects that are known beforehand: layers, samples, rate."""
+        """The cost of a setting in respects known beforehand: layers, samples, rate."""
         layers = self.counting(group, setting) or 0
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),
@@ -398,7 +398,7 @@ class Measurements:
         return lambda: _quietly(lambda: engine.block(gradient(live)))
 
     def start(self, group: str) -> Tree:
-        """The parameters, those that a group's modes change in arrays of the first engine."""
+        """The parameters; those that a group's modes change are arrays of the first engine."""
         live, rebuilt = self._live(group, self.engine)
         return rebuilt(live)
 
@@ -419,11 +419,11 @@ class Measurements:
         return live, rebuilt
 
     def timing(self, group: str, calls: Calls) -> InterleavedTiming:
-        """Functions that are to be timed, such as those of `call`, and where their times are kept.
+        """Timing of functions, such as those of `call`, with the store of their times.
 
         Args:
             group: of modes, whose parameters they differentiate.
-            calls: what to keep times under, a `Setting` or what a peer is called, → see `InterleavedTiming`.
+            calls: key of the times, a `Setting` or the name of a peer → see `InterleavedTiming`.
         """
         modes = self.modes(group)
         states = [state for mode in modes for state in self.state(mode)]
@@ -436,7 +436,7 @@ class Measurements:
 
 
 def _quietly(f: Callable[[], Any]) -> Any:
-    """The result of a call; what the library warns of is known from the first look at the scene."""
+    """The result of a call without warnings of the library, which the first look at the scene has shown."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RtsWarning)
         return f()

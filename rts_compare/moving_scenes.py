@@ -74,13 +74,13 @@ class Scene:
 
 
 def is_constant(tree: Tree) -> bool:
-    """True where every leaf is a NumPy array or a number, which is never differentiated."""
+    """True if every leaf is a NumPy array or a number, which are never differentiated."""
     return all(isinstance(x, (np.ndarray, np.generic, int, float, complex)) for x in leaves(tree))
 
 
-def parts_of(found: tuple[Part | Sequence[Part], Camera]) -> list[Part]:
-    """The parts of what a scene's function gave, in a list."""
-    return [found[0]] if isinstance(found[0], Part) else list(found[0])
+def parts_of(scene: tuple[Part | Sequence[Part], Camera]) -> list[Part]:
+    """The parts in the result of a scene's function, as a list."""
+    return [scene[0]] if isinstance(scene[0], Part) else list(scene[0])
 
 
 def moving(
@@ -187,8 +187,8 @@ class _Ways(NamedTuple):
         return part.replace(theta=theta, transform=transform)
 
     def changes_something(self, mode: str, parts: Sequence[Part], exact: Sequence[Part]) -> bool:
-        """Whether a mode has an effect, and the same one on parts and on exact ones."""
-        if mode == "camera":  # What is far is as large as what is near where there is no perspective.
+        """True if a mode has an effect, and the same one on parts and on exact ones."""
+        if mode == "camera":  # Without perspective, moving ahead changes nothing.
             return bool(np.any(np.asarray(self.camera.projection)[3, :3]))
         if mode not in self.changes:
             return True
@@ -225,27 +225,27 @@ def _rotation(about: np.ndarray, center: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------ where parts are
 
 CUTS = 4
-"""How often patches are cut along each side, to see where they are."""
+"""Cuts along each side of patches, to find their extent."""
 
 
 def _middle(parts: Sequence[Part]) -> np.ndarray:
     """The middle (3,) of the box around parts, world space."""
-    found = []
+    points_of = []
     for part in parts:
         points = _points(part)
         if part.transform is not None:
             matrix = np.asarray(part.transform, np.float64)
             points = points @ matrix[:3, :3].T + matrix[:3, 3]
-        found.append(points)
-    everything = np.concatenate(found)
+        points_of.append(points)
+    everything = np.concatenate(points_of)
     return (everything.min(axis=0) + everything.max(axis=0)) / 2
 
 
 def _points(part: Part) -> np.ndarray:
-    """Points (M, 3) of a surface, local space; where it has no triangles, the middle that it says it has, or 0."""
+    """Points (M, 3) of a surface, local space; without triangles, the middle that it states, or 0."""
     surface = part.surface
     if isinstance(surface, TriangleSurface):
-        with contextlib.suppress(InputError):  # Of a surface whose triangles depend on the view.
+        with contextlib.suppress(InputError):  # Triangles may depend on the view.
             vertices, faces = surface.tessellate(part.theta, CUTS)
             if len(faces):
                 return np.asarray(vertices, np.float64)[np.unique(faces)]
@@ -255,21 +255,21 @@ def _points(part: Part) -> np.ndarray:
 # ------------------------------------------------------------------------------------- how shapes and colours change
 
 UNEVEN = np.array([2.0, 3.0, 2.5])
-"""How often a swelling goes up and down across an object, in radians from its middle to its end, along each axis."""
+"""Phase of a swelling's wave from an object's middle to its end along each axis, radians."""
 
 NO_SHAPE = ("normals", "colors", "uv", "color", "texture", "light", "specular", "shininess", "depth_range")
-"""Attributes of surfaces, and what shaders read."""
+"""Attributes of surfaces, and entries that shaders read."""
 
 TINT = np.array([1.0, -0.5, 0.25, 0.0])
-"""By how much of themselves red, green, blue and alpha change."""
+"""Relative changes of red, green, blue and alpha."""
 
 
 def _swelling(part: Part) -> dict[str, np.ndarray]:
-    """The directions in which what the surface is made of changes, by entry."""
+    """Directions in which the entries of θ that shape the surface change, by entry."""
     reads = part.surface.reads(part.theta)
     # Beside its vertices a mesh may have attributes of any name.
     names = ("vertices",) if "vertices" in reads else [name for name in reads if name not in NO_SHAPE]
-    found = {}
+    directions = {}
     for name in names:
         if not isinstance(part.theta.get(name), (np.ndarray, np.floating)):
             continue
@@ -278,12 +278,12 @@ def _swelling(part: Part) -> dict[str, np.ndarray]:
             continue
         direction = _away(array) if array.ndim >= 2 and array.shape[-1] in (2, 3) else np.ones(array.shape)
         if direction.any():
-            found[name] = direction
-    return found
+            directions[name] = direction
+    return directions
 
 
 def _away(points: np.ndarray) -> np.ndarray:
-    """How points (..., 2 or 3) go away from their middle, some faster than others."""
+    """Velocities of points (..., 2 or 3) that move away from their middle, unevenly."""
     rows = np.asarray(points, np.float64).reshape(-1, points.shape[-1])
     away = rows - (rows.min(axis=0) + rows.max(axis=0)) / 2
     radius = float(np.linalg.norm(away, axis=1).max(initial=0.0)) or 1.0
@@ -292,7 +292,7 @@ def _away(points: np.ndarray) -> np.ndarray:
 
 
 def _coloring(part: Part, camera: Camera) -> dict[str, np.ndarray]:
-    """The direction in which the base colour of a part changes, by the entry that it comes from."""
+    """The direction in which the base colour of a part changes, by its entry of θ."""
     theta, reads = part.theta, part.surface.reads(part.theta)
     [checked], _ = check_scene(part, camera)
     if checked.reads is not None and not {"color", "uv"} & set(checked.reads):

@@ -1,4 +1,4 @@
-"""A search for the cheapest settings within a tolerance: cheap ones first, then the fastest of what will do."""
+"""A search for the cheapest settings within a tolerance: errors of cheap ones first, then the fastest that suffices."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from rts_compare.measurements import TOGETHER, Measurements
 LAYERS = (1, 2, 4, 8)
 SUPERSAMPLE = (1, 2, "adaptive:4", 3, 4)
 HOPELESS = 2.0
-"""How many times the error of the best splatter another one may have, to be looked at further."""
+"""The error of a splatter up to which it is tried further, as a multiple of the best one's."""
 ALIKE = 0.9
-"""A setting is faster than another one if it takes less than this share of its time."""
+"""The share of another setting's time below which a setting counts as faster."""
 TURNS = 6
-"""Turns of the fastest settings; those that are told of beside the chosen one have a sixth."""
+"""Timed turns of the fastest settings; settings mentioned beside the chosen one have a sixth."""
 MORE_WORK = 2.0
-"""A setting with so many times the work of one that will do is not looked at: no splatter is worth it."""
+"""A setting with this many times the work of a sufficient one is not tried: no splatter is worth it."""
 SLOWER = 3.0
-"""A setting that takes so many times as long as the fastest has one call."""
+"""A setting that takes this many times as long as the fastest has one call."""
 ENOUGH = 3
-"""Turns of the chosen one, at least."""
+"""The least turns of the chosen setting."""
 NEARLY = 1.2
-"""A setting is passed over if the best of as many samples has so many times the tolerance."""
+"""A setting is skipped if the best with as many samples has this many times the tolerance."""
 FAR = 1.5
-"""A setting is passed over if by what fewer samples did its error will be so many times the tolerance."""
+"""A setting is skipped if errors with fewer samples predict this many times the tolerance for it."""
 
 
 class Found(NamedTuple):
@@ -53,8 +53,8 @@ class Search:
     """A search for the cheapest settings within a tolerance.
 
     Args:
-        measured: the scene, and what is known of it.
-        samplers: names, each with the one whose errors it shares; "" for the usual one.
+        measured: the scene and its measurements.
+        samplers: names, each with the sampler whose errors it shares; "" for the usual one.
         tolerance: of the error.
         deadline: when to stop measuring, on the clock of `time.perf_counter`.
         phase: shows progress.
@@ -76,7 +76,7 @@ class Search:
         self.late = False
 
     def run(self, splatters: Sequence[str]) -> Found:
-        """The best of these splatters that is found in time."""
+        """The best setting, with one of these splatters, that time allows to find."""
         cells: list[Setting] = []
         within: list[Setting] = []
         for kind in dict.fromkeys(self.samplers.values()):
@@ -97,7 +97,7 @@ class Search:
         return Found(chosen, reasons, error, seconds)
 
     def _told_of_failure(self, error: float) -> str:
-        """A line for where nothing is within the tolerance; a warning, too."""
+        """Warn that no setting is within the tolerance; return a line that says so."""
         wanted = _percent(self.tolerance)
         told = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
         told = f"{told}: the least error that was found is {_percent(error)}"
@@ -116,8 +116,8 @@ class Search:
         rates: bool = True,
     ) -> list[Setting]:
         """All settings of a kind of sampler that may differ in their error, the cheapest first."""
-        found = self.measured.settings(TOGETHER, splatters, layers, supersample, [kind], rates)
-        return sorted(found, key=lambda s: math.prod(self._work(s)))
+        settings = self.measured.settings(TOGETHER, splatters, layers, supersample, [kind], rates)
+        return sorted(settings, key=lambda s: math.prod(self._work(s)))
 
     def _promising(self, splatters: Sequence[str], kind: str) -> list[str]:
         """The splatters that are accurate enough, or nearly as accurate as the best, with two layers and one sample."""
@@ -130,13 +130,13 @@ class Search:
 
     def _sampled(self, settings: Sequence[Setting]) -> list[Setting]:
         """Settings with each sampler: those that share their errors, and others that are accurate enough, too."""
-        found = []
+        sampled = []
         for setting in settings:
             for name, kind in self.samplers.items():
                 other = setting._replace(sampler=name, engine=self.engine)
                 if kind == setting.sampler or (not self._over() and self._bound(other) <= self.tolerance):
-                    found.append(other)
-        return found
+                    sampled.append(other)
+        return sampled
 
     def _cell(self, setting: Setting) -> Setting:
         """The key of a setting's error."""
@@ -147,46 +147,46 @@ class Search:
         return layers, supersample**2, rate
 
     def _within(self, cells: Sequence[Setting]) -> list[Setting]:
-        """The settings within the tolerance that no cheaper one of their splatter makes needless."""
+        """The settings within the tolerance, without those that a cheaper one makes needless."""
         done = self.phase("errors", len(cells))
-        found: list[Setting] = []
+        accurate: list[Setting] = []
         passed: list[Setting] = []
         for setting in cells:
             done()
-            if self._needless(setting, found):
+            if self._needless(setting, accurate):
                 continue
-            if self._far(setting) or self._in_vain(setting, cells, found):
+            if self._far(setting) or self._in_vain(setting, cells, accurate):
                 passed.append(setting)
-            elif not self._looked_at(setting, found):
+            elif not self._looked_at(setting, accurate):
                 break
-        for setting in [] if found else passed:
-            if not self._needless(setting, found) and not self._looked_at(setting, found):
+        for setting in [] if accurate else passed:
+            if not self._needless(setting, accurate) and not self._looked_at(setting, accurate):
                 break
-        return found
+        return accurate
 
-    def _looked_at(self, setting: Setting, found: list[Setting]) -> bool:
-        """Whether there was time to look at a setting, which joins those found if it is accurate enough."""
+    def _looked_at(self, setting: Setting, accurate: list[Setting]) -> bool:
+        """Try a setting, and add it to `accurate` if it is accurate enough; False if time is up."""
         if self._over():
             return False
         if self._bound(setting) <= self.tolerance:
-            found.append(setting)
+            accurate.append(setting)
         return True
 
-    def _needless(self, setting: Setting, found: Sequence[Setting]) -> bool:
-        """Whether something found costs far less, or is of its kind and costs no more in any respect."""
+    def _needless(self, setting: Setting, accurate: Sequence[Setting]) -> bool:
+        """True if an accurate setting costs far less, or is of the same kind and costs no more in any respect."""
         mine = self._work(setting)
-        if any(self._cost(setting) > MORE_WORK * self._cost(s) for s in found):
+        if any(self._cost(setting) > MORE_WORK * self._cost(s) for s in accurate):
             return True
         return any(
             (s.splatter, s.sampler) == (setting.splatter, setting.sampler)
             and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
-            for s in found
+            for s in accurate
         )
 
     def _far(self, setting: Setting) -> bool:
-        """Whether the errors with fewer samples, as a power of their number, tell of one that is much too large."""
+        """True if errors with fewer samples, extrapolated as a power of their number, predict one far too large."""
         if isinstance(setting.supersample, str):
-            return False  # Of outlines it has the error of as many samples everywhere.
+            return False  # At outlines its error is that of as many samples everywhere.
         numbers = [n for n in SUPERSAMPLE if not isinstance(n, str) and n < setting.supersample]
         fewer = {n: self._cell(setting._replace(supersample=n)) for n in numbers}
         known = [(n, self.bounds[cell]) for n, cell in fewer.items() if cell in self.bounds]
@@ -199,22 +199,22 @@ class Search:
         return smaller * (setting.supersample / fine) ** power > FAR * self.tolerance
 
     def _cost(self, setting: Setting) -> float:
-        """About what a setting takes: hidden layers are few samples, and faces less than pixels."""
+        """The approximate cost of a setting: hidden layers have few samples, and faces cost less than pixels."""
         layers, samples, rate = self._work(setting)
         return math.sqrt(layers * rate) * samples
 
-    def _in_vain(self, setting: Setting, cells: Sequence[Setting], found: list[Setting]) -> bool:
-        """Whether something like it failed, and neither more layers nor a finer surface would do with these samples."""
+    def _in_vain(self, setting: Setting, cells: Sequence[Setting], accurate: list[Setting]) -> bool:
+        """True if a similar setting failed, and with these samples neither more layers nor a finer surface suffice."""
         level = [s for s in cells if s._replace(layers=0, rate="") == setting._replace(layers=0, rate="")]
         best = max(level, key=lambda s: (self._work(s)[2], self._work(s)[0]))
         if setting == best or not any(self._cell(s) in self.bounds for s in level) or self._over():
             return False
         if self._cell(best) not in self.bounds:
-            self._looked_at(best, found)
+            self._looked_at(best, accurate)
         return self.bounds.get(self._cell(best), 0.0) > NEARLY * self.tolerance
 
     def _best(self, cells: Sequence[Setting]) -> Setting:
-        """The setting of the least error among those that were looked at; the first of all where none was."""
+        """The tried setting with the least error; the first of all if none was tried."""
         least, best = math.inf, cells[0] if cells else None
         for setting in sorted(self.bounds, key=lambda s: self.bounds[s]):
             if self.bounds[setting] >= least:
@@ -227,12 +227,12 @@ class Search:
         return best
 
     def _bound(self, setting: Setting) -> float:
-        """The largest error along a mode, or that along the first mode where it is beyond the tolerance."""
+        """The largest error along a mode, or the first that is beyond the tolerance."""
         worst = 0.0
         for mode in self.modes:
             error = self._along(mode, setting)
             if error > self.tolerance:
-                # What was too much once is looked at first.
+                # A mode that was beyond the tolerance once is tried first.
                 self.modes = [mode, *(m for m in self.modes if m != mode)]
                 worst = error
                 break
@@ -247,8 +247,8 @@ class Search:
         return worst
 
     def _along(self, mode: str, setting: Setting) -> float:
-        found = self.measured.scores(mode, self._cell(setting))
-        return math.inf if found is None else found["error"]
+        scores = self.measured.scores(mode, self._cell(setting))
+        return math.inf if scores is None else scores["error"]
 
     # ------------------------------------------------------------------------------------------------------ time
 
@@ -257,13 +257,13 @@ class Search:
         return self.late
 
     def _timed(self, settings: Sequence[Setting], turns: int = 1) -> dict[Setting, float]:
-        """Seconds of settings, those that fail or come too late left out."""
+        """Seconds of settings, without those that fail or come too late."""
         calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
-        found = self.measured.timing(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
-        return {Setting(*s): ms["median"] / 1e3 for s, ms in found.items()}
+        timed = self.measured.timing(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
+        return {Setting(*s): ms["median"] / 1e3 for s, ms in timed.items()}
 
     def _fastest(self, settings: Sequence[Setting]) -> Setting:
-        """The fastest, by successive halving: all have a turn, the faster half another, and so on."""
+        """The fastest setting, by successive halving: all have a turn, the faster half another, and so on."""
         turns, left = 1, list(settings)
         while True:
             times = self._timed(left, turns)
@@ -279,7 +279,7 @@ class Search:
     def _reasons(
         self, chosen: Setting, cells: Sequence[Setting], splatters: Sequence[str]
     ) -> tuple[list[str], Setting | None]:
-        """For each choice what the cheaper one lacks, and what the next one costs; and what is better after all."""
+        """Lines on each choice: the cheaper one's fault, the dearer one's cost; and a setting better still, or None."""
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),
@@ -288,21 +288,21 @@ class Search:
             "sampler": list(self.samplers),
         }
         others = {name: self._others(chosen, name, values) for name, values in options.items()}
-        told = dict.fromkeys(s for found in others.values() for s in found if s is not None)
+        told = dict.fromkeys(s for pair in others.values() for s in pair if s is not None)
         times = self._timed([chosen, *told]) if not self._over() else {}
         faster = [s for s in times if times[s] < ALIKE * times[chosen] and self._error(s) <= self.tolerance]
-        lines = [self._reason(chosen, name, *found, times) for name, found in others.items() if any(found)]
+        lines = [self._reason(chosen, name, *pair, times) for name, pair in others.items() if any(pair)]
         return lines, min(faster, key=lambda s: times[s], default=None)
 
     def _others(self, chosen: Setting, name: str, values: Sequence) -> tuple[Setting | None, Setting | None]:
-        """The next cheaper and the next dearer setting in one respect; for names, one that is another."""
-        found = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
+        """The next cheaper and the next dearer setting in one respect; for names, settings with another name."""
+        alternatives = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
         if name in ("splatter", "sampler"):
-            known = [s for s in found if self._cell(s) in self.bounds]
+            known = [s for s in alternatives if self._cell(s) in self.bounds]
             return None, min(known, key=lambda s: self.bounds[self._cell(s)], default=None)
         mine = math.prod(self._work(chosen))
-        work = {s: math.prod(self._work(s)) for s in found}
-        below, above = [s for s in found if work[s] < mine], [s for s in found if work[s] > mine]
+        work = {s: math.prod(self._work(s)) for s in alternatives}
+        below, above = [s for s in alternatives if work[s] < mine], [s for s in alternatives if work[s] > mine]
         return max(below, key=lambda s: work[s], default=None), min(above, key=lambda s: work[s], default=None)
 
     def _reason(
@@ -320,7 +320,7 @@ class Search:
 
 
 def _value(setting: Setting, name: str) -> str:
-    """A choice as a user would write it."""
+    """A choice in the form that a user would write."""
     value = getattr(setting, name)
     if name == "rate":
         return value or "the surfaces as they are given"

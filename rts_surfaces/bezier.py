@@ -25,7 +25,7 @@ class Bezier(Patches):
 
     Args:
         indices: (n, 16) integers into θ["points"]: the 4 × 4 points of each patch, first along u, then along v.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
         InputError: indices of another shape, or a tolerance that is not positive.
@@ -55,12 +55,12 @@ class Bezier(Patches):
 
     @classmethod
     def load(cls, path: Path) -> list[Part]:
-        """One part: the patches of a text file as Newell's teapot is in, or of an .npz.
+        """Load patches as one part, from an .npz or from text in the format of Newell's teapot.
 
-        The text has the number of patches, 16 numbers of points for each, from 1 on, separated by commas; then the
-        number of points, and three coordinates for each. An .npz has "indices" (n, 16), which count from 0, and
-        "points" (m, 3). Points that coincide exactly become one. In such files the derivatives along the first and the
-        second direction make a normal that points inside: the directions are exchanged.
+        The text begins with the number of patches. For each follow 16 indices of points, from 1 on, separated by
+        commas. Then come the number of points, and three coordinates for each. An .npz has "indices" (n, 16), from 0
+        on, and "points" (m, 3). Points that coincide exactly become one. In such files u × v points inwards: u and v
+        are exchanged.
 
         Raises:
             InputError: the file is damaged, or its indices refer to points that it lacks.

@@ -25,9 +25,9 @@ class BSpline(Patches):
 
     Args:
         shape: (nu, nv), the numbers of control points, at least 4 in each direction.
-        ends: "open", "clamped" or "periodic", or one for each direction. A spline that is open ends between its control
-            points, one that is clamped ends in its first and last, one that is periodic is closed.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        ends: "open", "clamped" or "periodic", or one for each direction. An open spline ends between its control
+            points, a clamped one at its first and last, and a periodic one is closed.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
         InputError: fewer than 4 control points, other ends, or a tolerance that is not positive.
@@ -64,7 +64,7 @@ class BSpline(Patches):
         )
 
     def bezier_rows(self, values: Array) -> Array:
-        """Bézier control points of all patches, by knot insertion: sums of control points, weights at least zero."""
+        """Bézier control points of all patches, by knot insertion: sums of control points, no weight negative."""
         xp, engine = namespace(values), engine_of(values)
         a, b = (engine.constant(m, values) for m in self._along)
         (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
@@ -79,7 +79,7 @@ class BSpline(Patches):
 
 
 def _product(a: Array, b: Array) -> Array:
-    """The product of matrices (n, m) and (m, k) in full precision, of which matrix units of some devices have less."""
+    """The product of matrices (n, m) and (m, k) in full precision; matrix units of some devices have less."""
     engine = engine_of(b)
     return a @ b if engine.exact_products(a, b) else engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)
 
@@ -96,7 +96,7 @@ class Revolution(BSpline):
         heights: (n,) numbers, the y of the profile's control points, at least 4.
         count: the number of control points around the axis, at least 4.
         ends: "clamped" or "open", of the profile.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
         InputError: fewer than 4 control points, other ends, or a tolerance that is not positive.
@@ -113,7 +113,7 @@ class Revolution(BSpline):
         heights = np.asarray(check_numbers("heights", heights, shape), np.float64)
         super().__init__((len(heights), count), (ends, "periodic"), tolerance)
         angle = 2 * np.pi * np.arange(count) / count
-        # A closed spline runs inside its control points; a control point's own radius is met at its angle.
+        # A closed spline runs inside its control points; at a control point's angle it must have that point's radius.
         reach = 3 / (2 + np.cos(2 * np.pi / count))
         around = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], axis=-1) * reach
         self._around, self._up = (
@@ -131,7 +131,7 @@ class Revolution(BSpline):
         return Part(cls(np.linspace(-1, 1, 8)), {"radii": radii}, "normals")
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
-        """(n, count, 3)."""
+        """Control points (n, count, 3) of the surface, from the radii in θ."""
         radii = theta["radii"]
         engine = engine_of(radii)
         return radii[:, None, None] * engine.constant(self._around, radii) + engine.constant(self._up, radii)
@@ -148,7 +148,7 @@ def _is_end(end: Any) -> bool:
 
 
 def extraction(count: int, ends: str) -> np.ndarray:
-    """(M, count) weights that make the control points of the cubic Bézier pieces of a uniform cubic B-spline.
+    """Weights (M, count) from control points of a uniform cubic B-spline to those of its cubic Bézier pieces.
 
     Pieces share their ends: M is three times their number, and one more unless periodic.
 

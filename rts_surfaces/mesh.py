@@ -79,7 +79,7 @@ class Mesh(TriangleSurface):
         corners = [c for a in (-1, 1) for b in (-golden, golden) for c in ((a, b, 0), (0, a, b), (b, 0, a))]
         directions = np.array(corners) / np.hypot(1, golden)
         triples = np.array(list(combinations(range(12), 3)))
-        # Its faces are the triples of corners that are an edge apart; the farthest others are √2 or more away.
+        # Its faces are the triples of corners one edge apart; others are at least √2 times as far.
         sides = np.linalg.norm(directions[triples] - directions[np.roll(triples, 1, axis=1)], axis=2)
         faces = triples[(sides < 1.1).all(axis=1)]
         inward = np.linalg.det(directions[faces]) < 0
@@ -117,7 +117,7 @@ class Mesh(TriangleSurface):
         return rates
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-        """θ with other vertices, which have the attributes of the vertices that they stand for."""
+        """θ with fewer vertices; each has the attributes of the nearest old vertex."""
         kept = {name: theta[name] for name in self._attributes(theta)}
         attributes = {name: take(x, engine_of(x).constant(nearest, x)) for name, x in kept.items()}
         return {**theta, **attributes, "vertices": vertices}

@@ -20,7 +20,7 @@ from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_erro
 from rts_surfaces.view_cells import view_key, view_of
 
 TOLERANCE = 0.1
-"""Pixels that a triangle may be off the surface where there may be an outline."""
+"""The largest distance of a triangle from the surface where there may be an outline, pixels."""
 
 TOLERANCES = (0.8, 0.3, 0.1, 0.05)
 """Tolerances that `rates` offers."""
@@ -56,7 +56,7 @@ class Parametric(TriangleSurface):
 
     Args:
         tiles: all patches.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
         used: the control points that patches have, as rows of all; None for all of them.
 
     Attributes:
@@ -132,8 +132,8 @@ class Parametric(TriangleSurface):
 
         Args:
             theta: θ, with values that are known.
-            rate: a whole number, of cuts along each side of a patch, at most `tiles.MOST`; or a float, the distance in
-            the units of θ that     triangles may be off the surface.
+            rate: a whole number, the cuts along each side of a patch, at most `tiles.MOST`; or a float, the largest
+                distance of triangles from the surface, in the units of θ.
 
         Returns:
             Vertices (V, 3) float32 and faces (T, 3) int32, without cracks between patches that share control points.

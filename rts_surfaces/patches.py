@@ -65,7 +65,7 @@ class Patches(Parametric):
     Args:
         table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v; they name rows of
             what `bezier_rows` gives.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
         used: see `Parametric`.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""What tests of `rts.Adaptive` look at: a scene, and masks that take the place of the pixels that are active."""
+"""A scene for tests of `rts.Adaptive`, and masks that replace the choice of active pixels."""
 
 import numpy as np
 from helpers import icosphere, quad, to_numpy
@@ -36,7 +36,7 @@ def random_mask(seed=0, share=0.3):
 
 def apart(parts, mask, s, atol=1e-6, **options):
     """Compare an adaptive image with the finer one at active pixels, and with the plain one at the others."""
-    found = to_numpy(render(parts, rts.Adaptive(s), **options))
+    adaptive = to_numpy(render(parts, rts.Adaptive(s), **options))
     finer, plain = (to_numpy(render(parts, n, **options)) for n in (s, 1))
-    np.testing.assert_allclose(found[mask], finer[mask], rtol=0, atol=atol)
-    np.testing.assert_allclose(found[~mask], plain[~mask], rtol=0, atol=atol)
+    np.testing.assert_allclose(adaptive[mask], finer[mask], rtol=0, atol=atol)
+    np.testing.assert_allclose(adaptive[~mask], plain[~mask], rtol=0, atol=atol)

@@ -1,4 +1,4 @@
-"""What test files share: arrays of every engine, small meshes, derivatives by the frameworks themselves."""
+"""Helpers of the tests: arrays of every engine, small meshes, derivatives by the frameworks themselves."""
 
 import importlib.util
 
@@ -109,10 +109,10 @@ def finite_difference(f, x, step=1e-6):
     return map_leaves(lambda _: next(it), x)
 
 
-def relative_error(found, expected):
+def relative_error(actual, expected):
     """The norm of the difference of two arrays over the norm of the second."""
-    found, expected = np.asarray(found, np.float64), np.asarray(expected, np.float64)
-    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+    actual, expected = np.asarray(actual, np.float64), np.asarray(expected, np.float64)
+    return np.linalg.norm(actual - expected) / np.linalg.norm(expected)
 
 
 # -------------------------------------------------------------------------------------------------- meshes

@@ -7,7 +7,7 @@ STEPS = [(u, v) for v in (-1, 0, 1) for u in (-1, 0, 1)]
 
 
 class Pairing:
-    """How cells pair, each given as (y, x)."""
+    """Pairing of cells, each given as (y, x)."""
 
     def __init__(self, positions, row, visible):
         self.positions, self.row, self.visible = positions, row, visible
@@ -49,7 +49,7 @@ class Pairing:
         return 0 if self.visible and joined else s
 
     def ends(self, cell, n):
-        """Whether the front of a cell ends in a direction (u, v); cells outside of the array are not known."""
+        """True if the front of a cell ends in a direction (u, v); false where the next cell is outside of the array."""
         beyond = cell[0] + n[1], cell[1] + n[0]
         if not (self.covers(*cell) and self.inside(*beyond)):
             return False

@@ -130,8 +130,8 @@ def volume(**options):
 
 def energy(kind, **options):
     given = {"vertices": VERTICES, "faces": FACES, **options}
-    found = kind(**given)
-    return found(VERTICES)
+    regularizer = kind(**given)
+    return regularizer(VERTICES)
 
 
 def subdivided(**options):

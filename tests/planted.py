@@ -119,8 +119,8 @@ class Remembering(Lifted):
         return theta["heights"]
 
     def proxy(self, inputs, camera, size):
-        found = super().proxy(inputs, camera, size)
-        return found._replace(vertices=found.vertices + np.array([0, self.last, 0], np.float32))
+        proxy = super().proxy(inputs, camera, size)
+        return proxy._replace(vertices=proxy.vertices + np.array([0, self.last, 0], np.float32))
 
     def refine(self, inputs, samples, rays):
         moved = rays._replace(origins=rays.origins - [0, self.last, 0])
@@ -176,18 +176,18 @@ class TurnedDiagonals(Loft):
     """Quadrilaterals are cut along another diagonal, as the view has it."""
 
     def proxy(self, inputs, camera, size):
-        found = super().proxy(inputs, camera, size)
+        proxy = super().proxy(inputs, camera, size)
         turned = np.asarray(camera.view)[0, 0] > 0.5
-        return found._replace(faces=np.roll(found.faces, int(turned), axis=1))
+        return proxy._replace(faces=np.roll(proxy.faces, int(turned), axis=1))
 
 
 class FacesInViewOrder(Loft):
     """Triangles come in the order of their distance."""
 
     def proxy(self, inputs, camera, size):
-        found = super().proxy(inputs, camera, size)
-        depth = camera.depth(found.vertices.astype(np.float64))[found.faces].mean(axis=1)
-        return found._replace(faces=np.ascontiguousarray(found.faces[np.argsort(depth)]))
+        proxy = super().proxy(inputs, camera, size)
+        depth = camera.depth(proxy.vertices.astype(np.float64))[proxy.faces].mean(axis=1)
+        return proxy._replace(faces=np.ascontiguousarray(proxy.faces[np.argsort(depth)]))
 
 
 def with_normals(surface, change):
@@ -196,8 +196,8 @@ def with_normals(surface, change):
 
     class OddNormals(kind):
         def evaluate(self, theta, samples):
-            found = super().evaluate(theta, samples)
-            made = {name: found[name] for name in list(found)}
+            entries = super().evaluate(theta, samples)
+            made = {name: entries[name] for name in list(entries)}
             made["normal"] = change(made["normal"], made["position"], samples.params)
             return rts.GBuffer(made)
 
@@ -232,8 +232,8 @@ class Tessellated(Heightfield):
     squares: int = 5
 
     def vertices(self, heights, cuts):
-        found = dataclasses.replace(self, squares=cuts).proxy(np.asarray(heights, np.float32), None, None)
-        return found.vertices, found.faces
+        proxy = dataclasses.replace(self, squares=cuts).proxy(np.asarray(heights, np.float32), None, None)
+        return proxy.vertices, proxy.faces
 
     def cuts(self, rate):
         return max(1, int(rate)) if isinstance(rate, int) else max(1, int(np.ceil(1 / rate**0.5)))
@@ -343,8 +343,8 @@ class KeepsMisses(Heightfield):
     """Leaves samples on the triangles where rays miss the surface."""
 
     def refine(self, inputs, samples, rays):
-        found = super().refine(inputs, samples, rays)
-        return found.replace(depth=np.where(found.row < 0, samples.depth, found.depth), row=samples.row)
+        refined = super().refine(inputs, samples, rays)
+        return refined.replace(depth=np.where(refined.row < 0, samples.depth, refined.depth), row=samples.row)
 
 
 # ------------------------------------------------------------------------------------------- shaders and splatters

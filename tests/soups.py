@@ -122,14 +122,14 @@ def deepened(soup, number):
 
 
 class Hits(NamedTuple):
-    """What float64 says of every triangle at every pixel's centre, and how sure it is; (T, H, W) each.
+    """Every triangle at every pixel's centre in float64, with bounds on rounding; (T, H, W) each.
 
     Attributes:
         open: whether rounding in float64 decides.
         depth: linear depth.
-        unsure: how far off rounding may put the depth.
+        unsure: the largest rounding error of the depth.
         weights: barycentrics of the first two corners, (T, H, W, 2).
-        skewed: how far off rounding may put these.
+        skewed: the largest rounding error of the weights.
         flat: (T, 1, 1), whether rounding decides which way the triangle faces.
         outline: pixels from the nearest line through an edge.
     """
@@ -206,7 +206,7 @@ def _slopes(corners, i, j):
 
 
 def _flat(corners, error):
-    """Whether rounding decides which way triangles face, by corners (T, 3, 3) in (X, Y, w)."""
+    """Marks of triangles whose facing rounding decides, by corners (T, 3, 3) in (X, Y, w)."""
     size, most = np.abs(corners) + error, 0.0
     for i, j, k in permutations(range(3)):
         terms = error[:, i, 0] * size[:, j, 1] * size[:, k, 2] + size[:, i, 0] * error[:, j, 1] * size[:, k, 2]
@@ -216,15 +216,15 @@ def _flat(corners, error):
 
 
 def found_in(fragments, count):
-    """(T, H, W) bool, which triangles were found where; each at most once, and no layer follows an empty one."""
+    """Masks (T, H, W) of the pixels that show each triangle, at most once; no layer follows an empty one."""
     ids = fragments.triangle_ids
     covered = ids >= 0
     assert not (covered[1:] & ~covered[:-1]).any(), "a layer follows an empty one"
-    found = np.zeros((count, *ids.shape[1:]), np.int32)
+    counts = np.zeros((count, *ids.shape[1:]), np.int32)
     k, y, x = np.nonzero(covered)
-    np.add.at(found, (ids[k, y, x], y, x), 1)
-    assert found.max(initial=0) <= 1, "a triangle was found twice"
-    return found > 0
+    np.add.at(counts, (ids[k, y, x], y, x), 1)
+    assert counts.max(initial=0) <= 1, "a triangle was found twice"
+    return counts > 0
 
 
 def differences(soup, fragments, every, known, opened):
@@ -232,10 +232,10 @@ def differences(soup, fragments, every, known, opened):
 
     Args:
         soup: the scene.
-        fragments: what a sampler found.
-        every: what the sampler to compare with found with as many layers as there are triangles.
+        fragments: of the sampler under test.
+        every: of the sampler to compare with, with as many layers as there are triangles.
         known: the hits of the soup.
-        opened: (T, H, W) bool, or fewer axes: which hits may be found, or not.
+        opened: (T, H, W) bool, or fewer axes: hits that may be there or not.
     """
     said = [name for name, x in zip(fragments._fields, fragments, strict=True) if not np.isfinite(x).all()]
     own, others = found_in(fragments, len(soup.faces)), found_in(every, len(soup.faces))

@@ -1,4 +1,4 @@
-"""What property-based tests share: their settings, and what is drawn for them."""
+"""Settings and strategies of the property-based tests."""
 
 from fractions import Fraction
 

@@ -27,11 +27,11 @@ class Cage:
 
     def edges(self):
         """Each edge's faces."""
-        found = {}
+        edges = {}
         for i, face in enumerate(self.faces):
             for a, b in zip(face, face[1:] + face[:1], strict=True):
-                found.setdefault(frozenset((a, b)), []).append(i)
-        return found
+                edges.setdefault(frozenset((a, b)), []).append(i)
+        return edges
 
     def refined(self):
         v, around = self.vertices, self.edges()
@@ -203,10 +203,10 @@ def limit_samples(vertices, faces, scheme, level=3, **tags):
     cage = Cage(vertices, faces, scheme, **tags)
     for _ in range(level):
         cage = cage.refined()
-    found = cage.samples(len(cage.vertices))
+    samples = cage.samples(len(cage.vertices))
     count = len(cage.vertices)
     # Vertices keep their numbers: sharpness may end later.
     while any(s < INFINITE for s in (*cage.creases.values(), *cage.corners.values())):
         cage = cage.refined()
-    vertex, face, params = found
+    vertex, face, params = samples
     return face, params, cage.limit()[:count][vertex]

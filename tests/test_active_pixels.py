@@ -1,4 +1,4 @@
-"""Which pixels take many samples: those beside outlines, and where colours change."""
+"""Active pixels, which take many samples: those beside outlines, and where colours change."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""What samplers build is built once, follows changes, and is let go; `rts.prepare`; what "auto" chooses."""
+"""Samplers' structures are built once, follow changes, and are released; `rts.prepare`; the choices of "auto"."""
 
 import gc
 import logging

@@ -102,7 +102,7 @@ def test_a_cone_holds_the_normals_of_its_cluster():
 
 
 def seen(made, camera, cull, both=False):
-    """Which clusters of a mesh may be seen, and which of their sides."""
+    """Bits of the sides that each cluster of a mesh may show; 0 for a cluster that cannot be seen."""
     size = (64, 64)
     found, sides, _ = made.seen(pixel_matrix(camera, size), size, facing(camera, cull), both)
     every = np.zeros(made.boxes.shape[1], np.uint8)

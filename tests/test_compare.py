@@ -85,7 +85,7 @@ class TestTruth:
         np.testing.assert_allclose(points.mean(axis=0), 0, atol=0.01)
 
     def test_closed_form(self, tmp_path):
-        """What a convex card covers does not change as it moves, and its edges pass by as long as they are upright."""
+        """A moving convex card keeps its area, and its upright edges keep their length."""
         moved = moving("card", card(), CAMERA, (SIDE, SIDE), modes=["translation"])
         found = true_derivatives.truth(
             moved, "translation", 2 * 3 * np.tan(np.radians(20)) / SIDE, samples=8, folder=tmp_path
@@ -160,7 +160,7 @@ class TestWorthTiming:
                 assert not (dearer and _no_worse(errors[other], errors[setting]))
 
     def test_levels(self):
-        """What is just within 3 % is not left out for what is just beyond it."""
+        """A setting just within 3 % is not dropped for one just beyond."""
         cheap, dear, dearer = (Setting("visible", k, 1) for k in (1, 2, 4))
         assert worth_timing({cheap: 0.0305, dear: 0.0295, dearer: 0.029}, lambda s: (s.layers,)) == [cheap, dear]
 
@@ -408,7 +408,7 @@ def gbuffer_color(gbuffer):
 
 class TestStrangers:
     def test_sampler_with_errors_of_its_own(self, kept, monkeypatch):
-        """What a sampler gets wrong is told of it alone."""
+        """A sampler's own errors are reported of it alone."""
 
         class Askew(plugin("samplers", "reference")):
             def rasterize(self, prepared, camera, size, layers, cull):
@@ -572,7 +572,7 @@ class TestTune:
         assert search._within(cells) == [Setting("visible", 4, 4)]
 
     def test_budget(self, kept):
-        """What is known when it is spent is what is taken."""
+        """When the budget is spent, the choice is made from the settings known by then."""
         options = dict(samplers=["raster"], truths=kept, **TRUTH)
         tuned = tune(scene("translation"), tolerance=0.5, budget_s=1e-6, **options)
         assert tuned.reasons[-1] == "the budget was spent before all settings were looked at"

@@ -314,7 +314,7 @@ def expected_pairs(rows):
 
 
 def agrees_with(read, compared, mode):
-    """Whether a view holds the rows of a mode: in the data of the graph, and where its points are on the screen."""
+    """Assert that a view holds the rows of a mode: in the graph's data, and in its points' places on the screen."""
     rows = rows_of(compared, mode)
     ours = [r for r in rows if "peer" not in r]
     np.testing.assert_allclose(sorted_pairs(**read["settings"]), expected_pairs(ours), rtol=1e-4)

@@ -52,13 +52,13 @@ EXAMPLES = {name: example(name) for name in rts.plugins("surfaces")} | {
 
 
 def works(surface, sampler):
-    """Whether a pair is meant to: all other samplers are of triangles."""
+    """True if a pair should work: samplers other than "auto" and "rays" need triangles."""
     return sampler == "auto" or hasattr(surface, "intersect" if sampler == "rays" else "proxy")
 
 
 @functools.cache
 def shown(surface, sampler):
-    """What a sampler shows of an example in NumPy."""
+    """The image of an example by a sampler, in NumPy."""
     return compatibility.attempt(EXAMPLES[surface], sampler, "numpy")
 
 

@@ -1,4 +1,4 @@
-"""What is compiled, and when: few loops, each once; a line on terminals alone."""
+"""Compilation: few loops, each once; a message on terminals alone."""
 
 import gc
 import io

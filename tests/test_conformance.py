@@ -143,7 +143,7 @@ class TestRaster(SamplerConformance):
 
 
 class TestClusters(SamplerConformance):
-    """What was prepared is in clusters, though there are few triangles."""
+    """Prepared triangles are in clusters, though there are few."""
 
     @pytest.fixture
     def sampler(self, monkeypatch):
@@ -840,7 +840,7 @@ class Naming(OddMulti):
 
 
 class Cutting(OddMulti):
-    """What lies in the border does not splat at all."""
+    """Cells in the border do not splat at all."""
 
     def cropped(self, splats):
         middle, border = np.zeros(splats.row.shape[1:], bool), splats.border

@@ -1,4 +1,4 @@
-"""What keeps the front and the back of a sheet from pairing: who tells which is which, and what it changes."""
+"""Facing, which keeps the front and the back of a sheet from pairing: its sources, and its effects."""
 
 import pickle
 from dataclasses import replace

@@ -306,7 +306,7 @@ RUNS = [
 
 
 def damages(length):
-    """How a file is damaged: (cut at, [(place, bytes that are there instead), ...])."""
+    """Damages of a file: (cut at, [(place, bytes to put there), ...])."""
     places, runs = st.integers(0, length - 1), st.sampled_from(RUNS) | st.binary(min_size=1, max_size=4)
     return st.tuples(st.just(length) | places, st.lists(st.tuples(places, runs), max_size=4))
 

@@ -1,4 +1,4 @@
-"""What is sampled where outlines are: which cells, how many layers, and what finds no room."""
+"""Samples at outlines: their cells, their layers, and their overflow."""
 
 import numpy as np
 import pytest

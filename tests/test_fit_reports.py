@@ -1,4 +1,4 @@
-"""What a fit says: what is missing, what it leaves open, where its floor is; and what it refuses, in one line."""
+"""Reports of fits: missing inputs, undetermined directions, the floor of the loss; and refusals in one line."""
 
 import numpy as np
 import pytest

@@ -36,7 +36,7 @@ def column(*depths, camera=PLANES):
 
 
 def settled_by_hand(samples, camera, spread):
-    """What `settle` does, a cell at a time."""
+    """`settle`, cell by cell."""
     row, depth = np.full_like(samples.row, -1), np.zeros_like(samples.depth)
     near, far = (float(x) for x in camera.depth_range())
     for y, x in np.ndindex(row.shape[1:]):
@@ -51,7 +51,7 @@ def settled_by_hand(samples, camera, spread):
 
 
 def repacked_by_hand(samples, kept, capacity):
-    """Which of the old rows the new ones are, where they are, and how many are lost."""
+    """The new table of rows, the old row of each new one, and the number of lost rows."""
     cells = np.argwhere(kept)
     fitting = cells if capacity is None else cells[:capacity]
     row, old = np.full_like(samples.row, -1), []
@@ -207,7 +207,7 @@ def sheets(refining, heights=HEIGHTS, **options):
 
 
 def layers_of(part, camera=FRONT, **options):
-    """How many samples there are in each layer."""
+    """The number of samples in each layer."""
     sampled = rts.sample(part, camera, SIZE, **{"layers": 3, **options})
     return (to_numpy(sampled.row) >= 0).sum(axis=(1, 2)).tolist()
 

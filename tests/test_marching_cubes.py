@@ -23,7 +23,7 @@ def directed_edges(faces):
 
 
 def is_closed(faces):
-    """Whether every edge is met once in either direction by equally many triangles."""
+    """True if equally many triangles use every edge in either direction."""
     edges = directed_edges(faces)
     return all(edges[b, a] == count for (a, b), count in edges.items())
 

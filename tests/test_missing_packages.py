@@ -70,7 +70,7 @@ if {jax}:
 
 
 def without(package, code, *, samplers=("raster", "reference"), torch=False, jax=False):
-    """What a program prints that cannot import a package."""
+    """The output of a program that cannot import a package."""
     script = HIDE.format(package=package, samplers=samplers, torch=torch, jax=jax) + textwrap.dedent(code)
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]

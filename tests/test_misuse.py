@@ -315,11 +315,11 @@ WORDS = {
     "save_animation.path": "animation",
     "save_animation.frames": "frame",
 }
-"""What messages call an argument, where that is not its name alone."""
+"""Words for an argument in messages, if they are not its name alone."""
 
 
 def named(call, message):
-    """Whether a message names the argument."""
+    """True if a message names the argument."""
     argument = call.partition(".")[2]
     return argument in message or WORDS.get(call, argument) in message
 
@@ -329,7 +329,7 @@ FUNCTIONS = "ImageResiduals.scene fit.loss fit.callback check_gradient.scene gra
 
 
 def complaint(call, value):
-    """What is wrong with the error that a wrong value gets; or None."""
+    """The fault of the error that a wrong value raises, or None."""
     try:
         CALLS[call](WRONG[value])
     except rts.RtsError as error:
@@ -385,7 +385,7 @@ def public():
 
 
 def is_base(value):
-    """Whether it is an error, or a base that a plugin subclasses."""
+    """True for an error, or for a base that plugins subclass."""
     return isinstance(value, type) and (issubclass(value, Exception) or isabstract(value))
 
 

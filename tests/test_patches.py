@@ -1,4 +1,4 @@
-"""What patches are made of: values and normals as operations, tiles that meet, samples that are moved and pruned."""
+"""Parts of patches: values and normals as operations, tiles that meet, samples that are moved and pruned."""
 
 import copy
 import os

@@ -44,7 +44,7 @@ def fan(count):
 
 
 def winding(polygon, points):
-    """How often a polygon (n, 2) goes around each of the points (P, 2)."""
+    """Winding numbers of a polygon (n, 2) about points (P, 2)."""
     to = polygon[None] - points[:, None]
     following = np.roll(to, -1, axis=1)
     cross = to[..., 0] * following[..., 1] - to[..., 1] * following[..., 0]
@@ -52,7 +52,7 @@ def winding(polygon, points):
 
 
 def assert_covered_once(polygon, triangles, seed=0):
-    """That points inside a polygon (n, 2) are in one triangle each, and those outside in none; all corners are used."""
+    """Assert that points inside a polygon (n, 2) are in one triangle each, others in none, and all corners are used."""
     assert len(triangles) == len(polygon) - 2
     np.testing.assert_array_equal(np.unique(triangles), np.arange(len(polygon)))
     low, high = polygon.min(axis=0), polygon.max(axis=0)

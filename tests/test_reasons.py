@@ -233,7 +233,7 @@ def gauge(mended):
 
 
 def depth(mended):
-    """How far away something is, without perspective and with it."""
+    """The distance of a card, without perspective or, `mended`, with it."""
     part = card(-0.9, 0.8, -0.7, 0.9, 0.0, RED)
     camera = EYE if mended else rts.Camera.orthographic((0, 0, 4), (0, 0, 0), height=3)
     xp = rts.namespace

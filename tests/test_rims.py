@@ -39,7 +39,7 @@ def pushed(splatter, splats, tangent, target="torch-cpu"):
 
 
 def cells(splats, target):
-    """What splats say of cells, by name."""
+    """The tables of cells in splats, by name."""
     known = {name: getattr(splats, name) for name in ("row", "part", "exit")}
     return {name: arrays(target, x) for name, x in known.items() if x is not None}
 
@@ -99,7 +99,7 @@ def rule(pairing, cell, part, exits):
 
 
 def corrections_by_loops(splatter, splats, tangent):
-    """What rims add to the derivative along a tangent, from the buffers' sums; and the names of the rules."""
+    """The share of rims in the derivative along a tangent, from the buffers' sums; and the names of the rules."""
     row, rgba, positions = splats.row, splats.rgba, splats.positions
     pairing = Pairing(positions, row, visible=True)
     rules = {cell: rule(pairing, cell, splats.part, splats.exit) for cell in pairing.cells if pairing.covers(*cell)}

@@ -1,4 +1,4 @@
-"""What stands between a surface and its samples: lifting, refinement, tables, capacity, merging."""
+"""Steps from a surface to its samples: lifting, refinement, tables, capacity, merging."""
 
 import numpy as np
 import pytest

@@ -497,7 +497,7 @@ def disk_motion(height, width, center, radius, scanlines=64):
 
 
 def gain_of_disk(splatter):
-    """How much of a translating disk's derivative is felt, both low-passed by 2 pixels."""
+    """The share of a translating disk's derivative that a splatter has, both low-passed by 2 pixels."""
     from scipy.ndimage import gaussian_filter
 
     center, radius = (48.3, 47.9), 37.0
@@ -505,9 +505,9 @@ def gain_of_disk(splatter):
     outside = np.hypot(positions[:, 0] - center[0], positions[:, 1] - center[1]) > radius
     row[0][outside.reshape(96, 96)] = -1
     _, slope = along_x(TORCH[0], splatter, positions, white(positions), row)
-    found = gaussian_filter(slope[..., 3].astype(np.float64), 2)
+    splatted = gaussian_filter(slope[..., 3].astype(np.float64), 2)
     exact = gaussian_filter(disk_motion(96, 96, center, radius), 2)
-    return (found * exact).sum() / (exact**2).sum()
+    return (splatted * exact).sum() / (exact**2).sum()
 
 
 @pytest.mark.parametrize("name", KERNELS)

@@ -280,7 +280,7 @@ def test_hardly_a_sample_is_lost_at_the_outline():
 
 
 def outline(covered):
-    """How many cells beside another are the last covered one."""
+    """The number of cells on outlines: covered, with an empty neighbour."""
     return sum((covered & ~np.roll(covered, step, axis)).sum() for step in (-1, 1) for axis in (1, 2)) / 2
 
 

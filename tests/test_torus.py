@@ -48,18 +48,18 @@ def quartic(o, d):
 
 
 def apart(roots, length):
-    """Whether all roots differ by a hundredth of a unit or more, complex ones as well."""
+    """True if all roots, complex ones too, are at least a hundredth of a unit apart, and as far from 0."""
     gaps = np.abs(roots[:, None] - roots[None]) + np.eye(4)
     return gaps.min() * length > 1e-2 and np.abs(roots).min() * length > 1e-2
 
 
 def closed_form(roots, layers=4):
-    """(K, R) distances of at least 0, nearest first; infinite where there is none."""
-    found = np.full((layers, len(roots)), np.inf)
+    """Distances (K, R) of at least 0, nearest first; infinite where there is no root."""
+    distances = np.full((layers, len(roots)), np.inf)
     for i, r in enumerate(roots):
         real = np.sort(r.real[(np.abs(r.imag) < 1e-6) & (r.real >= 0)])[:layers]
-        found[: len(real), i] = real
-    return found
+        distances[: len(real), i] = real
+    return distances
 
 
 def traced(radii, origins, directions, layers=4):

@@ -13,6 +13,7 @@ import pytest
 
 import rts
 import rts.testing
+from benchmarks.defects import planted
 
 pytestmark = pytest.mark.core
 
@@ -238,7 +239,7 @@ BLOCKS = (ast.For, ast.While, ast.If, ast.With, ast.Try)
 
 
 def nesting(nodes, depth=0):
-    """How deep blocks are nested in these statements; `elif` is as deep as its `if`, functions within count apart."""
+    """The depth of nested blocks in statements; `elif` is as deep as its `if`, inner functions count apart."""
     deepest = depth
     for node in nodes:
         if not isinstance(node, BLOCKS):
@@ -261,3 +262,12 @@ def test_no_function_nests_deeper_than_four_blocks():
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and nesting(node.body) > 4:
                 deep.append(f"{module}.{node.name}")
     assert not deep
+
+
+def test_forty_planted_defects_apply_to_the_tree():
+    assert len(planted.LOOPS) == len(planted.ARRAYS) == 20
+    assert len({defect.name for defect in planted.DEFECTS}) == 40
+    for defect in planted.DEFECTS:
+        assert (ROOT / defect.path).read_text().count(defect.before) == 1, defect.name
+        missing = [name for name in defect.tests.split() if not (ROOT / f"tests/test_{name}.py").is_file()]
+        assert not missing and defect.after != defect.before

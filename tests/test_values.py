@@ -1,4 +1,4 @@
-"""What passes between users and the library: numbers that are no numbers, other dtypes, shared memory, empty images."""
+"""Values from users: NaN and infinity, other dtypes, shared memory, empty images."""
 
 import copy
 import pickle

@@ -85,10 +85,10 @@ _FACE = {"obj": "f ", "plain.obj": "f ", "ply": r"3 \d+ \d+ \d+$", "off": r"3 \d
 def _places(kind, pattern, which=(0, 3, -1)):
     """The lines of a text, and the numbers of the first, fourth and last that the pattern of its kind finds."""
     lines = TEXTS[kind].splitlines()
-    found = [i for i, line in enumerate(lines) if re.match(pattern[kind], line)]
+    places = [i for i, line in enumerate(lines) if re.match(pattern[kind], line)]
     if kind == "off" and pattern is _VERTEX:
-        found = found[1:]  # The first are the counts.
-    return lines, [found[i] for i in which]
+        places = places[1:]  # The first are the counts.
+    return lines, [places[i] for i in which]
 
 
 def _with_line(kind, lines, place, *those):

@@ -107,9 +107,9 @@ def _cage(surface, a, b, kind, rng):
 
 
 def lacking(view, samples):
-    """Pixels (H, W) whose sheet in front the samples lack; and how many of them it is known for.
+    """Pixels (H, W) that lack the sheet in front, and the number of pixels where this can be decided.
 
-    It is known where no outline is within a quarter of a pixel, by a mesh of fine triangles.
+    A mesh of fine triangles decides, unless an outline is within a quarter of a pixel.
     """
     part, camera, size = view
     spread = camera.for_size(size).spread(size)
@@ -123,9 +123,9 @@ def lacking(view, samples):
         bends = [np.abs(np.diff(cells, 2, axis=axis)).max(axis=(2, 3)) for axis in (2, 3)]
         pixel = spread[0] + spread[1] * cells[:, :, QUARTER, QUARTER]
         known = np.maximum(*bends) < 0.3 * pixel
-        found = _fronts(samples, size[0])
-        off = np.abs(found - cells[:, :, QUARTER, QUARTER]) > np.ptp(cells, axis=(2, 3)) + 0.3 * pixel
-    return known & (np.isnan(found) | off), int(known.sum())
+        fronts = _fronts(samples, size[0])
+        off = np.abs(fronts - cells[:, :, QUARTER, QUARTER]) > np.ptp(cells, axis=(2, 3)) + 0.3 * pixel
+    return known & (np.isnan(fronts) | off), int(known.sum())
 
 
 def _fronts(samples, height):

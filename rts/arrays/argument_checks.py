@@ -63,7 +63,7 @@ def _shape_and_dtype(value: Any) -> tuple[Shape, Any]:
     if is_constant(value):
         array = np.asarray(value)
         return array.shape, array.dtype
-    if isinstance(value, (list, tuple)):  # Such as an eye of traced scalars.
+    if isinstance(value, (list, tuple)):  # For example a camera's eye of traced scalars.
         first = next(x for x in leaves(value) if not isinstance(x, CONSTANT_TYPES))
         return (len(value), *{shape_of(x) for x in value}.pop()), first.dtype
     return shape_of(value), value.dtype
@@ -76,7 +76,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
-    """As `check_numbers`, and refuse numbers of zero or less."""
+    """`check_numbers`, which also refuses numbers of zero or less."""
     array = check_numbers(name, value, *(shapes or ((),)))
     if array is not None and not (array > 0).all():
         raise InputError(
@@ -86,7 +86,7 @@ def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
 
 
 def check_planes(near: Any, far: Any, *, positive: bool) -> None:
-    """Refuse near and far planes in the wrong order, where their values are known."""
+    """Refuse near and far planes in the wrong order, if their values are known."""
     a, b = check_numbers("near", near, ()), check_numbers("far", far, ())
     if a is not None and b is not None and not a < b:
         raise InputError(f"near is {quoted(near)} and far is {quoted(far)}; expected finite numbers with near < far")
@@ -106,7 +106,7 @@ def check_rotation(name: str, matrix: Any) -> None:
 
 
 ROTATION_TOLERANCE = 2e-3
-"""Largest difference of R Rᵀ from the identity. It accepts rotations that are written with three digits."""
+"""Largest accepted difference of R Rᵀ from the identity: rotations written with three digits pass."""
 
 
 def is_invertible(matrix: np.ndarray) -> bool:

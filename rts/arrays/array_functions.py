@@ -128,7 +128,7 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
     ]
     engine = engine_of(values_)
     if any(isinstance(v, (list, tuple)) for v in values_):
-        # A list of traced scalars, such as an eye built of parameters.
+        # A list of traced scalars, such as a camera's eye computed from parameters.
         like = exemplar(values_)
         values_ = [
             namespace(like).stack([engine.constant(x, like) if is_constant(x) else x for x in v])

@@ -59,7 +59,7 @@ class Engine(Plugin):
 
     @abc.abstractmethod
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
-        """(count, C) sums of the rows of `values` (M, C) that share a segment (M,)."""
+        """Sums (count, C) of the rows of `values` (M, C) that share a segment (M,)."""
 
     @abc.abstractmethod
     def to_numpy(self, x: Array) -> np.ndarray:
@@ -164,7 +164,7 @@ class Engine(Plugin):
         return False
 
     def fill_unused(self, x: Array, row: Array) -> Array:
-        """Packed x (N, ·), with its first row in place of every row that no cell of `row` (K, H, W) names.
+        """Packed x (N, ·), with its first row in place of every row that no cell of `row` (K, H, W) refers to.
 
         Only called if `padded(row)` is True.
         """

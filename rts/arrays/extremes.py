@@ -39,7 +39,7 @@ def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
 
 
 def _ends(x: np.ndarray, mask: np.ndarray) -> tuple[int, int]:
-    """The least and the largest of int32. `mask`, of the same shape or empty, is set where they are not negative."""
+    """The least and the largest number of int32. `mask`, of x's shape or empty, is set where x is not negative."""
     from rts.arrays import extremes_loops
 
     numbers = read_only(x).reshape(-1)

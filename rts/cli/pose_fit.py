@@ -36,7 +36,7 @@ class PoseFit(NamedTuple):
         history: the loss at each step: mean square of the difference of silhouettes, or a robust loss of it, at that
             step's resolution and blur.
         levels: the number of steps at each stage, from coarse to fine.
-        start: the model as loaded, seen by the camera given.
+        start: the pose of the model as loaded, with the given camera.
         first_loss: the loss of the start at full resolution.
         loss: the lowest loss at full resolution.
         reason: the reason why the last stage stopped.
@@ -62,7 +62,7 @@ class PoseFit(NamedTuple):
 
 
 def available_engine() -> str:
-    """The name of an engine with derivatives that is installed, torch before jax."""
+    """The name of an installed engine with derivatives, torch before jax."""
     preferred = ["torch", "jax"]
     others = [name for name in registry.plugins("rts.engines") if name not in preferred]
     for name in (*preferred, *others):
@@ -72,7 +72,7 @@ def available_engine() -> str:
 
 
 def silhouette_of(image: np.ndarray) -> np.ndarray:
-    """(H, W) float32 in [0, 1] of a picture (H, W, 4): its alpha, or its luminance where it is opaque.
+    """The silhouette (H, W) float32 in [0, 1] of a picture (H, W, 4): its alpha, or, if it is opaque, its luminance.
 
     Raises:
         InputError: no pixel, or every pixel, is inside.
@@ -88,7 +88,7 @@ def silhouette_of(image: np.ndarray) -> np.ndarray:
 
 
 def shrunk(mask: np.ndarray, largest: int) -> np.ndarray:
-    """(h, w) box-filtered so that the longer side is at most `largest`."""
+    """A mask (h, w), box-filtered so that its longer side is at most `largest`."""
     size = Stage(min(1.0, largest / max(mask.shape))).size(mask.shape)
     return box_filtered(mask[..., None], size)[..., 0]
 
@@ -174,7 +174,7 @@ def _best_so_far(visited: list[np.ndarray], result: Fit) -> list[np.ndarray]:
 
 
 def _engine(name: str) -> Engine:
-    """The engine of a name; it must have derivatives."""
+    """The engine with this name; it must have derivatives."""
     if name == "numpy":
         raise InputError("engine is 'numpy', which has no derivatives; expected torch or jax")
     return registry.plugin("rts.engines", name)()

@@ -1,7 +1,7 @@
 """Decorators that compile loops: functions that Python calls, and helpers, which only other loops call.
 
-Compiled loops are kept on disk; helpers are not, since a helper that is loaded is not inlined. Where much has to be
-compiled, a terminal is told.
+Compiled loops are kept on disk; helpers are not, since a helper loaded from disk is not inlined. If compilation takes
+long, a message on the terminal says so.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ except ImportError:  # Windows.
     fcntl = None
 
 TOLD_AFTER = 1.0
-"""Seconds of compilation after which a terminal is told of it."""
+"""Seconds of compilation after which a message appears on the terminal."""
 
 LOOP = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
 """numba's options of loops. It makes two wrappers beside a function's code, one for Python and one for C.
 
-Divisions by zero are not looked for. All loops have these options, since numba compiles its own functions, such as
-`min` and `np.empty`, once for each set of options.
+Division by zero raises no error. All loops have these options, since numba compiles its own functions, such as `min`
+and `np.empty`, once for each set of options.
 """
 
 
@@ -40,7 +40,7 @@ def loop(function: Callable | None = None, **options: Any) -> Any:
 
     def decorate(function: Callable) -> Any:
         made = cast(Any, numba.njit(**options)(function))
-        if made is not function:  # As it is where compilation is switched off.
+        if made is not function:  # With compilation switched off, it is the function itself.
             made._cache = _Cache(function)
         return made
 
@@ -48,7 +48,7 @@ def loop(function: Callable | None = None, **options: Any) -> Any:
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a helper, which only compiled loops call, not Python, nor itself. `options` are numba's."""
+    """Compile a helper, which only compiled loops call; it must not call itself. `options` are numba's."""
     options = LOOP | {"no_cpython_wrapper": True} | options
     decorate = numba.njit(**options)
     return decorate if function is None else decorate(function)
@@ -56,14 +56,14 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 @contextmanager
 def alone(folder: str, writes: bool = True) -> Iterator[None]:
-    """Hold a folder of loops as the only process that writes, where the system and the file system know such locks.
+    """Hold a folder of loops as the only process that writes, if the system and the file system support locks.
 
     numba reads a function's index, chooses a name for the code, and writes both, one after the other. Two processes
     that do so at once, for different types, may choose the same name: one type's calls would then run the other's code.
 
     Args:
-        folder: where the loops are.
-        writes: False to hold it together with others that read.
+        folder: the folder of the loops.
+        writes: False to share it with other readers.
     """
     file = _lock_file(folder)
     if fcntl is None or file is None:
@@ -76,35 +76,35 @@ def alone(folder: str, writes: bool = True) -> Iterator[None]:
             yield
         finally:
             with suppress(OSError):
-                fcntl.flock(file, fcntl.LOCK_UN)  # A child that was forked meanwhile has the file, too.
+                fcntl.flock(file, fcntl.LOCK_UN)  # A child forked meanwhile has the file open, too.
 
 
 def _lock_file(folder: str) -> IO[bytes] | None:
-    for mode in ("ab", "rb"):  # It may be another user's.
+    for mode in ("ab", "rb"):  # Another user's file is readable only.
         with suppress(OSError):
             return open(os.path.join(folder, ".lock"), mode)
     return None
 
 
 class _Cache(FunctionCache):
-    """The compiled code of a loop on disk, where another process may be writing."""
+    """The compiled code of a loop on disk, safe while other processes write."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Compiled code for some types of arguments; None if there is none yet."""
+        """Load compiled code for some types of arguments; None if there is none yet."""
         with alone(self.cache_path, writes=False):
             return super().load_overload(sig, target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Write code that has been compiled."""
+        """Save compiled code."""
         with alone(self.cache_path):
             super().save_overload(sig, data)
 
 
 class _Watch(event.Listener):
-    """Listener to the compilation of our loops, with all that each calls. The compiler's lock is held meanwhile.
+    """Listener to the compilation of the library's loops and their helpers. The compiler holds its lock meanwhile.
 
-    It tells a terminal once that loops are compiled, where that takes long. It pauses the collection of garbage:
-    compilation makes so many objects that this takes a tenth of the time.
+    It prints one message if compilation takes long. It also pauses garbage collection, which would take a tenth of the
+    time, since compilation makes many objects.
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class _Watch(event.Listener):
         self._depth, self._since, self._told, self._paused = 0, 0.0, False, False
 
     def on_start(self, event: Any) -> None:
-        """Begin with a function, or with one that it calls."""
+        """Note the start of a function, or of one that it calls."""
         if self._depth == 0:
             self._since = time.perf_counter()
             self._paused = _is_ours(event) and gc.isenabled()
@@ -121,7 +121,7 @@ class _Watch(event.Listener):
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """End with a function, compiled or refused."""
+        """Note the end of a function, compiled or refused."""
         self._depth -= 1
         if self._depth:
             return

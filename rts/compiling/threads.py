@@ -20,10 +20,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 TASKS_PER_THREAD = 4
-"""Several tasks for each thread, so that one that gets the heavy rows does not keep the others waiting."""
+"""Tasks for each thread: several, so that a thread with heavy rows does not keep the others waiting."""
 
 LITTLE_WORK = 100_000
-"""Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
+"""Nanoseconds of work below which a loop stays on its caller's thread: to wake another takes tens of thousands."""
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -34,7 +34,7 @@ def _nothing() -> None:
 
 
 def _core_of_caller() -> Callable[[], int] | None:
-    """A function that tells on which core it is called; None where the system does not tell."""
+    """A function that returns the core that it is called on; None if the system does not know."""
     return getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
 
 
@@ -43,18 +43,18 @@ _local = threading.local()
 
 
 def cores() -> set[int]:
-    """The cores that this thread may run on; a helper has those of the thread that asked it. Linux alone tells."""
+    """The cores that this thread may run on; for a helper, those of its caller's thread. Only Linux knows them."""
     return getattr(_local, "cores", None) or os.sched_getaffinity(0)
 
 
 class _Job:
-    """Work that a helper is asked to join in; whoever claims it first, helper or caller, decides whether it does.
+    """Work offered to a helper. The first to claim it, helper or caller, decides whether the helper joins in.
 
     Attributes:
         work: a function.
-        cores: of the thread that asks, if the system tells.
-        roams: whether it may run on all of these, also on that of this thread.
-        error: what it raised.
+        cores: the cores of the caller's thread, if the system knows them.
+        roams: whether it may run on all of these, the caller's own core included.
+        error: the error that it raised, or None.
     """
 
     def __init__(self, work: Callable[[], None], cores: set[int] | None, roams: bool):
@@ -64,29 +64,29 @@ class _Job:
         self._going.acquire()
 
     def claim(self) -> bool:
-        """Whether nobody has claimed it before; it is the caller's then."""
+        """Claim the job; True for the first to do so, who owns it from then on."""
         return self._unclaimed.acquire(blocking=False)
 
     def withdraw(self) -> bool:
-        """Claim it so that nobody does it, and let go of what it would work on; False where it has been claimed."""
+        """Claim the job so that nobody does it, and release its arrays; False if it is already claimed."""
         mine = self.claim()
         if mine:
             self.work = _nothing
         return mine
 
     def run(self) -> None:
-        """Do the work, and keep what it raises."""
+        """Do the work, and keep its error."""
         try:
             self.work()
         except BaseException as error:
             self.error = error
 
     def end(self) -> None:
-        """Let go those that wait until it is done."""
+        """Release the threads that wait for the job."""
         self._going.release()
 
     def wait(self) -> None:
-        """Wait until it is done."""
+        """Wait until the job is done."""
         self._going.acquire()
 
 
@@ -98,17 +98,17 @@ class _Helpers:
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
         self._under_way: set[_Job] = set()
         self._lock = threading.Lock()
-        # Threads by the system's numbers, those of them that run anywhere now, and where the others run.
+        # The system's numbers of the threads; of those that run anywhere now; and the cores of the others.
         self._threads: list[int] = []
         self._roaming: set[int] = set()
         self._placed: set[int] | None = None
 
     def free(self, count: int) -> int:
-        """How many of so many helpers have nothing to do, or are not there yet."""
+        """The number of `count` helpers that are idle or not started yet."""
         return max(0, count - len(self._under_way))
 
     def start(self, count: int) -> None:
-        """Start so many helpers, if there are fewer."""
+        """Start helpers until there are `count`."""
         if self.count >= count:
             return
         with self._lock:
@@ -116,7 +116,7 @@ class _Helpers:
                 thread = threading.Thread(target=self._serve, name="rts", daemon=True)
                 try:
                     thread.start()
-                except RuntimeError:  # The system gives no more: those that there are, or the caller, do the work.
+                except RuntimeError:  # The system gives no more threads: existing helpers, or the caller, do the work.
                     break
                 self.count += 1
                 if thread.native_id:
@@ -124,10 +124,10 @@ class _Helpers:
                 self._placed = None
 
     def keep_off(self, core: int, cores: set[int]) -> None:
-        """Have helpers that have nothing to do run on other cores than one of these.
+        """Have idle helpers run on `cores` without one of them, `core`.
 
-        Linux wakes a thread on the core of the one that wakes it, though others are idle, more often than not where
-        there are two: it would wait there until the loop is over.
+        On two cores Linux often wakes a thread on its waker's core, though the other is idle: it would wait there until
+        the loop is over.
         """
         cores = cores - {core} or cores
         if self._under_way or cores == self._placed:
@@ -139,7 +139,7 @@ class _Helpers:
                     _place(thread, cores)
 
     def ask(self, job: _Job) -> None:
-        """Hand a job to one of the helpers."""
+        """Give a job to one of the helpers."""
         self._jobs.put(job)
 
     def _serve(self) -> None:
@@ -157,7 +157,7 @@ class _Helpers:
             del job  # A thread that waits must not keep arrays alive.
 
     def _run_anywhere(self, job: _Job, cores: set[int]) -> None:
-        """Run a job on any of some cores; where the helper runs afterwards is for the next that asks."""
+        """Run a job on any of some cores; the next caller chooses the helper's cores anew."""
         own = threading.get_native_id()
         with self._lock:
             self._roaming.add(own)
@@ -169,7 +169,7 @@ class _Helpers:
 
 
 def _place(thread: int, cores: set[int]) -> None:
-    with contextlib.suppress(OSError):  # Where that may not be said, they run anywhere.
+    with contextlib.suppress(OSError):  # Without permission, they run anywhere.
         os.sched_setaffinity(thread, cores)
 
 
@@ -195,7 +195,7 @@ def thread_count() -> int:
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """A contiguous view, copied only if it has to be; always read-only, so that loops are compiled but once."""
+    """A contiguous view, copied only if necessary; always read-only, so that loops are compiled only once."""
     view = np.asarray(x, dtype, order="C").view()
     view.flags.writeable = False
     return view
@@ -207,12 +207,12 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
     Args:
         loop: a function of (start, stop, *args).
         count: the end of the range.
-        *args: handed on.
-        work: nanoseconds that it takes on one thread, roughly.
-        apart: whether helpers are to keep off the caller's core all the time. What they call must not start threads
-            then, which would have to keep off as well.
+        *args: passed on.
+        work: rough nanoseconds on one thread.
+        apart: whether helpers must stay off the caller's core all the time. Functions that they call must not start
+            threads then, which would have to stay off as well.
     """
-    # In a task of another loop there may be no helper left, and to ask takes time.
+    # Inside a task of another loop no helper may be free, and asking takes time.
     if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
         loop(0, count, *args)
         return
@@ -226,10 +226,10 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
             while not failed and (task := next(numbers)) < tasks:
                 loop(bounds[task], bounds[task + 1], *args)
         except BaseException:
-            failed = True  # What has not begun is left, by all.
+            failed = True  # No thread begins another range.
             raise
 
-    # The caller works too. A helper that has not woken by the time all is begun is not waited for.
+    # The caller works too. It does not wait for helpers that have not woken when the last range begins.
     jobs: list[_Job] = []
     _helpers.start(threads - 1)
     own = cores() if _core else None
@@ -241,7 +241,7 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
             _helpers.ask(jobs[-1])
         share()
     finally:
-        # Whatever happens, none is to be left that writes to arrays which the caller may give away.
+        # Whatever happens, no helper may still write to arrays when the caller returns.
         begun = [job for job in jobs if not job.withdraw()]
         for job in begun:
             job.wait()
@@ -251,15 +251,15 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
 
 
 def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-    """The results of a function for each of some items, on all cores; loops inside of it take what cores are idle then.
+    """The results of a function for each item, computed on all cores; loops inside of it use idle cores.
 
-    Where it fails for several items, the error is that of the first; items after it may be left out.
+    If it fails for several items, the error is that of the first; items after it may be left out.
 
     Args:
         f: a function that several threads may call at once.
-        items: what to call it with, in this order.
+        items: its arguments, in this order.
     """
-    found: list[Any] = [None] * len(items)
+    results: list[Any] = [None] * len(items)
     errors: dict[int, Exception] = {}
     first = len(items)
 
@@ -269,7 +269,7 @@ def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
             if i > first:
                 return
             try:
-                found[i] = f(items[i])
+                results[i] = f(items[i])
             except Exception as error:
                 errors[i] = error
                 first = min(first, i)
@@ -277,4 +277,4 @@ def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
     parallel(some, len(items), apart=False)
     if errors:
         raise errors[min(errors)]
-    return found
+    return results

@@ -216,12 +216,12 @@ class Hidden(Protocol):
 
     @property
     def settles(self) -> bool:
-        """See above."""
+        """True if decisions have `settled`."""
         ...
 
     @property
     def size(self) -> float:
-        """See above."""
+        """The largest number that surfaces read; 0 if unknown."""
         ...
 
     def decide(self, question: Question) -> Decision:

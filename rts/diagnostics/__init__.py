@@ -1,4 +1,4 @@
-"""Looking at derivatives: beside finite differences, as pictures, and where they come from."""
+"""Diagnostics of derivatives: finite differences to compare with, pictures, and reasons for disagreement."""
 
 from rts.diagnostics.gradients import check_gradient, gradient_image
 

@@ -1,4 +1,4 @@
-"""Shapes made by formulas that scenes are tried on: boxes, spheres, and unlit meshes of vertex colours."""
+"""Example shapes from formulas: boxes, spheres, and unlit meshes of vertex colours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rts.registry import plugin
 from rts.scene.parts import Part
 
 QUAD = ((0, 1, 2), (0, 2, 3))
-"""Two triangles of four corners that go around counter-clockwise."""
+"""Two triangles that make a face of four corners, listed counter-clockwise."""
 
 
 def box(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:

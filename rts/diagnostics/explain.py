@@ -1,4 +1,4 @@
-"""What rendering a scene would do: which sampler each part gets, and how many samples."""
+"""Preview of a rendering: the sampler of each part, and the number of samples."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def explain(
     layers: int | Literal["auto"] = 2,
     supersample: int | Adaptive = 1,
 ) -> list[Choice]:
-    """What `sampler="auto"` takes for each part of a scene, and why; and, at a size, how many samples there are.
+    """Explain which sampler `sampler="auto"` chooses for each part, and count samples if a size is given.
 
     Args:
         parts: as in `rts.render`.
@@ -44,18 +44,18 @@ def explain(
         supersample: as in `rts.render`.
 
     Returns:
-        For each part the name of the `sampler`, the `reason`, and `remarks` on what looks like a mistake; with a size
-        also the number of `samples`, apron included, and with `rts.Adaptive` how many of them are `fine`, and how many
-        pixels are `active`.
+        For each part the name of the `sampler`, the `reason`, and `remarks` on likely mistakes. With a size also the
+        number of `samples`, apron included. With `rts.Adaptive` also the number of `fine` ones among them, and of
+        `active` pixels.
 
     Raises:
-        InputError: what was given cannot be sampled.
+        InputError: the scene cannot be sampled.
     """
     checked, seen = check_scene(parts.parts if isinstance(parts, Prepared) else parts, camera)
-    found = None
+    sampled = None
     shaded: list[Any] = [shaded_by(part) for part in checked]
     if size is not None:
-        found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
+        sampled = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
         if None in shaded:
             seen_to_read = _observed(checked, camera, size)
             shaded = [b if a is None else a for a, b in zip(shaded, seen_to_read, strict=True)]
@@ -63,13 +63,13 @@ def explain(
         choose(part, static=is_static(part, seen))._replace(remarks=tuple(_remarks(part, seen, own)))
         for part, own in zip(checked, shaded, strict=True)
     ]
-    if found is None:
+    if sampled is None:
         return choices
-    coarse = map(_count, found.samples)
-    if found.fine is None:
+    coarse = map(_count, sampled.samples)
+    if sampled.fine is None:
         return [choice._replace(samples=n) for choice, n in zip(choices, coarse, strict=True)]
-    pixel = engine_of(found).to_numpy(found.fine.pixel)
-    finer, active = map(_count, found.fine.samples), int(np.count_nonzero(pixel >= 0))
+    pixel = engine_of(sampled).to_numpy(sampled.fine.pixel)
+    finer, active = map(_count, sampled.fine.samples), int(np.count_nonzero(pixel >= 0))
     counts = zip(choices, coarse, finer, strict=True)
     return [choice._replace(samples=n + m, fine=m, active=active) for choice, n, m in counts]
 
@@ -85,7 +85,7 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
 
 
 def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:
-    """Likely mistakes of a part whose shader reads these entries of θ; None where that is not known."""
+    """Likely mistakes in a part; `shaded` are the entries of θ that its shader reads, None if unknown."""
     for name in unread(part, shaded):
         meant = likely_name(part, name, shaded or ())
         yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
@@ -94,5 +94,5 @@ def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) 
 
 
 def _count(samples: Samples) -> int:
-    """How many samples cells refer to."""
+    """The number of samples that cells refer to."""
     return int(np.count_nonzero(engine_of(samples).to_numpy(samples.row) >= 0))

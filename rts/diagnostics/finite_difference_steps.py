@@ -1,4 +1,4 @@
-"""How far parameters are moved by finite differences: until something has moved by a pixel."""
+"""Step lengths of finite differences: far enough to move something by a pixel."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
 
 STEP_PIXELS = 1.0
-"""How far a step moves what moves fastest in the image."""
+"""The motion of the fastest point in the image by a step, pixels."""
 STEP_COLOR = 0.05
-"""How far a step changes the colour that changes fastest, where nothing moves."""
+"""The change of the fastest colour by a step, if nothing moves."""
 FADING = 0.7
-"""What deeper layers count for, less and less, so that motions of two of them cannot cancel."""
+"""The ratio of successive layers' weights: they fall, so that motions of two layers cannot cancel."""
 
 
 class _Probe(Splatter):
-    """A splatter that shows where samples are on the image, or their colour; of the front layer, or of all."""
+    """A splatter that shows the image positions of samples, or their colours, in the front layer or in all."""
 
     def __init__(self, color: bool, deep: bool):
         self.color, self.deep = color, deep
@@ -53,13 +53,13 @@ def pixel_step(
     Args:
         engine: of the parameters.
         image: parameters and options of `rts.render` → (H, W, 4).
-        parameters: where derivatives are looked at.
-        direction: of their structure.
-        deep: whether to look at all layers that are kept, not only at the front one.
+        parameters: the point of the derivative.
+        direction: a tree of the parameters' structure.
+        deep: whether all kept layers count, not only the front one.
     """
     for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
         probe = partial(image, splatter=_Probe(color, deep), supersample=1, background=None)
-        # What nothing moves may be of NumPy.
+        # An image that does not depend on the parameters may be NumPy.
         probe = partial(_of_engine, engine, probe)
         speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
         if speed > 1e-6:

@@ -1,4 +1,4 @@
-"""Looking at derivatives: as a picture, and beside finite differences that know nothing of splatting."""
+"""Derivatives as pictures, and compared with finite differences of images without splatting."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from rts.fitting.run import untraceable
 from rts.rendering.image import render
 
 NEGLIGIBLE = 0.01
-"""What does not matter, as a share of the largest effect of a step."""
+"""The largest negligible effect, as a share of the largest effect of a step."""
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
 
 
 class GradientImage(NamedTuple):
-    """How an image changes with its parameters.
+    """The derivative of an image along a direction of its parameters.
 
     Attributes:
         derivative: (H, W, C) float, change of the image for a unit step along the direction.
@@ -81,10 +81,10 @@ def gradient_image(
         raise InputError(f"scale is {quoted(scale)}; expected a positive number, or None for the largest change")
 
     def checked(p: Tree) -> Array:
-        found = image(p)
-        if not engine.owns(found) or found.ndim != 3:
-            raise InputError(f"image gave {kind_of(found)}; expected a {engine.name} array (H, W, C)")
-        return found
+        result = image(p)
+        if not engine.owns(result) or result.ndim != 3:
+            raise InputError(f"image gave {kind_of(result)}; expected a {engine.name} array (H, W, C)")
+        return result
 
     with _traceable(engine):
         derivative = engine.to_numpy(engine.jvp(checked, parameters, direction)[1])
@@ -95,14 +95,14 @@ def gradient_image(
 
 
 class GradientCheck(NamedTuple):
-    """The result of `check_gradient`; as a string, a table and what explains it.
+    """The result of `check_gradient`; as a string, a table with its reasons.
 
     Attributes:
-        slopes: one for each number that was looked at.
-        tolerance: how far a derivative may be off, relative to itself.
+        slopes: one for each number that was checked.
+        tolerance: the largest error of a derivative, relative to it.
         reasons: why slopes differ or vanish, those that explain most first.
         picture: (H, W, 3) linear RGB for `rts.save_image`: the scene, dark, and the pixels of reasons in their colours.
-        note: what was left out, since the budget was spent, say; empty if nothing was.
+        note: omissions, for example because the budget was spent; empty if there are none.
     """
 
     slopes: list[Slope]
@@ -112,10 +112,10 @@ class GradientCheck(NamedTuple):
     note: str = ""
 
     def agrees(self, slope: Slope) -> bool:
-        """Whether autodiff and the difference agree.
+        """True if autodiff and the difference agree.
 
-        They may be off by the tolerance, three error bars and what is negligible beside the other slopes. Slopes of
-        different units are compared by what a step of a pixel does to the loss.
+        They may differ by the tolerance, three error bars, and an amount negligible beside the other slopes. Slopes in
+        different units are compared by the effect of a one-pixel step on the loss.
         """
         effects = [abs(s.difference * s.step) for s in self.slopes]
         largest = max((x for x in effects if math.isfinite(x)), default=0.0)
@@ -124,7 +124,7 @@ class GradientCheck(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether all slopes agree."""
+        """True if all slopes agree."""
         return all(map(self.agrees, self.slopes))
 
     def __str__(self) -> str:
@@ -156,23 +156,22 @@ def check_gradient(
 ) -> GradientCheck:
     """Compare the gradient of a loss of a rendered scene with finite differences, and say why they differ or vanish.
 
-    The differences are of images without splatting, of `samples`² and (`samples` + 1)² samples a pixel, over a step
-    that moves what moves fastest by one pixel, and over twice that step. Where the two disagree, and where nothing
-    changes at all, experiments on the scene tell why: without culling, alone, with more layers or samples, from
-    farther away, and so on.
+    The differences are of images without splatting, with `samples`² and (`samples` + 1)² samples a pixel. Their step
+    moves the fastest point by one pixel; they are repeated over twice that step. If a derivative disagrees or
+    vanishes, experiments on the scene tell why: without culling, with one part alone, with more layers or samples,
+    from farther away, and so on.
 
     Args:
         scene: parameters → (parts, camera).
         parameters: a torch or jax array, or nested dicts and lists of them.
         size: (height, width).
         loss: image (H, W, 4) → scalar; None for a smooth random weighting of the image, with a fixed seed.
-        entries: how many numbers to look at in each array: those of largest gradient, and some at random.
-        samples: the square root of the number of samples a pixel.
-        tolerance: how far a derivative may be off, relative to itself.
-        budget_s: seconds after which nothing more is begun; what was looked at until then is returned. At least one
-            number is looked at. Where they do not suffice, all numbers are looked at with few samples before any is
-            with more.
-        progress: a bar on standard error; None for where that is a terminal.
+        entries: how many numbers of each array to check: those of largest gradient, and some at random.
+        samples: samples a pixel along each axis.
+        tolerance: the largest error of a derivative, relative to it.
+        budget_s: seconds after which nothing more is begun; the result covers what was checked until then, at least
+            one number. If time is short, all numbers are checked with few samples before any is with more.
+        progress: whether to show a bar on standard error; None to do so on a terminal.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
     Raises:
@@ -198,22 +197,22 @@ def check_gradient(
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
     subject = Subject(engine, scene, map_leaves(engine.stop_gradient, parameters), size, options, loss)
     with _traceable(engine), phases(progress) as phase, warnings.catch_warnings():
-        # Why nothing is seen is what the check tells.
+        # The check itself tells why nothing is seen.
         warnings.simplefilter("ignore", EmptyImageWarning)
         warnings.simplefilter("ignore", LayersWarning)
         subject.require_dependence()
         numbers, count, rough = looked_at(subject, entries, samples, clock, phase)
         check = GradientCheck([n.slope for n in numbers], tolerance)
         plain = [n for n in numbers if n.forward]
-        found, left = explained(subject, plain, check.agrees, own, clock.turn, phase)
-        picture = marked(subject.seen, found)
+        reasons, left = explained(subject, plain, check.agrees, own, clock.turn, phase)
+        picture = marked(subject.seen, reasons)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
     notes += [f"the differences of {rough} are of fewer samples than asked for"] if rough else []
     notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
     told = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
     if len(plain) < len(numbers):
         told.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
-    return check._replace(reasons=found, picture=picture, note=" ".join(told))
+    return check._replace(reasons=reasons, picture=picture, note=" ".join(told))
 
 
 # --------------------------------------------------------------------------------------------------- parameters
@@ -221,7 +220,7 @@ def check_gradient(
 
 @contextlib.contextmanager
 def _traceable(engine: Engine) -> Iterator[None]:
-    """Errors of a framework that cannot trace the user's function are told in one line."""
+    """Turn errors of a framework that cannot trace the user's function into one line."""
     try:
         yield
     except Exception as error:
@@ -232,7 +231,7 @@ def _traceable(engine: Engine) -> Iterator[None]:
 
 
 def _differentiable(parameters: Tree, caller: str) -> tuple[Engine, Tree]:
-    """The engine of parameters that have derivatives, and the parameters, dicts in the order of `leaves`."""
+    """The engine of differentiable parameters, and the parameters with dicts in the order of `leaves`."""
     engine = differentiable(parameters)
     if any(engine.traced(x) for x in leaves(parameters)):
         raise InputError(f"parameters holds traced arrays; call {caller} outside jit and other transforms")
@@ -261,7 +260,7 @@ def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
 
 
 def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array], Array]:
-    """The loss, refused where it is no scalar of the engine."""
+    """The loss, with a check that its result is a scalar of the engine."""
 
     def call(image: Array) -> Array:
         value = loss(image)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 
 Phase = Callable[[str, int], Callable[[], None]]
-"""(what is done, how many steps it has) → a function to call after each step."""
+"""(name of a phase, number of its steps) → a function to call after each step."""
 
 
 @contextlib.contextmanager
@@ -15,7 +15,7 @@ def phases(wanted: bool | None) -> Iterator[Phase]:
     """A bar for each phase, with the time that is left.
 
     Args:
-        wanted: None for where standard error is a terminal.
+        wanted: whether to show bars; None to do so on a terminal.
     """
     if wanted is False or (wanted is None and not sys.stderr.isatty()):
         yield lambda what, steps: lambda: None

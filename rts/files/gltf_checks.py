@@ -193,7 +193,7 @@ def _view(index: int, view: dict[str, Any], buffers: list[bytes], fail: Any) -> 
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[int, str]:
-    """Refuse attributes that do not fit. Return the accessors that trimesh would misread, with the type to take."""
+    """Refuse unfit attributes. Return the accessors that trimesh would misread, with the types to convert them to."""
     mode = count_of(primitive.get("mode", 4))
     if mode > 5:
         raise fail(f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)")

@@ -72,7 +72,7 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
             raise InputError(f"merge and weld are for meshes; the surface {surface!r} reads its files without them")
         check_exists(path)
         return list(reader.load(path))
-    with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # What overflows is refused by name.
+    with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # Checks refuse overflow by name.
         pieces = [_linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):
             pieces = [_merged(path, pieces)]
@@ -148,7 +148,7 @@ def _welded(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _settled(
     rows: np.ndarray, table: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """One row a vertex (and no table) where the faces around each vertex agree, else rows and their table."""
+    """One row for each vertex, and no table, if the faces around each vertex agree; otherwise rows and their table."""
     if len(rows) == count and np.array_equal(table, faces):
         return rows, None
     by_vertex = np.zeros((count, rows.shape[1]), rows.dtype)
@@ -172,7 +172,7 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
             tables.setdefault(name, []).append(pair)
     whole = {}
     for name, pairs in tables.items():
-        if len(pairs) == len(pieces):  # What only some of them have is dropped.
+        if len(pairs) == len(pieces):  # Attributes that only some pieces have are dropped.
             if all(rows is pairs[0][0] for rows, _ in pairs):
                 whole[name] = pairs[0][0], np.concatenate([table for _, table in pairs])
                 continue
@@ -198,7 +198,7 @@ def _in_scene(piece: Piece) -> Piece:
         if "normals" in attributes:
             rows, table = attributes["normals"]
             attributes["normals"] = (rows @ np.linalg.inv(m[:3, :3]), table)
-        if mirrored:  # A mirror image would be inside out.
+        if mirrored:  # Mirrored triangles would be inside out.
             faces = faces[:, ::-1]
             attributes = {name: (rows, table[:, ::-1]) for name, (rows, table) in attributes.items()}
     return piece._replace(vertices=vertices, faces=faces, attributes=attributes, transform=None)
@@ -218,7 +218,7 @@ def read_pieces(path: Path) -> list[Piece]:
     """The meshes of a file, at least one, each with at least one face; indices and values are checked.
 
     Raises:
-        InputError: the file cannot be read, or what it holds is not a sound mesh.
+        InputError: the file cannot be read, or holds no sound mesh.
     """
     extension = path.suffix.lower().removeprefix(".")
     check_exists(path)

@@ -1,4 +1,4 @@
-"""Functions that do not depend on their parameters, and directions that they do not determine."""
+"""Checks for functions that do not depend on their parameters, and directions left undetermined, in words."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rts.fitting.parameter_names import listed
 UNSEEN = 0.02
 """Numbers below this share of a direction's largest are left out of its description."""
 SHORT = 4
-"""Arrays of at most so many numbers are described as a vector."""
+"""The most numbers of an array that is described as a vector."""
 
 NO_WAY = "no derivative leads from the one to the other"
 
@@ -29,7 +29,7 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
         purpose: text for the end of an error.
 
     Raises:
-        InputError: no arrays that have derivatives.
+        InputError: no array has derivatives.
         EngineError: arrays of two engines.
     """
     try:
@@ -53,10 +53,10 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
 
 
 def refuse_independent(residuals: Callable, loss: Callable | None, parameters: Tree, engine: Engine) -> None:
-    """Refuse a function whose results no derivative connects to the parameters. Called where a gradient is zero.
+    """Refuse a function whose results no derivative connects to the parameters. Called for a gradient of zero.
 
-    A result is connected where the engine marks it as it marks the parameters: in torch by the graph, in jax by being
-    traced. A gradient may be zero though all is connected, such as where nothing is in view.
+    A result is connected if the engine differentiates it: in torch it then has a graph, in jax it is traced. A gradient
+    may be zero though everything is connected, for example if nothing is in view.
 
     Raises:
         InputError: the residuals do not depend on the parameters, or the loss not on the residuals.
@@ -73,7 +73,7 @@ def refuse_independent(residuals: Callable, loss: Callable | None, parameters: T
 
     engine.value_and_grad(probe)(parameters)
     if not marks["parameters"]:
-        return  # An engine that marks nothing: nobody can tell.
+        return  # The engine marks nothing, so that independence cannot be detected.
     for what, of in (("residuals", "parameters"), ("loss", "residuals")):
         if not marks[what]:
             raise InputError(
@@ -91,17 +91,17 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
 
     Args:
         basis: (U, k), linearly independent columns that span the directions, in numbers of the parameters.
-        units: (U,), what makes changes of different arrays comparable; positive.
+        units: (U,), positive factors that make changes of different arrays comparable.
         names: of the arrays.
         shapes: of the arrays.
 
     Returns:
-        Such as "light.direction along (0.32, 0.53, 0.78), gain"; at most a few.
+        Text such as "light.direction along (0.32, 0.53, 0.78), gain"; at most a few directions.
     """
     from scipy.linalg import qr
 
     columns = basis * units[:, None]
-    # As many zeros as there are: one entry of each direction is 1 there, and 0 in the others.
+    # As many zeros as possible: one entry of each direction is 1, and 0 in the other directions.
     pivots: Any = qr(columns.T, mode="economic", pivoting=True)[-1]
     pivots = pivots[: columns.shape[1]]
     columns = columns @ np.linalg.inv(columns[pivots])
@@ -129,7 +129,7 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
 
 
 def _terms(name: str, shape: tuple, part: np.ndarray) -> list[str]:
-    """The part of a direction that is in one array."""
+    """Terms for the entries of a direction in one array."""
     used = np.flatnonzero(part)
     if not len(used):
         return []

@@ -67,7 +67,7 @@ class Run:
 
     @property
     def fresh(self) -> bool:
-        """True before the first loss of the first stage. An error then is the caller's, since nothing can be saved."""
+        """True before the first loss of the first stage. No result can be saved then: an error goes to the caller."""
         return not self.history and not self.before
 
     def note_gradient(self, mattered: Sequence[bool]) -> None:

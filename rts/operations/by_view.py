@@ -23,7 +23,7 @@ def rows_in_views(view: np.ndarray) -> int:
 
 
 def index_of_views(view: Array) -> Array:
-    """(N,) the view of each row, counted from 0 on; unused rows have the first."""
+    """The view (N,) of each row, counted from 0 on; unused rows have the first."""
     return view - namespace(view).astype(view > 0, view.dtype)
 
 

@@ -15,15 +15,15 @@ from rts.operations.take import take
 
 
 def combine(rows: Array, ids: Array, weights: Array) -> Array:
-    """(N, C): Σᵢ wᵢ rowᵢ, differentiable in rows and weights.
+    """Weighted sums Σᵢ wᵢ rowᵢ (N, C), differentiable in rows and weights.
 
     Args:
         rows: (V, C) float, such as control points.
-        ids: (N, I) integers, numbers of rows. A sum of fewer rows names any row with a weight of zero.
+        ids: (N, I) integers, indices of rows. A sum of fewer rows repeats any index with a weight of zero.
         weights: (N, I) float.
 
     Raises:
-        InputError: shapes do not fit, or an id names no row.
+        InputError: shapes do not fit, or an id is no index of a row.
     """
     rows, weights = from_numbers(rows, "rows"), from_numbers(weights, "weights")
     ids = np.asarray(from_numbers(ids, "ids"), np.int32) if isinstance(ids, (list, tuple)) else from_numbers(ids, "ids")
@@ -43,7 +43,7 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 
 
 def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
-    """(N, C): c + w₀ (a − c) + w₁ (b − c), for the rows a, b, c of (V, C) that three columns of `ids` name.
+    """Interpolation c + w₀ (a − c) + w₁ (b − c), (N, C), of rows a, b, c, whose indices are three columns of `ids`.
 
     This is `combine` of three rows, whose last weight is one minus the others.
 
@@ -67,7 +67,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
 
 
 def _alike(rows: Array, weights: Array) -> tuple[Array, Array]:
-    """Rows and weights in one engine, the weights' dtype at least as wide as the rows'."""
+    """Rows and weights in one engine; the weights' dtype is at least as wide as the rows'."""
     if weights.dtype == rows.dtype:
         return rows, weights
     engine = engine_of(rows, weights)
@@ -79,14 +79,14 @@ def _alike(rows: Array, weights: Array) -> tuple[Array, Array]:
 
 def _specification(rows: Array, weights: Array, ids: Array, *, column: int, count: int, affine: bool) -> Array:
     xp = namespace(rows, ids)
-    # One gather of all rows: its gradient fills one array of their size, instead of one for each column.
+    # One gather of all columns: its gradient fills one array of the rows' size, instead of one for each column.
     index = xp.reshape(ids[:, column : column + count], (-1,))
-    found = xp.reshape(take(rows, index), (-1, count, rows.shape[1]))
+    gathered = xp.reshape(take(rows, index), (-1, count, rows.shape[1]))
     if not affine:
-        return sum(weights[:, i : i + 1] * found[:, i, :] for i in range(count))
-    last = total = found[:, count - 1, :]
+        return sum(weights[:, i : i + 1] * gathered[:, i, :] for i in range(count))
+    last = total = gathered[:, count - 1, :]
     for i in range(count - 1):
-        total = total + weights[:, i : i + 1] * (found[:, i, :] - last)
+        total = total + weights[:, i : i + 1] * (gathered[:, i, :] - last)
     return total
 
 
@@ -95,7 +95,7 @@ def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...]
 
 
 def _check(rows: np.ndarray, weights: np.ndarray, ids: np.ndarray, *, column: int, count: int, affine: bool) -> None:
-    """Refuse ids and weights that lack columns that are used."""
+    """Refuse ids and weights with too few columns."""
     if len(ids) != len(weights) or not 0 <= column <= ids.shape[1] - count or weights.shape[1] < count - affine:
         raise InputError(
             f"ids and weights have shapes {ids.shape} and {weights.shape}; expected (N, {column + count}) and "

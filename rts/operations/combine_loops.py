@@ -1,8 +1,8 @@
 """Weighted sums of rows and their derivatives, as compiled loops for arrays on the host.
 
-`count` columns of `ids` (N, I), from `column` on, name rows of (V, C). The first columns of weights (N, W) belong to
-these rows. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last). Triangles
-have loops of their own. Gradients are added up in the order of the samples.
+`count` columns of `ids` (N, I), from `column` on, are indices of rows of (V, C). The first columns of weights (N, W)
+belong to these rows. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last).
+Triangles have loops of their own. Gradients are added up in the order of the samples.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rts.errors import InputError
 
 
 def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
-    """Raise an InputError where ids name no row."""
+    """Raise an InputError if an id is no index of a row."""
     named = ids[:, column : column + count]
     if not named.size:
         return

@@ -17,7 +17,7 @@ STEP = 6e-6
 
 
 def gradient(f: Callable[[Array], Array], points: Array) -> Array:
-    """The gradient (N, 3) of a function of points whose values depend on their own points alone.
+    """The gradient (N, 3) of a function of points. Each value must depend on its own point alone.
 
     The gradient is differentiable in the points and in arrays that `f` closes over. For NumPy arrays, which have no
     derivatives, it is a central difference in float64.

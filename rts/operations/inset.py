@@ -1,4 +1,4 @@
-"""Images in which some pixels are means of a finer image; the others are given, or have one colour."""
+"""Insets: images in which some pixels are means of a finer image; others are given, or have one colour."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from rts.operations.operation import Arrays, Operation, Some
 
 
 def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:
-    """(H, W, C): the image, with means of `side`² cells of a finer image where `pixel` is not negative.
+    """The image (H, W, C), with means of `side`² cells of a finer image where `pixel` is not negative.
 
     Args:
         image: (H, W, C).
         fine: (h · side, w · side, C), of the dtype of the image.
         pixel: (H, W) integers, the index of a pixel among the h × w of the finer image, counted along its lines;
-            negative for none. No two are the same.
+            negative for none. No index appears twice.
         side: cells along each side of a pixel.
     """
     return INSET(image, fine, pixel, side=side)
 
 
 def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, side: int) -> Array:
-    """(H, W, C): as `with_inset`, with an image of one colour on covered pixels and zeros elsewhere.
+    """An image (H, W, C) as by `with_inset`, from one of a single colour on covered pixels and zeros elsewhere.
 
     Args:
         color: (C,).
@@ -38,7 +38,7 @@ def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: 
 
 
 def averaged(image: Array, side: int) -> Array:
-    """(h, w, C) of (h · side, w · side, C): each pixel the mean of `side`² cells."""
+    """An image (h, w, C) of (h · side, w · side, C): each pixel is the mean of `side`² cells."""
     # One axis after the other: over both at once, torch takes three times as long.
     xp, (height, width), channels = namespace(image), (n // side for n in image.shape[:2]), image.shape[2]
     rows = xp.mean(xp.reshape(image, (height, side, width * side * channels)), axis=1)
@@ -125,7 +125,7 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, *, side: int) -> None:
 
 def _pull_painted(operands: Arrays, g: np.ndarray, results: Some, *, side: int) -> None:
     color, fine = results
-    # Of each line by itself, so that the sum does not depend on the number of threads.
+    # Each line has its own sum, so that the total does not depend on the number of threads.
     sums, none = np.zeros((0 if color is None else len(g), g.shape[2]), g.dtype), np.empty((0, 0, g.shape[2]), g.dtype)
     row, settled = read_only(operands[3], np.int32), read_only(operands[4])
     _pulled(g, operands[2], row, settled, side, none, sums, none if fine is None else fine)

@@ -34,7 +34,7 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
 @compiled
 def _sum(fine, top, left, c, side, share):
     """The sum of the means of columns of a pixel's cells."""
-    # Rows first, as in the specification, whose rounding this has.
+    # Rows first, for the same rounding as in the specification.
     total = fine.dtype.type(0)
     for u in range(left, left + side):
         column = fine.dtype.type(0)

@@ -87,11 +87,11 @@ def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
     if not is_plain_product(rows, points):
         return VIEWS(rows, points, view)
     VIEWS.check_ranks((rows, points, view))
-    found = np.zeros((len(points), rows.shape[1]), np.result_type(rows, points))
+    mapped = np.zeros((len(points), rows.shape[1]), np.result_type(rows, points))
     for b, own in ranges_of_views(view, len(rows)):
-        np.matmul(points[own], rows[b, :, :3].T, out=found[own])
-        found[own] += rows[b, :, 3]
-    return found
+        np.matmul(points[own], rows[b, :, :3].T, out=mapped[own])
+        mapped[own] += rows[b, :, 3]
+    return mapped
 
 
 def _specification_of_views(rows: Array, points: Array, view: Array) -> Array:

@@ -58,10 +58,10 @@ Some = Sequence[np.ndarray | None]
 class Operation:
     """A function of arrays that every engine can differentiate, in forward and reverse mode, and to second order.
 
-    `forward`, `push` and `pull` compute value and first derivatives where arrays are on the host, and their floats all
-    of one dtype, float32 or float64. Elsewhere, and for second derivatives, `specification` runs. Under `vmap` items
-    are computed one after another. An operation is called with its operands, and with parameters by name. Parameters
-    are hashable values, no arrays, and are handed on to all of its functions.
+    `forward`, `push` and `pull` compute value and first derivatives if arrays are on the host, and all floats have one
+    dtype, float32 or float64. Otherwise, and for second derivatives, `specification` runs. Under `vmap` items are
+    computed one after another. An operation is called with its operands, and with parameters by name. Parameters are
+    hashable values, not arrays, and are passed to all of its functions.
 
     `forward`, `push` and `pull` run on the host. Their `operands` are NumPy arrays, C-contiguous and read-only; they
     fill `out` and `results` in place.
@@ -129,10 +129,10 @@ class Operation:
             specification: in array code.
             ranks: of the operands.
             shape: of the result.
-            loops: () → (forward, push, pull), asked in each call, so that it may import numba when that is needed.
+            loops: () → (forward, push, pull); called each time, so that it may import numba on first use.
                 forward(*operands, out, **params) and push(*operands, *tangents, out, **params) fill `out`;
                 pull(*operands, gradient, *results, **params) fills the results, of which not all are None.
-            check: (*operands, **params), raises an InputError where operands do not fit one another.
+            check: (*operands, **params), raises an InputError if operands do not fit one another.
             **options: the other attributes, from `differentiable` on.
 
         Raises:
@@ -316,7 +316,7 @@ class Operation:
             )
 
     def _refused(self, function: str, shapes: Sequence[tuple[int, ...]], error: Exception) -> Exception:
-        """The error to raise where a function fails."""
+        """The error to raise if a function fails."""
         if isinstance(error, RtsError):
             return error
         return InputError(

@@ -26,7 +26,7 @@ def projective_map(rows: Array, points: Array) -> Array:
 
 
 def projective_map_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
-    """As `projective_map`, for points (N, 3) of several views that are placed in one picture.
+    """`projective_map` for points (N, 3) of several views, which are placed side by side in one picture.
 
     Args:
         rows: (B, 4, 4), the affine maps of each view.
@@ -36,11 +36,11 @@ def projective_map_of_views(rows: Array, points: Array, view: Array, places: Arr
     """
     if not is_plain_product(rows[0, ...], points):
         return VIEWS(rows, points, view, places)
-    xp, found = namespace(points), []
+    xp, placed = namespace(points), []
     for b, own in ranges_of_views(view, len(rows)):
         shown = _specification(rows[b, ...], points[own, :])
-        found.append(xp.concat([shown[:, :2] + places[b, :2], shown[:, 2:] * places[b, 2]], axis=1))
-    return xp.concat(found)
+        placed.append(xp.concat([shown[:, :2] + places[b, :2], shown[:, 2:] * places[b, 2]], axis=1))
+    return xp.concat(placed)
 
 
 def _specification(rows: Array, points: Array) -> Array:
@@ -105,10 +105,10 @@ def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays, np.ndarra
 def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
     out[rows_in_views(operands[2]) :] = 0
     for _, own, given, place in _each_view(operands):
-        found = out[own]
-        PROJECTION.forward(given, found)
-        found[:, :2] += place[:2]
-        found[:, 2] *= place[2]
+        projected = out[own]
+        PROJECTION.forward(given, projected)
+        projected[:, :2] += place[:2]
+        projected[:, 2] *= place[2]
 
 
 def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:

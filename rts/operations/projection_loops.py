@@ -74,7 +74,7 @@ def _push(start, stop, m, points, turn, move, out):
 def _pull(start, stop, m, points, g, sums, g_points):
     zero, one = points.dtype.type(0), points.dtype.type(1)
     for chunk in range(start, stop):
-        # Not an array that is assigned: for that numba compiles an error that tells shapes, which takes a second.
+        # A loop, since for assigned arrays numba also compiles an error about their shapes, which takes a second.
         total = sums[chunk]
         total[:] = 0
         for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):

@@ -1,8 +1,8 @@
 """Several views of a scene, sampled side by side in one picture.
 
-One pass over the picture decides for all views which samples splatters need, which side of a surface is seen, and
-where each sample stands in the table. So Python's overhead is paid once, and threads run long loops. Only the triangles
-are drawn view by view.
+One pass over the picture decides for all views which samples splatters need, which side of a surface is seen, and in
+which row of the table each sample is. So Python's overhead is paid once, and threads run long loops. Only the
+triangles are drawn view by view.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def sampled_as_one(sampling: Sampling) -> Views:
 
 
 def _views_of(samples: Samples, picture: Picture) -> Array:
-    """(N,) the view of each row in the table of a part, each of which stands in one cell; 0 for unused rows."""
+    """The view (N,) of each row in the table of a part, in which every sample has one cell; 0 for unused rows."""
     size = samples.ids.shape[0]
 
     def host(row: np.ndarray) -> tuple[np.ndarray]:
@@ -181,7 +181,7 @@ def _views_of(samples: Samples, picture: Picture) -> Array:
 
 
 def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
-    """(size,) int32, the number of each row's view, from 1 on, for `counts` rows a view; then 0 for unused rows."""
+    """The view (size,) int32 of each row, from 1 on, given the rows of each view; then 0 for unused rows."""
     numbers = np.zeros(size, np.int32)
     numbers[: counts.sum()] = np.repeat(np.arange(1, len(counts) + 1), counts)
     return numbers
@@ -337,7 +337,7 @@ def decided_in_views(
 
 
 def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:
-    """(height, width) the factor on the depth of each cell."""
+    """Factors (height, width) on the depth of each cell."""
     factors = np.ones(picture.size, dtype)
     for (lines, columns), scale in zip(picture.places(), scales, strict=True):
         factors[lines, columns] = scale
@@ -345,7 +345,7 @@ def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:
 
 
 def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
-    """(B,) the largest depth of each view, from depths (K, height, width) of the picture."""
+    """The largest depth (B,) of each view, from depths (K, height, width) of the picture."""
     layers, (height, width) = len(depth), picture.view
     lines = depth.reshape(-1, width)
     sizes = np.maximum(lines.max(axis=1, initial=0), -lines.min(axis=1, initial=0))
@@ -362,10 +362,10 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
-    """(B,) number of rows of each view, each of which stands in one cell; at least `rows` in all."""
+    """The number (B,) of rows of each view, in which every sample has one cell; at least `rows` in all."""
     from rts.sampling import packing_loops
 
     assert row is not None
     counts = packing_loops.count_in_views(row >= 0, (picture.down, picture.across))[: picture.views]
-    counts[0] += max(0, rows - counts.sum())  # Tables of empty pictures have a row nevertheless.
+    counts[0] += max(0, rows - counts.sum())  # The table of an empty picture has one row.
     return counts

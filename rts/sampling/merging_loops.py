@@ -15,14 +15,14 @@ def interleave(
     layers: int,
     more: int,
 ) -> tuple[np.ndarray, ...]:
-    """The nearest layers of several parts: part and row within it, −1 where empty, and depth, (K, H, W) each.
+    """The nearest layers of several parts: part, row within it (−1 in empty layers), and depth, (K, H, W) each.
 
-    With them, where it is told, which piece faces the viewer in each cell.
+    If parts have `facing`, the last result is that of the merged layers; otherwise it has no layers.
 
     Args:
         rows: `row` of each part, (L, H, W) int32, front to back.
         depths: depths of each part, (L, H, W).
-        facing: `facing` of each part, (L, H, W) int16; or none.
+        facing: `facing` of each part, (L, H, W) int16; or empty.
         layers: K.
         more: `Cells.MORE_BEHIND`.
     """
@@ -35,12 +35,12 @@ def interleave(
     ]
     # One part after the other: earlier parts are merged already.
     before: tuple[np.ndarray, ...] = (np.empty((0, height, width), np.int32), *given[0])
-    given += [tuple(x[:0] for x in given[0])] * (len(rows) == 1)  # With one alone nothing is merged.
+    given += [tuple(x[:0] for x in given[0])] * (len(rows) == 1)  # A single part is merged with no layers.
     for number, own in enumerate(given[1:], start=1):
-        found = *(np.empty(shape, dtype) for dtype in (np.int32, np.int32, kind)), np.empty(told, np.int16)
+        merged = *(np.empty(shape, dtype) for dtype in (np.int32, np.int32, kind)), np.empty(told, np.int16)
         numbers = number, len(rows), more
-        parallel(_merge, height, *map(read_only, before), *own, *numbers, *found, work=4 * found[0].size)
-        before = found
+        parallel(_merge, height, *map(read_only, before), *own, *numbers, *merged, work=4 * merged[0].size)
+        before = merged
     return before if facing else before[:3]
 
 
@@ -63,7 +63,7 @@ def _merge(
     merged_depth,
     merged_facing,
 ):
-    """Merge a part into those before it, which are the first alone where `part` has no layers."""
+    """Merge a part into those merged before it. If `part` has no layers, only the first part came before."""
     before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(facing) > 0
     for y in range(start, stop):
         for x in range(row.shape[2]):
@@ -97,7 +97,7 @@ def _merge(
 
 @compiled
 def _of_part(facing, part, count, more):
-    """The number of a part's piece among those of all parts; 0 where it would be too large."""
+    """The number of a part's piece among those of all parts; 0 if it would be too large."""
     size = abs(np.int64(facing))
     beyond = more if size >= more else 0
     number = (size - beyond) * count + part

@@ -23,13 +23,13 @@ from rts.contracts.records import ArraySpec, Cells, Decision, Fine, Question, Sa
 from rts.sampling.hidden import HiddenBySplatter, numbers_of
 
 STRIP = 16
-"""Lines of fine cells in a strip without its apron, about. Fewer make more aprons, more make more empty cells."""
+"""Approximate lines of fine cells in a strip without its apron: fewer mean more aprons, more mean more empty cells."""
 
 LINE = 256
-"""Fine cells that are sampled, in a line of their list."""
+"""Fine cells in a line of the list of those to sample."""
 
 FILLED = 1 / 3
-"""Share of a strip's cells that are needed, about, where shapes have to be known beforehand."""
+"""Approximate share of needed cells in a strip, if shapes have to be known beforehand."""
 
 
 class FineGrid(NamedTuple):
@@ -63,16 +63,16 @@ class FineGrid(NamedTuple):
 
     @property
     def gap(self) -> int:
-        """Pixels whose place the aprons of a run take, on its left and right together."""
+        """Pixels of width that the aprons of a run take, left and right together."""
         return -(-2 * self.apron // self.side)
 
     @property
     def pitch(self) -> int:
-        """Pixels whose height a line of a layout takes, with aprons."""
+        """Pixels of height that a line of a layout takes, aprons included."""
         return self.high + self.gap
 
     def room(self, capacity: int | None, layers: int) -> Room:
-        """Room for the worst case, or for so many rows."""
+        """Room for the worst case, or for `capacity` rows."""
         cells, columns = self.fine[0] * self.fine[1], self.strips * (self.size[1] + self.gap)
         if capacity is None:
             return Room(columns, cells)
@@ -133,8 +133,8 @@ class Layout(NamedTuple):
 
 
 def _lines(grid: FineGrid, columns: int) -> tuple[int, int]:
-    """Lines and columns of an about square layout with room for runs of so many columns in all."""
-    # Where a line ends, up to `gap` columns stay empty, and a run that is cut has aprons once more.
+    """Lines and columns of a roughly square layout with room for runs of `columns` columns in all."""
+    # At the end of a line up to `gap` columns stay empty, and a run that is cut needs its aprons twice.
     across = max(math.isqrt(columns * grid.pitch), 3 * grid.gap + 1)
     return -(-columns // (across - 2 * grid.gap)), across
 
@@ -148,14 +148,14 @@ def _shape(grid: FineGrid, lines: int, across: int) -> tuple[int, int]:
 def lay_out(
     active: np.ndarray, grid: FineGrid, room: Room | None = None, sizes_of: Callable[[int], int] | None = None
 ) -> Layout:
-    """The fine cells that active pixels (H, W) bool need, in strips, as far as there is room.
+    """Lay out the fine cells that active pixels (H, W) bool need in strips, as far as there is room.
 
     Args:
-        active: the pixels.
+        active: the active pixels.
         grid: the sizes.
-        room: the room; None for all that is needed.
-        sizes_of: the number of columns, or of lines of cells, to allot for the number that is needed. None where
-            shapes follow from `room`.
+        room: the room; None for as much as needed.
+        sizes_of: needed number of columns, or of lines of cells → the number to allot. None if shapes follow from
+            `room`.
     """
     from rts.sampling import strips_loops
 

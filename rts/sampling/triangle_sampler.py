@@ -31,11 +31,11 @@ from rts.scene.parts import Part
 _T = TypeVar("_T")
 
 NOTHING_ELSE = Request()
-"""Asks for all samples, and nothing besides."""
+"""A request for all samples, and nothing else."""
 
 LEAST_LAYERS = 3
-"""Least number of layers of triangles for a surface that refines its samples; otherwise one more than was asked for.
-At an outline both sides of a fold of triangles may stand where the surface is not."""
+"""The least layers of triangles for a surface that refines its samples; if more are requested, one more than these.
+At an outline both sides of a fold of triangles may lie beside the surface."""
 
 
 class TriangleSampler(Sampler):
@@ -51,7 +51,7 @@ class TriangleSampler(Sampler):
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Give every instance a keeper, whatever `__init__` a subclass has; refuse an `update` that is never called."""
+        """Give every instance a keeper, whatever `__init__` a subclass has; refuse an `update` without a `prepare`."""
         if overrides(cls, "update", TriangleSampler) and not overrides(cls, "prepare", TriangleSampler):
             raise PluginError(
                 f"{cls.__qualname__} has an update, which adapts what prepare built, and no prepare; write prepare, or "
@@ -62,7 +62,7 @@ class TriangleSampler(Sampler):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """The sampler's own settings: a copy, such as in another process, prepares anew."""
+        """The sampler's own settings: a copy, for example in another process, prepares anew."""
         return {name: value for name, value in self.__dict__.items() if name != "_keeper"}
 
     def prepare(self, proxy: Proxy) -> Any:
@@ -80,7 +80,7 @@ class TriangleSampler(Sampler):
     def arrange(self, prepared: Any) -> Any:
         """Rearrange the result of `prepare` for triangles that will stay, as `rts.prepare` promises.
 
-        This may take longer than to draw them a few times. The default changes nothing.
+        This may take longer than drawing the triangles a few times. The default changes nothing.
         """
         return prepared
 
@@ -103,7 +103,7 @@ class TriangleSampler(Sampler):
     def rasterize_cells(
         self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
-        """Fragments of some cells alone; see `rasterize`. The default draws all cells, and selects those.
+        """Fragments of some cells alone; see `rasterize`. The default draws all cells, and selects some.
 
         Args:
             prepared: see `rasterize`.
@@ -111,7 +111,7 @@ class TriangleSampler(Sampler):
             size: see `rasterize`.
             layers: see `rasterize`.
             cull: see `rasterize`.
-            cells: (L, C) int32, flat indices of cells in the grid, none of them twice, or −1 for none.
+            cells: (L, C) int32, flat indices of cells in the grid, none of them twice; −1 for an unused place.
 
         Returns:
             Fragments, (K, L, C).
@@ -132,15 +132,15 @@ class TriangleSampler(Sampler):
     ) -> tuple[Fragments, np.ndarray, Fragments]:
         """`rasterize` with cull="back", and the triangles seen from behind in some cells.
 
-        The default calls `rasterize` and `rasterize_cells`, which look at all triangles anew.
+        The default calls `rasterize` and `rasterize_cells`, each of which goes through all triangles.
 
         Args:
             prepared: see `rasterize`.
             camera: see `rasterize`.
             size: see `rasterize`.
             layers: see `rasterize`.
-            beside: gives the cells (1, M) int32, flat indices in the grid, of the fragments (K, H, W), which are not to
-                be changed from then on.
+            beside: fragments (K, H, W) → the cells (1, M) int32, flat indices in the grid. The fragments must not
+                change afterwards.
 
         Returns:
             Fragments (K, H, W), the cells, and the fragments (1, 1, M) of cull="front" in these.
@@ -173,12 +173,12 @@ class TriangleSampler(Sampler):
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
         """An entry of a copy of the surface's proxy, checked, and of the result of `prepare` for it."""
         proxy = checked_proxy(surface, inputs, camera, size)
-        # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
+        # A copy, since the given arrays may change in place, or be valid only during this call.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
         return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None, largest(proxy.vertices))
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
-        """The entry that `_built` makes, kept from call to call where that pays."""
+        """The entry by `_built`, kept from call to call if that saves time."""
         if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
@@ -202,8 +202,8 @@ class TriangleSampler(Sampler):
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
-        Surfaces that move samples off their triangles tell no sides. Those with a `refine` tell no exits, nor do those
-        that are not `centered`, nor lists of cells.
+        Sides are not recorded for surfaces that move samples off their triangles. Exits are not recorded for surfaces
+        with a `refine`, for surfaces that are not `centered`, nor for lists of cells.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -251,7 +251,7 @@ class TriangleSampler(Sampler):
             camera: the camera.
             view: (height, width) of the grid of cells.
             entry: the prepared entry, if known.
-            work: may be called by several threads at once where several may draw.
+            work: a function of the entry. Several threads may call it at once if `draws_at_once`.
         """
         with self._keeper.lock:
             known = entry or self._entry(surface, inputs, camera, view)
@@ -281,7 +281,7 @@ class _Search:
         inputs: of the surface's proxy.
         camera: host matrices.
         shape: bounds on the number of samples.
-        tables: what the surface's `table_specs` allots.
+        tables: the result of the surface's `table_specs`.
         hidden: the rule for hidden samples; None to keep all.
         entry: the surface's prepared entry, if known.
         cells: (L, C), the cells to sample; None for all.
@@ -299,13 +299,13 @@ class _Search:
     cells: np.ndarray | None
 
     def in_place(self, sides: bool, exits: bool) -> Samples:
-        """The samples where the triangles are, or where a surface that moves none refines them."""
+        """Samples on the triangles, or refined by a surface that does not move them."""
         known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
-        # Refined samples all stay, none is left out amid one colour.
+        # All refined samples stay, also those amid one colour.
         kept, facing = decision.needed if self.surface.refines else decision.kept, None
         if sides:
-            # Nobody looks at them where no sample is hidden, and to find them takes long.
+            # Without hidden samples nothing reads the sides, and finding them takes long.
             pieces = checked_pieces(self.surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
             facing = facing_of(fragments, kept, known.proxy, pieces, self.camera, listed=self.cells is not None)
         if not self.surface.refines:
@@ -316,9 +316,9 @@ class _Search:
         return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
 
     def moved(self) -> Samples:
-        """The samples where a surface moves them, off its triangles."""
+        """Samples that the surface moves off its triangles."""
         layers = self.shape.layers
-        # Of tables there is but one set, so that no samples can be added later.
+        # There is only one set of tables, so that no samples can be added later.
         known, fragments, covered, *_ = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
         samples = on_surface(
             self.surface,
@@ -332,7 +332,7 @@ class _Search:
             self.cells,
         )
         covers = kept = samples.row >= 0
-        if self.hidden is not None:  # It is asked only now, since it goes by the final depths.
+        if self.hidden is not None:  # The rule comes last, since it goes by the final depths.
             kept = self.hidden.decide(Question(covers, samples.depth)).needed
         ran_out = np.count_nonzero(covered[-1] & ~covers[-1])
         return repack(samples, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
@@ -340,7 +340,7 @@ class _Search:
     def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
         """The prepared entry, the fragments (K, ·, ·), and their covered cells.
 
-        With `exits` also the decision for them, and where rays leave the part; else None for both.
+        With `exits` also the decision on the fragments, and the exits of rays from the part; otherwise None for both.
         """
         sampler, (camera, view) = self.sampler, (self.camera, self.shape.view)
         grid = layers, *self.shape.size
@@ -374,16 +374,16 @@ class _Search:
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
 
     def _decided(self, covered: np.ndarray, fragments: Fragments, known: Entry) -> Decision:
-        """The decision which fragments become samples; their depths are final."""
+        """The decision on which fragments become samples; their depths must be final."""
         if self.hidden is None:
             return Decision(covered, None, covered)
         return self.hidden.decide(Question(covered, fragments.depth, self._size(known)))
 
     def _size(self, known: Entry) -> float:
-        """The size of the largest coordinate of the triangles; 0 where the rule knows it already."""
+        """The absolute value of the triangles' largest coordinate; 0 if the rule knows it already."""
         if known.size is not None or self.hidden is None:
             return known.size or 0.0
-        # The rule has the size of vertices that are themselves a part of θ.
+        # The rule knows the size of vertices that are themselves in θ.
         read = self.hidden.size > 0 and any(np.may_share_memory(x, known.proxy.vertices) for x in leaves(self.inputs))
         return 0.0 if read else largest(known.proxy.vertices)
 

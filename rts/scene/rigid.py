@@ -49,7 +49,7 @@ def _specification(pose: Array, center: Array) -> Array:
     xp = namespace(pose, center)
     x, y, z = pose[0], pose[1], pose[2]
     square = x * x + y * y + z * z
-    # Below a tenth of a radian the series are right to 3e-14; the square root is kept away from zero, where its
+    # Below a tenth of a radian the series are accurate to 3e-14. The square root stays away from zero, where its
     # derivative is infinite.
     small = square < 1e-2
     angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))
@@ -91,8 +91,8 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    found = g.reshape(-1) @ _computed(operands)[1]
-    for result, part in zip(results, (found[:6], found[6:]), strict=True):
+    gradient = g.reshape(-1) @ _computed(operands)[1]
+    for result, part in zip(results, (gradient[:6], gradient[6:]), strict=True):
         if result is not None:
             result[...] = part
 

@@ -7,9 +7,9 @@
         def part(self):
             return Heightfield.example()
 
-Each class says which fixtures to override. Checks that need torch or jax are skipped, with the reason, where it is not
-installed. Nothing is collected unless it is subclassed. Classes are imported when they are asked for: `import rts` and
-the command line do without pytest.
+The docstring of each class names the fixtures to override. Checks that need torch or jax are skipped, with the reason,
+if that is not installed. pytest collects subclasses alone. Classes are imported on first use: `import rts` and the
+command line do without pytest.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a claim of the kit fails, and with what words."""
+"""Claims of the kit: assertions that fail with a message."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rts.errors import RtsError
 
 
 def claim(holds: Any, message: str) -> None:
-    """Fail with a message unless something holds; plain asserts of installed packages say nothing of their values."""
+    """Fail with a message unless a condition holds; pytest shows no values for plain asserts in installed packages."""
     if not holds:
         raise AssertionError(message)
 
 
-def claim_close(found: Any, expected: Any, tolerance: float, what: str) -> None:
+def claim_close(actual: Any, expected: Any, tolerance: float, what: str) -> None:
     """Fail unless two arrays of one shape differ by at most a tolerance, absolutely."""
-    found, expected = np.asarray(found), np.asarray(expected)
-    claim(found.shape == expected.shape, f"{what} has shape {found.shape}; expected {expected.shape}")
-    worst = np.abs(found - expected).max(initial=0)
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    claim(actual.shape == expected.shape, f"{what} has shape {actual.shape}; expected {expected.shape}")
+    worst = np.abs(actual - expected).max(initial=0)
     claim(worst <= tolerance, f"{what} is off by {worst:.3g}; expected at most {tolerance:.3g}")
 
 
@@ -34,7 +34,7 @@ def claim_finite(tree: Any, what: str) -> None:
 
 @contextlib.contextmanager
 def no_error(what: str) -> Iterator[None]:
-    """Turn an error into a failed claim that says what was being done."""
+    """Turn an error into a failed claim whose message says what was tried."""
     try:
         yield
     except AssertionError:
@@ -44,10 +44,10 @@ def no_error(what: str) -> Iterator[None]:
 
 
 def refusal(call: Callable[[], Any], what: str) -> str | None:
-    """The message with which a call refuses its input, or None where it accepts it.
+    """The message with which a call refuses its input; None if it accepts it.
 
     Raises:
-        AssertionError: the error is none of `rts.RtsError`, or its message is not one line.
+        AssertionError: the error is not an `rts.RtsError`, or its message is not one line.
     """
     try:
         call()

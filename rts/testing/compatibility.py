@@ -1,4 +1,4 @@
-"""Which surface goes with which sampler and engine: each tried on the example that the surface gives of itself."""
+"""Compatibility of surfaces with samplers and engines, tried on the example of each surface."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from rts.scene.parts import Part
 
 SIZE = (14, 18)
 CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], principal_point=(0.1, -0.05))
-"""Sees an example, which lies about the origin and within two units of it; nothing is symmetric."""
+"""A view of an example, which lies about the origin, within two units of it. The view has no symmetry."""
 
 LAYERS = 2
 APRON = RenderSettings(None, 1, 1, None).apron
 CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
-"""A row for every cell, so that engines that compile meet the same shapes again."""
+"""A row for every cell: the same shapes each time, so that engines compile once."""
 
 DIFFERING, SHARE = 1e-3, 0.02
-"""How far an image may be from the reference's, and in which share of the pixels farther."""
+"""The largest difference of a pixel from the reference's, and the share of pixels that may differ by more."""
 
 WIDTH = 120
-"""How many characters tell an error that is not the library's."""
+"""Characters shown of an error that is not the library's."""
 
 
 class Pair(NamedTuple):
@@ -43,8 +43,8 @@ class Pair(NamedTuple):
 
     Attributes:
         surface: the surface.
-        sampler: the sampler; "" where the surface cannot be tried.
-        problems: for each engine why it does not work, or None.
+        sampler: the sampler; "" if the surface cannot be tried.
+        problems: for each engine the problem, or None.
     """
 
     surface: str
@@ -53,17 +53,17 @@ class Pair(NamedTuple):
 
 
 def example(surface: str) -> Part | None:
-    """The example of a registered surface, or None where it gives none."""
-    found = registry.plugin("rts.surfaces", surface)
-    return found.example() if hasattr(found, "example") else None
+    """The example of a registered surface; None if it has none."""
+    kind = registry.plugin("rts.surfaces", surface)
+    return kind.example() if hasattr(kind, "example") else None
 
 
 def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
-    """The image of an example, after its gradient in θ has been taken where the engine has derivatives.
+    """The image of an example; with an engine that differentiates, its gradient in θ is tried first.
 
     Raises:
-        RtsError: the image shows nothing, is not that of the sampler `reference` (of triangles), or a value or
-            derivative is not finite; or whatever rendering raises.
+        RtsError: the image is empty; it is not that of the sampler `reference`, if of triangles; or a value or
+            derivative is not finite. Errors of rendering pass through.
     """
     chosen = engine_named(engine)
     theta = constants(map_leaves(single, part.theta), chosen, None)
@@ -72,29 +72,29 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
         seen = part.replace(theta=theta)
         return render(seen, CAMERA, SIZE, sampler=sampler, splatter="single", layers=LAYERS, capacity=CAPACITY)
 
-    found = np.asarray(chosen.to_numpy(image(theta)))
-    if not (np.isfinite(found).all() and found.any()):
+    shown = np.asarray(chosen.to_numpy(image(theta)))
+    if not (np.isfinite(shown).all() and shown.any()):
         raise RtsError("the image is empty or not finite; an example lies about the origin, within two units of it")
     if _is_of_triangles(part, sampler):
-        _check_image(found, part)
+        _check_image(shown, part)
     if chosen.differentiates and not is_constant(theta):
         _check_gradient(chosen, image, theta)
-    return found
+    return shown
 
 
 def _is_of_triangles(part: Part, sampler: Any) -> bool:
-    """Whether a sampler can only show the part's triangles, not what it intersects."""
+    """True if a sampler can show only the part's triangles, not its intersections with rays."""
     surface = check_scene(part, CAMERA)[0][0].surface
     if not isinstance(surface, RaySurface):
         return isinstance(surface, TriangleSurface)
     return isinstance(check_sampler(sampler), TriangleSampler)
 
 
-def _check_image(found: np.ndarray, part: Part) -> None:
+def _check_image(actual: np.ndarray, part: Part) -> None:
     """Refuse an image that is not the one of the sampler `reference`, in NumPy."""
     part = part.replace(theta=map_leaves(single, part.theta))
     expected = render(part, CAMERA, SIZE, sampler="reference", splatter="single", layers=LAYERS, capacity=CAPACITY)
-    differing = (np.abs(found - expected) > DIFFERING).any(axis=-1)
+    differing = (np.abs(actual - expected) > DIFFERING).any(axis=-1)
     if differing.mean() > SHARE:
         raise RtsError(
             f"{differing.sum()} of the {differing.size} pixels are not those of the sampler 'reference', by more than "
@@ -126,13 +126,13 @@ def single(x: Any) -> np.ndarray:
 
 
 def pairs(only: Sequence[str] = ()) -> Iterator[Pair]:
-    """Every registered surface with every sampler, tried in every engine, one after the other.
+    """Try every registered surface with every sampler, in every engine.
 
     Args:
-        only: names of surfaces, samplers and engines; of a kind that none is named of all are tried.
+        only: names of surfaces, samplers and engines to try; all of a kind if none of it is named.
 
     Raises:
-        InputError: nothing is registered by such a name.
+        InputError: a name is not registered.
     """
     kinds = {kind: registry.plugins(f"rts.{kind}") for kind in ("surfaces", "samplers", "engines")}
     known = {name for names in kinds.values() for name in names}
@@ -152,15 +152,15 @@ def _tried(surfaces: Sequence[str], samplers: Sequence[str], engines: Sequence[s
             yield Pair(surface, "", dict.fromkeys(engines, problem))
             continue
         for sampler in samplers:
-            found = {engine: _problem(part, sampler, engine) for engine in engines}
+            problems = {engine: _problem(part, sampler, engine) for engine in engines}
             own = repr(part.surface)  # The row names it already.
-            yield Pair(surface, sampler, {e: p and p.replace(own, surface) for e, p in found.items()})
+            yield Pair(surface, sampler, {e: p and p.replace(own, surface) for e, p in problems.items()})
 
 
 def _problem(part: Part, sampler: str, engine: str) -> str | None:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", EmptyImageWarning)  # It is what is asked.
+            warnings.simplefilter("ignore", EmptyImageWarning)  # Empty images are reported below.
             attempt(part, sampler, engine)
     except Exception as error:  # Other people's plugins may raise anything.
         return _reason(error)
@@ -168,7 +168,7 @@ def _problem(part: Part, sampler: str, engine: str) -> str | None:
 
 
 def _reason(error: Exception) -> str:
-    """The error in a line; of one that is not the library's, as much as tells what it is."""
+    """The error in one line; one that is not the library's is cut short."""
     text = re.sub(r"<([\w.]+)[^<>]* at 0x[0-9a-fA-F]+>", r"\1", " ".join(str(error).split()))
     if isinstance(error, RtsError):
         return text

@@ -1,4 +1,4 @@
-"""The base of the kit's classes: what pytest collects of them."""
+"""The base of the kit's classes, which decides what pytest collects."""
 
 from __future__ import annotations
 

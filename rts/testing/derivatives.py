@@ -1,4 +1,4 @@
-"""Derivatives by every engine that is installed, on the host."""
+"""Derivatives by every installed engine, on the host."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DIFFERENTIABLE = sorted((name for name in ENGINES if name != "numpy"), key=lambd
 
 
 def engine_or_skip(name: str) -> Engine:
-    """The engine, or a skip with the reason where it is not installed."""
+    """The engine; skip the test, with the reason, if it is not installed."""
     try:
         engine = engine_named(name)
         importlib.import_module(name)
@@ -32,7 +32,7 @@ def engine_or_skip(name: str) -> Engine:
 
 
 def differentiating(name: str) -> Engine:
-    """The engine, or a skip with the reason where it is not installed, or does not differentiate."""
+    """The engine; skip the test, with the reason, if it is not installed or does not differentiate."""
     engine = engine_or_skip(name)
     if not engine.differentiates:
         pytest.skip(f"the engine {name} does not differentiate")
@@ -40,7 +40,7 @@ def differentiating(name: str) -> Engine:
 
 
 def installed() -> list[Engine]:
-    """The engines with derivatives; skips where there is none."""
+    """The installed engines with derivatives; skip the test if there is none."""
     engines = []
     for name in DIFFERENTIABLE:
         try:
@@ -65,13 +65,13 @@ def host(engine: Engine, tree: Tree) -> Tree:
 
 
 def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]]:
-    """The floating leaves of a tree of NumPy arrays, and the tree with others in their place."""
-    found: list[np.ndarray] = []
+    """The floating leaves of a tree of NumPy arrays, and a function that puts other leaves in their place."""
+    floating: list[np.ndarray] = []
 
     def collect(x: Any) -> Any:
         x = np.asarray(x)
         if np.issubdtype(x.dtype, np.floating):
-            found.append(x)
+            floating.append(x)
         return x
 
     tree = map_leaves(collect, tree)
@@ -80,32 +80,32 @@ def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]
         it = iter(values)
         return map_leaves(lambda x: next(it) if np.issubdtype(x.dtype, np.floating) else x, tree)
 
-    return found, join
+    return floating, join
 
 
 def names(tree: Tree) -> list[str]:
-    """Names of the leaves that `split` finds, which say where they are."""
+    """Names of the leaves that `split` returns, by their place in the tree."""
     return [f"theta[{key!r}]" for key in sorted(tree) for _ in split(tree[key])[0]]
 
 
 def joined(engine: Engine, join: Callable, values: Sequence[Any]) -> Tree:
-    """The tree of `split` with these values, everything else as constants of the engine."""
+    """The tree of `split` with new values for its leaves; all other arrays become constants of the engine."""
     return constants(join(values), engine, None)
 
 
 def directions(values: Sequence[np.ndarray], seed: int = 1) -> list[np.ndarray]:
-    """A random direction in the space of some arrays."""
+    """A random direction: an array of each value's shape."""
     rng = np.random.default_rng(seed)
     return [rng.standard_normal(v.shape) for v in values]
 
 
 def claim_slope(gradient: np.ndarray, along: np.ndarray, slope: float, what: str) -> None:
-    """Fail unless a float32 gradient explains a difference, which was found along a direction in float64."""
-    found = float(np.sum(gradient * along))
+    """Fail unless a float32 gradient agrees with a slope, a difference along a direction in float64."""
+    product = float(np.sum(gradient * along))
     scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-3)
     claim(
-        abs(found - slope) <= 2e-3 * scale,
-        f"{what} is {found:.6g}, but {slope:.6g} by finite differences; is something detached, or taken elsewhere?",
+        abs(product - slope) <= 2e-3 * scale,
+        f"{what} is {product:.6g}, but {slope:.6g} by finite differences; is something detached, or taken elsewhere?",
     )
 
 
@@ -127,7 +127,7 @@ def derivatives(engine: Engine, f: Callable, at: list, along: list, weights: np.
 
 
 def compiled(engine: Engine, f: Callable, at: Sequence, along: Sequence, weights: np.ndarray) -> Derivatives:
-    """The same, compiled as a whole where the engine compiles."""
+    """`derivatives`, compiled as a whole if the engine compiles."""
     at, along, weights = on(engine, list(at)), on(engine, list(along)), on(engine, weights)
     xp = engine.namespace
 
@@ -138,12 +138,12 @@ def compiled(engine: Engine, f: Callable, at: Sequence, along: Sequence, weights
     return Derivatives(*host(engine, (value, gradient, slope)))
 
 
-def claim_consistent(found: Derivatives, along: list, weights: np.ndarray, what: str) -> None:
+def claim_consistent(result: Derivatives, along: list, weights: np.ndarray, what: str) -> None:
     """Fail unless forward and reverse mode agree: ⟨w, J d⟩ = ⟨Jᵀ w, d⟩."""
-    claim_finite(found, f"{what} or its derivative")
-    forward = float(np.sum(weights * found.along))
-    reverse = float(sum(np.sum(g * d) for g, d in zip(found.gradient, along, strict=True)))
-    scale = max(np.linalg.norm(found.along) * np.linalg.norm(weights), 1e-6)
+    claim_finite(result, f"{what} or its derivative")
+    forward = float(np.sum(weights * result.along))
+    reverse = float(sum(np.sum(g * d) for g, d in zip(result.gradient, along, strict=True)))
+    scale = max(np.linalg.norm(result.along) * np.linalg.norm(weights), 1e-6)
     claim(
         abs(forward - reverse) <= 1e-4 * scale,
         f"forward mode gives {forward:.6g} for the derivative of {what}, reverse mode {reverse:.6g}",
@@ -157,17 +157,17 @@ def claim_engines_agree(f: Callable, at: list, value: np.ndarray, what: str) -> 
         f: from a list of arrays to an array, in any engine.
         at: NumPy arrays.
         value: the value of `f`, by NumPy.
-        what: what is computed, in words.
+        what: name of the result, in words.
     """
     weights = np.random.default_rng(0).standard_normal(value.shape)
     along, first = directions(at), None
     for engine in installed():
         with no_error(f"{what} in {engine.name}"):
-            found = derivatives(engine, f, at, along, weights)
-        claim_close(found.value, value, 1e-5, f"{what} in {engine.name}, against NumPy,")
-        claim_consistent(found, along, weights, f"{what} in {engine.name}")
-        first = first or found
-        pairs = zip([found.along, *found.gradient], [first.along, *first.gradient], strict=True)
+            result = derivatives(engine, f, at, along, weights)
+        claim_close(result.value, value, 1e-5, f"{what} in {engine.name}, against NumPy,")
+        claim_consistent(result, along, weights, f"{what} in {engine.name}")
+        first = first or result
+        pairs = zip([result.along, *result.gradient], [first.along, *first.gradient], strict=True)
         for here, there in pairs:
             scale = 1e-4 * max(np.linalg.norm(there), 1e-3)
             claim(

@@ -1,4 +1,4 @@
-"""What engines are tried on: the library's operations with operands, and functions of the array API."""
+"""Examples to try engines on: the library's operations with operands, and functions of the array API."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ N = 6
 
 
 def numbers(*shape: int, seed: int = 0) -> np.ndarray:
-    """Random float32 from −1 to 1."""
+    """Random float32 numbers from −1 to 1."""
     return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
 
 
@@ -35,7 +35,7 @@ OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
     "combine": (lambda rows, w: combine(rows, _ids(rows), w), [numbers(4, 3), numbers(N, 3, seed=1)]),
     "rigid": (rigid, [numbers(6), numbers(3, seed=1)]),
 }
-"""The library's own operations, and operands."""
+"""The library's own operations, with operands."""
 
 NAMESPACE: dict[str, Callable] = {
     "arithmetic": lambda xp, x: (x * x + 2 - x / 3) ** 2,
@@ -51,7 +51,7 @@ NAMESPACE: dict[str, Callable] = {
     "argsort": lambda xp, x: xp.take_along_axis(x, xp.argsort(x, axis=0, stable=True), axis=0),
     "any and all": lambda xp, x: xp.astype(xp.any(x > 0, axis=0) & ~xp.all(x > 0, axis=0), x.dtype),
 }
-"""What the core and plugins use of the array API, each as a function of x (6, 4)."""
+"""Functions of the array API that the core and plugins use, each as a function of x (6, 4)."""
 
 
 def _ids(like: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What every engine must do."""
+"""Checks that every engine must pass."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ TOLERANCE = 1e-5
 class EngineConformance(Conformance):
     """Checks of an engine.
 
-    Override the fixture `engine`: the name of a registered one, or an object. Checks of derivatives are skipped where
-    it says that it does not differentiate.
+    Override the fixture `engine`: the name of a registered one, or an object. Checks of derivatives are skipped if the
+    engine does not differentiate.
     """
 
     @pytest.fixture
@@ -38,7 +38,7 @@ class EngineConformance(Conformance):
     # ------------------------------------------------------------------------------------------- arrays
 
     def test_it_owns_its_arrays_alone(self, engine: Any) -> None:
-        """`owns` holds for what `constant` gives, and not for lists, numbers or other frameworks' arrays."""
+        """`owns` holds for results of `constant`, but not for lists, numbers or other frameworks' arrays."""
         chosen = _instance(engine)
         claim(chosen.owns(chosen.constant(np.ones(3))), "it does not own the array that `constant` gives")
         strangers = [1.0, [1.0], None, *([] if chosen.name == "numpy" else [np.ones(3)])]
@@ -46,12 +46,12 @@ class EngineConformance(Conformance):
             claim(not chosen.owns(x), f"it owns a {type(x).__name__}")
 
     def test_constants_keep_their_values(self, engine: Any) -> None:
-        """`constant` gives floats in the dtype of `like`; integers and booleans stay what they are."""
+        """`constant` gives floats in the dtype of `like`; integers and booleans keep theirs."""
         chosen = _instance(engine)
         single = chosen.constant(np.ones(2, np.float32))
         for value in (np.array([1.5, -2.0]), np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), 0.5):
-            found = chosen.constant(value, single)
-            host = chosen.to_numpy(found)
+            result = chosen.constant(value, single)
+            host = chosen.to_numpy(result)
             claim(np.array_equal(host, value), f"the constant of {value!r} is {host!r}")
             kind = np.asarray(value).dtype.kind
             claim(host.dtype.kind == kind, f"the constant of {value!r} has dtype {host.dtype}")
@@ -61,13 +61,13 @@ class EngineConformance(Conformance):
 
     @pytest.mark.parametrize("name", NAMESPACE)
     def test_its_namespace_is_that_of_the_array_api(self, engine: Any, name: str) -> None:
-        """Functions of `namespace` give NumPy's results."""
+        """Functions of `namespace` return NumPy's results."""
         chosen, x, f = _instance(engine), numbers(N, 4, seed=4), NAMESPACE[name]
         from array_api_compat import numpy as xp
 
         with owning(chosen), no_error(f"{name} in the namespace of {chosen.name}"):
-            found = chosen.to_numpy(f(chosen.namespace, chosen.constant(x)))
-        claim_close(found, f(xp, x), TOLERANCE, name)
+            result = chosen.to_numpy(f(chosen.namespace, chosen.constant(x)))
+        claim_close(result, f(xp, x), TOLERANCE, name)
 
     # ------------------------------------------------------------------------------------------ the host
 
@@ -90,7 +90,7 @@ class EngineConformance(Conformance):
             claim((packed[2:] == 0).all(), f"a packed result{how} is not padded with zeros")
 
     def test_host_functions_have_no_derivative(self, engine: Any) -> None:
-        """Derivatives go around what `call_host` gives: it is a constant, in both modes."""
+        """The result of `call_host` is a constant for derivatives, in both modes."""
         chosen = _differentiating(engine)
         xp, spec = chosen.namespace, ArraySpec((N, 3), np.float32)
 
@@ -105,22 +105,22 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(along), 2 * numbers(N, 3).sum(), 1e-4, "its derivative in forward mode")
 
     def test_what_is_decided_by_the_device_is_the_same(self, engine: Any) -> None:
-        """`by_host` gives one of its functions' results, compiled or not."""
+        """`by_host` returns the result of one of its functions, compiled or not."""
         chosen = _instance(engine)
         for how, call in _both_ways(chosen, lambda x: chosen.by_host(lambda v: (v * 2,), lambda v: (v + v,), x)[0]):
             with owning(chosen), no_error(f"by_host{how}"):
-                found = chosen.to_numpy(call(chosen.constant(numbers(N))))
-            claim_close(found, 2 * numbers(N), 0, f"the result of by_host{how}")
+                result = chosen.to_numpy(call(chosen.constant(numbers(N))))
+            claim_close(result, 2 * numbers(N), 0, f"the result of by_host{how}")
 
     # ------------------------------------------------------------------------------------------- sums, loops
 
     def test_segments_are_summed(self, engine: Any) -> None:
-        """`segment_sum` gives the sums, zero for an empty segment, and has their derivatives."""
+        """`segment_sum` returns the sums, zero for an empty segment, and has their derivatives."""
         chosen, values, segments = _instance(engine), numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
         expected = np.zeros((5, 3), np.float32)
         np.add.at(expected, segments, values)
-        found = chosen.to_numpy(chosen.segment_sum(chosen.constant(values), segments, 5))
-        claim_close(found, expected, TOLERANCE, "segment_sum")
+        sums = chosen.to_numpy(chosen.segment_sum(chosen.constant(values), segments, 5))
+        claim_close(sums, expected, TOLERANCE, "segment_sum")
         if chosen.differentiates:
             weights = chosen.constant(numbers(5, 3, seed=2))
             f = lambda v: chosen.namespace.sum(chosen.segment_sum(v, segments, 5) * weights)  # noqa: E731
@@ -128,7 +128,7 @@ class EngineConformance(Conformance):
             claim_close(gradient, numbers(5, 3, seed=2)[segments], TOLERANCE, "the gradient of segment_sum")
 
     def test_loops_end_early(self, engine: Any) -> None:
-        """`repeat` stops as soon as nothing goes on, or after the most times, compiled or not."""
+        """`repeat` stops when its condition fails, or after the most times, compiled or not."""
         chosen = _instance(engine)
         xp = chosen.namespace
 
@@ -144,11 +144,11 @@ class EngineConformance(Conformance):
         for most, expected in ((50, [1.0, 0.125, 3]), (2, [2.0, 0.25, 2])):
             for how, call in _both_ways(chosen, halved(most)):
                 with owning(chosen), no_error(f"repeat{how}"):
-                    found = chosen.to_numpy(call(chosen.constant(np.array([8.0, 1.0], np.float32))))
-                claim_close(found, np.array(expected), 0, f"what repeat of at most {most} times{how} gives")
+                    result = chosen.to_numpy(call(chosen.constant(np.array([8.0, 1.0], np.float32))))
+                claim_close(result, np.array(expected), 0, f"what repeat of at most {most} times{how} gives")
 
     def test_loops_have_no_derivative(self, engine: Any) -> None:
-        """What `repeat` makes of a state is a constant, in both modes, compiled or not."""
+        """The result of `repeat` is a constant for derivatives, in both modes, compiled or not."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, chosen.constant(np.array([8.0, 1.0], np.float32))
 
@@ -158,21 +158,21 @@ class EngineConformance(Conformance):
 
         for how, gradient in _both_ways(chosen, lambda v: chosen.value_and_grad(f)(v)[1]):
             with owning(chosen), no_error(f"the gradient of what repeat gives{how}"):
-                found = chosen.to_numpy(gradient(x))
-            claim_close(found, np.array([1.0, 0.125]), 0, f"the gradient of repeat(x) x{how}")
+                slopes = chosen.to_numpy(gradient(x))
+            claim_close(slopes, np.array([1.0, 0.125]), 0, f"the gradient of repeat(x) x{how}")
 
     def test_unused_rows_are_filled(self, engine: Any) -> None:
-        """`fill_unused` puts the first row where no cell of `row` names one, and leaves the others."""
+        """`fill_unused` replaces rows that no cell of `row` refers to by the first row, and leaves the others."""
         chosen, x = _instance(engine), numbers(N, 3)
         row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
         with owning(chosen):
             if not chosen.padded(chosen.constant(row)):
                 pytest.skip("outside of transforms it allots no more rows than are used")
-            found = chosen.to_numpy(chosen.fill_unused(chosen.constant(x), chosen.constant(row)))
-        claim_close(found, np.concatenate([x[:3], x[[0, 0, 0]]]), 0, "fill_unused")
+            filled = chosen.to_numpy(chosen.fill_unused(chosen.constant(x), chosen.constant(row)))
+        claim_close(filled, np.concatenate([x[:3], x[[0, 0, 0]]]), 0, "fill_unused")
 
     def test_functions_of_rows_in_use_are_those_of_all_rows(self, engine: Any) -> None:
-        """`by_rows_in_use` gives what the function gives of the rows that some cell names, compiled or not."""
+        """`by_rows_in_use` returns the function's result for rows that a cell refers to, compiled or not."""
         chosen, x = _instance(engine), numbers(N, 3)
         row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
 
@@ -184,11 +184,11 @@ class EngineConformance(Conformance):
 
         for how, function in _both_ways(chosen, call):
             with owning(chosen), no_error(f"by_rows_in_use{how}"):
-                found = chosen.to_numpy(function(chosen.constant(x), chosen.constant(row)))
-            claim_close(found[:3], 2 * x[:3], 0, f"what by_rows_in_use gives{how}")
+                result = chosen.to_numpy(function(chosen.constant(x), chosen.constant(row)))
+            claim_close(result[:3], 2 * x[:3], 0, f"what by_rows_in_use gives{how}")
 
     def test_compiled_functions_are_the_same(self, engine: Any) -> None:
-        """`jit` of a function of a record gives what the function gives; `block` gives back what it is given."""
+        """`jit` of a function of a record returns the function's result; `block` returns its argument."""
         chosen = _instance(engine)
         xp = chosen.namespace
 
@@ -198,8 +198,8 @@ class EngineConformance(Conformance):
         samples = Samples(IDS, numbers(N, 2), Cells(np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1)), np.int32(0))
         with owning(chosen), no_error("a compiled function of Samples"):
             given = map_leaves(chosen.constant, samples)
-            found = chosen.block(chosen.jit(f)(given))
-        claim_close(chosen.to_numpy(found), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")
+            result = chosen.block(chosen.jit(f)(given))
+        claim_close(chosen.to_numpy(result), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")
 
     # -------------------------------------------------------------------------------------- derivatives
 
@@ -224,7 +224,7 @@ class EngineConformance(Conformance):
             claim(False, f"{name} raises nothing, though the engine says that it does not differentiate")
 
     def test_gradients_are_those_of_closed_forms(self, engine: Any) -> None:
-        """`value_and_grad` takes nested parameters, and gives zeros for those that are not used."""
+        """`value_and_grad` takes nested parameters, and returns zeros for unused ones."""
         chosen = _differentiating(engine)
         xp = chosen.namespace
         tree = {"a": numbers(3), "b": [numbers(2, seed=1), numbers(4, seed=2)]}
@@ -232,14 +232,14 @@ class EngineConformance(Conformance):
             value, gradient = chosen.value_and_grad(lambda t: xp.sum(t["a"] ** 2) + 3 * xp.sum(t["b"][0]))(
                 map_leaves(chosen.constant, tree)
             )
-            found = derivatives.host(chosen, gradient)
+            gradients = derivatives.host(chosen, gradient)
         claim_close(chosen.to_numpy(value), (tree["a"] ** 2).sum() + 3 * tree["b"][0].sum(), TOLERANCE, "the value")
-        claim_close(found["a"], 2 * tree["a"], TOLERANCE, "the gradient of a square")
-        claim_close(found["b"][0], np.full(2, 3.0), TOLERANCE, "the gradient of a multiple")
-        claim_close(found["b"][1], np.zeros(4), 0, "the gradient in what is not used")
+        claim_close(gradients["a"], 2 * tree["a"], TOLERANCE, "the gradient of a square")
+        claim_close(gradients["b"][0], np.full(2, 3.0), TOLERANCE, "the gradient of a multiple")
+        claim_close(gradients["b"][1], np.zeros(4), 0, "the gradient in what is not used")
 
     def test_forward_mode_can_be_differentiated(self, engine: Any) -> None:
-        """`jvp` is right for x³ along d, and has a gradient in a factor that the function closes over."""
+        """`jvp` is right for x³ along d, and has a gradient in a captured factor."""
         chosen = _differentiating(engine)
         xp, x, d = chosen.namespace, numbers(4), numbers(4, seed=1)
         at, along = chosen.constant(x), chosen.constant(d)
@@ -253,7 +253,7 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
 
     def test_rows_have_gradients(self, engine: Any) -> None:
-        """`gradient_of_rows` is right for k |x|², and has a gradient in k, which the function closes over."""
+        """`gradient_of_rows` is right for k |x|², and has a gradient in the captured factor k."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, numbers(N, 3)
         at = chosen.constant(x)
@@ -262,9 +262,9 @@ class EngineConformance(Conformance):
             return chosen.gradient_of_rows(lambda rows: k * xp.sum(rows**2, axis=1), at)
 
         with owning(chosen), no_error("the gradient of rows"):
-            found = chosen.to_numpy(slopes(chosen.constant(np.float32(2))))
+            gradient = chosen.to_numpy(slopes(chosen.constant(np.float32(2))))
             second = chosen.value_and_grad(lambda k: xp.sum(slopes(k)))(chosen.constant(np.float32(2)))[1]
-        claim_close(found, 4 * x, TOLERANCE, "the gradient of 2 |x|²")
+        claim_close(gradient, 4 * x, TOLERANCE, "the gradient of 2 |x|²")
         claim_close(chosen.to_numpy(second), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows")
 
     def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
@@ -279,7 +279,7 @@ class EngineConformance(Conformance):
         claim_close(rows[1], np.ones(3), TOLERANCE, "the Jacobian of a sum")
 
     def test_stop_gradient_stops_it(self, engine: Any) -> None:
-        """`stop_gradient` leaves the value, and no derivative in either mode."""
+        """`stop_gradient` keeps the value, without a derivative in either mode."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, chosen.constant(numbers(4))
         f = lambda v: xp.sum(chosen.stop_gradient(v) * v)  # noqa: E731
@@ -303,7 +303,7 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(gradient), 2 * expected * numbers(4), TOLERANCE, "the gradient of a checkpoint")
 
     def test_optimizers_step(self, engine: Any) -> None:
-        """`optimizer` steps by rate times gradient (SGD), first by the rate (Adam), and changes no array in place."""
+        """`optimizer` steps by rate × gradient (SGD), or first by the rate (Adam), and changes no array in place."""
         chosen = _differentiating(engine)
         given = {"x": numbers(3), "y": [numbers(2, seed=1)]}
         slopes = map_leaves(lambda v: np.sign(v) * 2, given)
@@ -311,8 +311,8 @@ class EngineConformance(Conformance):
             for name, expected in (("sgd", lambda v: v - 0.2 * np.sign(v)), ("adam", lambda v: v - 0.1 * np.sign(v))):
                 parameters = map_leaves(chosen.constant, given)
                 step = chosen.optimizer(name, 0.1, parameters)
-                found = derivatives.host(chosen, step(parameters, map_leaves(chosen.constant, slopes)))
-                for x, v in zip(leaves(found), leaves(given), strict=True):
+                stepped = derivatives.host(chosen, step(parameters, map_leaves(chosen.constant, slopes)))
+                for x, v in zip(leaves(stepped), leaves(given), strict=True):
                     claim_close(x, expected(v), 1e-4, f"the first step of {name}")
                 for x, v in zip(leaves(derivatives.host(chosen, parameters)), leaves(given), strict=True):
                     claim_close(x, v, 0, f"what {name} was given")
@@ -327,8 +327,8 @@ class EngineConformance(Conformance):
             expected = np.asarray(f(*operands))  # The value of the specification.
         for how, call in _both_ways(chosen, lambda *x: f(*x)):
             with owning(chosen), no_error(f"{name}{how}"):
-                found = chosen.to_numpy(call(*map(chosen.constant, operands)))
-            claim_close(found, expected, TOLERANCE, f"{name}{how}")
+                value = chosen.to_numpy(call(*map(chosen.constant, operands)))
+            claim_close(value, expected, TOLERANCE, f"{name}{how}")
         if not chosen.differentiates:
             return
         weights, along = numbers(*expected.shape, seed=3), derivatives.directions(operands)
@@ -352,7 +352,7 @@ class EngineConformance(Conformance):
     # ----------------------------------------------------------------------------------------- a render
 
     def test_a_render_is_numpys(self, engine: Any) -> None:
-        """The image of a shaded ball is NumPy's; forward and reverse mode are one derivative."""
+        """The image of a shaded ball is NumPy's; forward and reverse mode agree."""
         chosen = _instance(engine)
         part = scenes.ball(transform=np.asarray(rigid([0.2, 0.3, 0.1, 0.05, 0.1, 0.0]), np.float32))
         expected = scenes.render(part, scenes.CAMERA, scenes.SIZE, sampler="reference")
@@ -363,8 +363,8 @@ class EngineConformance(Conformance):
             return scenes.render(moved, scenes.CAMERA, scenes.SIZE, sampler="reference", capacity=scenes.CAPACITY)
 
         with owning(chosen), no_error(f"a render in {chosen.name}"):
-            found = chosen.to_numpy(image([chosen.constant(v) for v in values]))
-            claim_close(found, expected, 1e-4, "the image of a ball")
+            shown = chosen.to_numpy(image([chosen.constant(v) for v in values]))
+            claim_close(shown, expected, 1e-4, "the image of a ball")
             if chosen.differentiates:
                 weights, along = numbers(*expected.shape, seed=5), derivatives.directions(values)
                 both = derivatives.derivatives(chosen, image, values, along, weights)
@@ -388,7 +388,7 @@ def _curvature(engine: Engine, f: Callable, operands: list, along: list, weights
 
 @contextlib.contextmanager
 def owning(engine: Engine) -> Iterator[None]:
-    """Context in which the core takes this object for the engine of its arrays."""
+    """Context in which the core uses this object as the engine of its arrays."""
     kinds = {type(engine.constant(np.ones(1)))} - {np.ndarray}
     before = {kind: OWNERS.get(kind) for kind in kinds}
     OWNERS.update(dict.fromkeys(kinds, engine))
@@ -407,9 +407,9 @@ def _both_ways(engine: Engine, f: Callable) -> list[tuple[str, Callable]]:
 
 
 def _instance(engine: Any) -> Engine:
-    found = derivatives.engine_or_skip(engine) if isinstance(engine, str) else engine
-    claim(isinstance(found, Engine), f"the engine is {engine!r}; expected a name, or an object of rts.Engine")
-    return found
+    instance = derivatives.engine_or_skip(engine) if isinstance(engine, str) else engine
+    claim(isinstance(instance, Engine), f"the engine is {engine!r}; expected a name, or an object of rts.Engine")
+    return instance
 
 
 def _differentiating(engine: Any) -> Engine:

@@ -1,4 +1,4 @@
-"""Claims about surfaces whose θ moves a little: points of kept samples move with it, and so do the triangles."""
+"""Claims about surfaces whose θ changes a little: points of kept samples and triangles move along."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from rts.testing.normal_claims import normals_at
 
 STEP = 1e-5
 MOVED = 0.02
-"""How far the point that moves fastest is moved: a tenth of a pixel."""
+"""The motion of the fastest point: a tenth of a pixel."""
 
 BEHIND = 0.35
-"""How far points may be off the surface that has moved, a share of the way that it went."""
+"""The largest distance of points from the moved surface, as a share of the surface's motion."""
 
 ENOUGH = 20
-"""Samples, at least, to tell from."""
+"""The least samples to judge from."""
 
 
 class Move(NamedTuple):
-    """A little change of one array of θ.
+    """A small change of one array of θ.
 
     Attributes:
         name: of the array.
         part: the part with θ changed.
-        points: (N, 3) float64, the points of the samples that were found before.
+        points: (N, 3) float64, the changed part's points at samples of the unchanged one.
     """
 
     name: str
@@ -69,7 +69,7 @@ def claim_followed(part: Part, sampler: Any) -> None:
             return
         old, new = _fronts_of_both(before, after)
         reached = _points(moved, after.samples[0])[new]
-        # Where another sheet is seen now, nothing is told.
+        # Cells that show another sheet now are left out.
         same = np.linalg.norm(start[old] - reached, axis=1) < 10 * MOVED
         across = normals[new] * same[:, None]
         off, way = (np.abs(np.sum((x[old] - reached) * across, axis=1)) for x in (points, start))
@@ -106,7 +106,7 @@ def _points(part: Part, samples: Samples) -> np.ndarray:
 
 
 def _fronts_of_both(before: Sampled, after: Sampled) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of the front samples of cells that have one before and after."""
+    """Rows of the front samples of cells that have one both before and after."""
     old, new = np.asarray(before.row)[0], np.asarray(after.row)[0]
     both = (old >= 0) & (new >= 0)
     return old[both], new[both]

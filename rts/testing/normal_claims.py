@@ -1,4 +1,4 @@
-"""Claims about normals: they stand upright on the surface, or on its triangles in the mean."""
+"""Claims about normals: they are perpendicular to the surface, or in the mean to its triangles."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from rts.testing.claims import claim
 from rts.testing.sample_claims import FEW
 
 STEP = 2**-8
-"""How far the two parameters of samples are moved."""
+"""The step of the two parameters of samples."""
 
 SHIFT = 0.1
-"""How far pictures are shifted, pixels, where samples have other parameters."""
+"""The shift of images, pixels, for samples that do not have two parameters."""
 
 UPRIGHT, LARGEST = 3.0, 10.0
-"""Degrees that normals may lean in the middle, and all but a tenth of them."""
+"""Degrees by which normals may lean: the median, and the ninth decile."""
 
 NEAR = 0.3
-"""How far apart two samples of one sheet are at most."""
+"""The largest distance of two samples of one sheet."""
 
 SPREAD, TILT = 0.6, 0.1
-"""How far normals of triangles may lean: a share of the angle between neighbours, and their mean, of unit length."""
+"""The lean allowed to normals of triangles: as a share of the angle between neighbours, and of their unit mean."""
 
 
 def claim_upright(part: Part, sampler: Any) -> None:
-    """Fail unless normals are not zero and, where samples lie on no triangles, perpendicular to the surface."""
+    """Fail if normals are zero or, where the surface is not made of triangles, not perpendicular to it."""
     surface = scenes.checked(part).surface
     flat = isinstance(surface, TriangleSurface) and not (surface.refines and surface.refine_moves)
     part = part.replace(theta=map_leaves(derivatives.single if flat else wide, part.theta))
@@ -61,7 +61,7 @@ def claim_upright(part: Part, sampler: Any) -> None:
 
 
 def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Fail unless the mean of a triangle's normals is about its own, as far as neighbours differ.
+    """Fail unless the mean of the normals at a triangle's corners is about its own, as far as neighbours differ.
 
     Args:
         normals: (3, T, 3), at the corners of the triangles; of any length.
@@ -87,7 +87,7 @@ def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces:
 
 
 def normals_at(part: Part, samples: Samples) -> np.ndarray | None:
-    """(N, 3) unit normals where samples are: by their two parameters, else as the surface has them; None without."""
+    """Unit normals (N, 3) at samples: by their two parameters, or else the surface's; None if it has none."""
     if samples.params.shape[1] == 2:
         return _by_parameters(part, samples)
     gbuffer = part.surface.evaluate(part.theta, samples)
@@ -106,7 +106,7 @@ def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def unit(x: np.ndarray) -> np.ndarray:
-    """Vectors of unit length, zero where they are."""
+    """Vectors scaled to unit length; zeros stay zero."""
     length = np.linalg.norm(x, axis=-1, keepdims=True)
     return x / np.where(length > 0, length, 1)
 
@@ -123,7 +123,7 @@ def _by_parameters(part: Part, samples: Samples) -> np.ndarray:
 
 
 def _perpendicular(part: Part, sampler: Any, samples: Samples) -> np.ndarray | None:
-    """Like `_by_parameters`; where samples have not two, by pictures that are shifted by a little."""
+    """`_by_parameters`, or for samples without two parameters normals from slightly shifted images."""
     if samples.params.shape[1] == 2:
         return _by_parameters(part, samples)
     if not samples.centered:
@@ -139,8 +139,8 @@ def _perpendicular(part: Part, sampler: Any, samples: Samples) -> np.ndarray | N
             good &= row >= 0
             ends.append(position[np.maximum(row, 0)])
         tangents.append(ends[0] - ends[1])
-        # Not where one of them lies on another sheet.
+        # A pair on two sheets does not count.
         good &= np.linalg.norm(tangents[-1], axis=-1) < NEAR
-    found, good = np.zeros((len(samples.ids), 3)), good & (rows[0] >= 0)
-    found[rows[0][good]] = unit(np.cross(*tangents))[good]
-    return found
+    normals, good = np.zeros((len(samples.ids), 3)), good & (rows[0] >= 0)
+    normals[rows[0][good]] = unit(np.cross(*tangents))[good]
+    return normals

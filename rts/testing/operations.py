@@ -17,14 +17,14 @@ from rts.testing.claims import claim, claim_finite, no_error
 from rts.testing.conformance import Conformance
 
 TOLERANCES = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-9}
-"""By how much results may differ, over the largest number of what is expected."""
+"""The largest difference of results, relative to the largest expected number."""
 
 
 class OperationConformance(Conformance):
-    """Checks of an operation: its functions on NumPy arrays, and the operation in every engine, by its specification.
+    """Checks of an operation against its specification: its functions on NumPy arrays, and itself in every engine.
 
     Override the fixtures `operation`: an `Operation`; `operands`: NumPy arrays, floats of any dtype, at which the
-    specification has derivatives; and, where it takes parameters, `params`: a dict.
+    specification has derivatives; and, if it takes parameters, `params`: a dict.
     """
 
     @pytest.fixture
@@ -34,7 +34,7 @@ class OperationConformance(Conformance):
 
     @pytest.fixture
     def operands(self) -> Sequence[np.ndarray]:
-        """Operands that fit."""
+        """Operands for the operation."""
         raise NotImplementedError("override the fixture 'operands' with NumPy arrays for the operation")
 
     @pytest.fixture
@@ -46,14 +46,14 @@ class OperationConformance(Conformance):
     def test_forward_is_the_specification(
         self, operation: Operation, operands: Sequence, params: dict, dtype: Any
     ) -> None:
-        """`forward` fills `out`, of the shape that `shape` tells, with what the specification gives."""
-        given, found = _of(operands, dtype), _value(operation, _of(operands, dtype), params)[0]
+        """`forward` fills `out`, whose shape is that of `shape`, with the specification's value."""
+        given, value = _of(operands, dtype), _value(operation, _of(operands, dtype), params)[0]
         with no_error(f"the specification of {operation.name}"):
             expected = np.asarray(operation.specification(*given, **params))
         claim(expected.dtype == dtype, f"the specification gives {expected.dtype} for operands of {np.dtype(dtype)}")
-        left = np.sum(np.isnan(found) & ~np.isnan(expected)) if found.shape == expected.shape else 0
-        claim(not left, f"forward leaves {left} of {found.size} numbers of `out` unwritten, or NaN")
-        _claim_close(found, expected, f"the value by forward in {np.dtype(dtype)}, of the shape that `shape` tells,")
+        left = np.sum(np.isnan(value) & ~np.isnan(expected)) if value.shape == expected.shape else 0
+        claim(not left, f"forward leaves {left} of {value.size} numbers of `out` unwritten, or NaN")
+        _claim_close(value, expected, f"the value by forward in {np.dtype(dtype)}, of the shape that `shape` tells,")
 
     def test_push_is_the_derivative_of_the_specification(
         self, operation: Operation, operands: Sequence, params: dict
@@ -64,8 +64,8 @@ class OperationConformance(Conformance):
         varied, kept = at[: operation.differentiable], _value(operation, at, params)[1]
         for which in _choices(len(varied)):
             sweep = _tangents(varied, which, count=2)
-            found = _pushed(operation, at, sweep, kept, params)
-            for i, result in enumerate(found):
+            pushed = _pushed(operation, at, sweep, kept, params)
+            for i, result in enumerate(pushed):
                 along = [np.zeros_like(x) if t is None else t[i] for x, t in zip(varied, sweep, strict=True)]
                 expected = _specified_slope(engine, operation, at, along, params)
                 _claim_close(result, expected, f"push along {_named(which)}")
@@ -74,7 +74,7 @@ class OperationConformance(Conformance):
     def test_pull_is_the_transpose_of_push(
         self, operation: Operation, operands: Sequence, params: dict, dtype: Any
     ) -> None:
-        """`pull` gives the gradients of which `push` gives the derivatives: ⟨g, J t⟩ = ⟨Jᵀ g, t⟩ for each operand."""
+        """`pull` is the transpose of `push`: ⟨g, J t⟩ = ⟨Jᵀ g, t⟩ for each operand."""
         at = _of(operands, dtype)
         varied, (value, kept) = at[: operation.differentiable], _value(operation, at, params)
         g = read_only(np.random.default_rng(2).standard_normal(value.shape).astype(dtype))
@@ -93,7 +93,7 @@ class OperationConformance(Conformance):
             )
 
     def test_what_forward_keeps_changes_nothing(self, operation: Operation, operands: Sequence, params: dict) -> None:
-        """Derivatives are the same with what `forward` has kept and without."""
+        """Derivatives are the same with and without the data that `forward` keeps."""
         if not operation.keeps:
             pytest.skip("its forward keeps nothing")
         at = _of(operands, np.float64)
@@ -109,7 +109,7 @@ class OperationConformance(Conformance):
     def test_rows_are_computed_by_themselves(
         self, operation: Operation, operands: Sequence, params: dict, share: float
     ) -> None:
-        """The first rows alone, or no rows, have the value and the derivatives that they have among all."""
+        """The first rows alone, or no rows, have the same value and derivatives as among all."""
         if not (operation.packed and operation.packed_result):
             pytest.skip("its result has no row for each sample")
         whole = _of(operands, np.float64)
@@ -135,8 +135,8 @@ class OperationConformance(Conformance):
         for how, call in (("", operation), (", compiled,", engine.jit(lambda *x: operation(*x, **params)))):
             with no_error(f"{operation.name} in {name}{how}"):
                 given = _constants(engine, at)
-                found = engine.to_numpy(call(*given, **params) if call is operation else call(*given))
-            _claim_close(found, expected, f"the value in {name}{how}")
+                result = engine.to_numpy(call(*given, **params) if call is operation else call(*given))
+            _claim_close(result, expected, f"the value in {name}{how}")
         if not engine.differentiates:
             return
         weights = np.random.default_rng(4).standard_normal(expected.shape)
@@ -147,18 +147,18 @@ class OperationConformance(Conformance):
                 for f in (operation, operation.specification)
             )
         _claim_close(own.along, specified.along, f"the derivative in forward mode in {name}")
-        for found, gradient in zip(own.gradient, specified.gradient, strict=True):
-            _claim_close(found, gradient, f"the gradient in {name}")
+        for result, gradient in zip(own.gradient, specified.gradient, strict=True):
+            _claim_close(result, gradient, f"the gradient in {name}")
 
 
 def _of(operands: Sequence, dtype: Any) -> list[np.ndarray]:
-    """Read-only operands whose floats are of a dtype, as operations get them."""
+    """Read-only operands with floats of a dtype, as operations get them."""
     arrays = [np.asarray(x) for x in operands]
     return [read_only(x.astype(dtype) if x.dtype.kind == "f" else x) for x in arrays]
 
 
 def _constants(engine: Engine, arrays: Sequence[np.ndarray]) -> list[Any]:
-    """Arrays of an engine, in float64 where they are and it has that."""
+    """Arrays of an engine; float64 stays float64 if the engine has it."""
     like = _float64(engine) if any(x.dtype == np.float64 for x in arrays) else None
     return [engine.constant(x, like) for x in arrays]
 
@@ -170,7 +170,7 @@ def _float64(engine: Engine) -> Any:
 
 
 def _most_precise() -> Engine:
-    """An engine with derivatives, in float64 if there is such a one."""
+    """An engine with derivatives; one with float64 if installed."""
     return max(derivatives.installed(), key=lambda engine: floating_bits(_float64(engine)))
 
 
@@ -200,7 +200,7 @@ def _pulled(operation: Operation, operands: Sequence, g: np.ndarray, which: Sequ
 
 
 def _choices(count: int) -> Iterator[list[int]]:
-    """Each operand alone, and all."""
+    """Each operand alone, then all together."""
     yield from ([i] for i in range(count))
     if count > 1:
         yield list(range(count))
@@ -221,12 +221,12 @@ def _specified_slope(engine: Engine, operation: Operation, at: list, along: list
         return engine.to_numpy(engine.jvp(f, given[:count], _constants(engine, along))[1])
 
 
-def _claim_close(found: Any, expected: Any, what: str) -> None:
-    """Fail unless two arrays of one shape agree as far as the coarser of their dtypes allows."""
-    claim(found.shape == expected.shape, f"{what} has shape {found.shape}; expected {expected.shape}")
-    claim_finite(found, what)
-    coarse = max(TOLERANCES[x.dtype] for x in (found, expected))
-    worst = float(np.abs(np.subtract(found, expected, dtype=np.float64)).max(initial=0))
+def _claim_close(actual: Any, expected: Any, what: str) -> None:
+    """Fail unless two arrays of one shape agree within the tolerance of the coarser dtype."""
+    claim(actual.shape == expected.shape, f"{what} has shape {actual.shape}; expected {expected.shape}")
+    claim_finite(actual, what)
+    coarse = max(TOLERANCES[x.dtype] for x in (actual, expected))
+    worst = float(np.abs(np.subtract(actual, expected, dtype=np.float64)).max(initial=0))
     most = coarse * max(float(np.abs(expected).max(initial=0)), 1e-3)
     claim(worst <= most, f"{what} is off by {worst:.3g}; expected the specification's, to {most:.2g}")
 

@@ -1,4 +1,4 @@
-"""Claims about the triangles that stand for a surface."""
+"""Claims about proxies, the triangles that stand for a surface."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VIEWS = {"a view": scenes.CAMERA, "another": scenes.AXES[0], "one from afar": sc
 
 
 def triangles_of(part: Part) -> TriangleSurface:
-    """The surface, or a skip where it has no triangles."""
+    """The surface; skip the test if it has no triangles."""
     surface = scenes.checked(part).surface
     if not isinstance(surface, TriangleSurface):
         pytest.skip("the surface has no triangles")
@@ -27,12 +27,12 @@ def triangles_of(part: Part) -> TriangleSurface:
 
 
 def inputs_of(part: Part, surface: TriangleSurface) -> Tree:
-    """What `proxy_inputs` gives of a part's θ in float32."""
+    """The result of `proxy_inputs` for a part's θ in float32."""
     return map_leaves(np.asarray, surface.proxy_inputs(map_leaves(derivatives.single, part.theta)))
 
 
 def claim_corners(part: Part, surface: TriangleSurface, when: str) -> None:
-    """Fail unless corners evaluate to themselves, normals are the triangles', and there are as many as is said."""
+    """Fail unless corners evaluate to themselves, normals are the triangles', and their numbers are those promised."""
     proxy = surface.proxy(inputs_of(part, surface), scenes.CAMERA, scenes.SIZE)
     count = surface.face_count
     claim(count in (None, len(proxy.faces)), f"face_count is {count}; proxy gives {len(proxy.faces)} triangles{when}")
@@ -56,7 +56,7 @@ def claim_corners(part: Part, surface: TriangleSurface, when: str) -> None:
 
 
 def claim_keys_tell_views(part: Part, surface: TriangleSurface) -> None:
-    """Fail unless the triangles of two views are the same, or the keys of these views differ."""
+    """Fail unless two views have the same triangles, or different keys."""
     inputs = inputs_of(part, surface)
     given = {
         f"{view} of {scale * scenes.SIZE[0]} rows": (camera, (scale * scenes.SIZE[0], scale * scenes.SIZE[1]))
@@ -81,7 +81,7 @@ def _both(one: Proxy, other: Proxy, name: str) -> tuple[Any, Any]:
 
 
 def _at_corner(proxy: Proxy, i: int) -> Samples:
-    """One sample a triangle, at its corner i."""
+    """One sample for each triangle, at its corner i."""
     count = len(proxy.faces)
     weights = np.broadcast_to(np.eye(3, 2, dtype=np.float32)[i], (count, 2))
     row = np.arange(count, dtype=np.int32).reshape(1, 1, -1)

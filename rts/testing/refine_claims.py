@@ -1,4 +1,4 @@
-"""Claims about surfaces that find their points themselves: by `refine`, or by intersecting rays."""
+"""Claims about surfaces that find their own points: by `refine`, or by intersecting rays."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from rts.testing.sample_claims import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
 
 DEEP = 5
-"""Layers of rays that are shot in both directions."""
+"""Layers of rays that are cast in both directions."""
 
 BEYOND, NOWHERE = 6.0, 1e3
-"""How far behind the last hit such a ray begins, beyond all there is; and the distance that stands for no hit."""
+"""Distance behind the last hit at which such a ray begins, beyond everything; and the distance for no hit."""
 
 SHORT = 2e-3
-"""How far before a hit the second ray begins, in units of depth."""
+"""Distance before a hit at which the second ray begins, in units of depth."""
 
 GROWN = 1.15
-"""How much larger triangles are than they should be, so that rays at outlines miss what is within."""
+"""The factor by which triangles are too large, so that rays at outlines miss the surface inside."""
 
 MISSED = 0.01
-"""The share of hits that may be missed by the second ray, where rays touch the surface."""
+"""The share of hits that the second ray may miss: those where rays touch the surface."""
 
 
 def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: str) -> None:
@@ -49,25 +49,25 @@ def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: st
 
 
 def _off_rays(part: Part, surface: TriangleSurface, inputs: Tree, proxy: Proxy, local: Camera, view: str) -> np.ndarray:
-    """How far samples that `refine` makes of those on triangles are off their rays, pixels."""
+    """Distances of refined samples from their rays, pixels."""
     sampler = registry.instance("rts.samplers", "reference")
     lifted = lift(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
     try:
-        found, rays = refined(surface, inputs, lifted, local, surface.table_specs(len(lifted.ids), None))
+        samples, rays = refined(surface, inputs, lifted, local, surface.table_specs(len(lifted.ids), None))
     except InputError as error:
         raise AssertionError(f"{view}: {error}") from error
-    cells = found.row >= 0
-    row, depth = found.row[cells], found.depth[cells].astype(np.float64)
+    cells = samples.row >= 0
+    row, depth = samples.row[cells], samples.depth[cells].astype(np.float64)
     if not len(row):
         return np.zeros(1)
-    position = np.asarray(surface.evaluate(part.theta, found)["position"], np.float64)[row]
+    position = np.asarray(surface.evaluate(part.theta, samples)["position"], np.float64)[row]
     claim_finite(position, f"{view}: the surface where refine has put samples")
     point = rays.origins[row] + depth[:, None] * rays.directions[row]
     return np.linalg.norm(position - point, axis=1) / (rays.spread[0] + rays.spread[1] * depth)
 
 
 def claim_misses_dropped(part: Part, surface: TriangleSurface) -> None:
-    """Fail unless `refine` drops samples whose rays pass beside the surface: those on triangles that are too large."""
+    """Fail unless `refine` drops samples whose rays pass beside the surface, on triangles that are too large."""
     local = scenes.CAMERA.within(part.transform).map(lambda m: np.asarray(m, np.float64))
     inputs = inputs_of(part, surface)
     proxy = surface.proxy(inputs, local, GRID)
@@ -82,7 +82,7 @@ def claim_misses_dropped(part: Part, surface: TriangleSurface) -> None:
 
 
 def _rays_of(part: Part, camera: Camera) -> tuple[Tree, np.ndarray, np.ndarray]:
-    """θ in float32, and origins on the near plane and directions (R, 3) of a part's rays, local space."""
+    """θ in float32; and origins on the near plane and directions (R, 3) of a part's rays, local space."""
     local = camera.within(part.transform)
     rays = local.rays(GRID)
     directions = rays.directions.reshape(-1, 3).astype(np.float32)
@@ -91,14 +91,14 @@ def _rays_of(part: Part, camera: Camera) -> tuple[Tree, np.ndarray, np.ndarray]:
 
 
 def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
-    """Fail unless rays that begin just short of hits hit there again."""
+    """Fail unless rays that begin just before hits hit there again."""
     theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, LAYERS)
     hit, distance = np.asarray(hits.hit), np.asarray(hits.distance)
     claim_finite((distance, np.asarray(hits.params)), f"{view}: what intersect gives, also where nothing is hit,")
     missed, total, worst = 0, 0, 0.0
     for k in range(len(hit)):
-        # Hits before which another one lies are left out.
+        # Hits with another one just before them are left out.
         apart = distance[k] - (distance[k - 1] if k else 0) > 2 * SHORT
         chosen = np.flatnonzero(hit[k] & apart)
         if not len(chosen):
@@ -116,7 +116,7 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
 
 
 def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
-    """Fail unless rays that come from behind hit at the same places."""
+    """Fail unless rays from behind hit at the same places."""
     theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, DEEP)
     hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)

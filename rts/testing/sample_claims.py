@@ -1,4 +1,4 @@
-"""Claims about the samples of one part, which a surface and a sampler both have to meet."""
+"""Claims about the samples of one part, for surfaces and for samplers."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from rts.testing.compatibility import APRON
 from rts.testing.scenes import GRID, SIZE
 
 REPROJECTION = 0.02
-"""Pixels that a sample may be off its pixel's centre: float32 positions."""
+"""The largest distance of a sample from its pixel's centre, pixels: rounding of float32 positions."""
 
 RESIDUAL = 0.25
-"""Pixels that the few samples may be off that no refinement can move to the centre, at the edges of curved surfaces."""
+"""The same, pixels, for the few samples at edges of curved surfaces that no refinement can move to the centre."""
 
 FEW = 0.03
 
 
 def claim_reprojected(part: Part, sampled: Sampled, camera: Camera, view: str) -> None:
-    """Fail unless the part, evaluated at its samples, lies on the centres of their pixels, at their depth."""
+    """Fail unless the part, evaluated at its samples, lies at the centres of their pixels, at their depth."""
     samples = sampled.samples[0]
     if not samples.centered:
         return
@@ -58,7 +58,7 @@ def claim_ordered(sampled: Sampled, view: str) -> None:
 
 
 def claim_empty_where_empty(sampled: Sampled, view: str) -> None:
-    """Fail unless rows number the samples once each, and empty cells have row −1 and depth 0."""
+    """Fail unless each sample has one row, and empty cells have row −1 and depth 0."""
     samples = sampled.samples[0]
     row, depth = np.asarray(samples.row), np.asarray(samples.depth)
     claim(row.min() >= -1, f"{view}: row holds {row.min()}; expected −1 where a cell is empty")

@@ -1,4 +1,4 @@
-"""What every sampler must do."""
+"""Checks that every sampler must pass."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, en
 from rts.testing.sample_claims import claim_empty_where_empty, claim_ordered, claim_reprojected
 
 DEEPER = 4
-"""Layers of the reference beyond those compared, which tell where a silhouette is."""
+"""Layers of the reference beyond those compared, which show where silhouettes are."""
 
 SCALES = 1, 0.9, 0.8, 0.7, 0.8
-"""Factors of θ, call after call: more than are kept (`rts.sampling.cache.KEPT`), and one that is."""
+"""Factors of θ in successive calls: more than the cache keeps (`rts.sampling.cache.KEPT`), then one that it keeps."""
 
 
 class Elsewhere(Surface):
-    """A surface that no sampler can sample: it has neither triangles nor an intersection."""
+    """A surface that no sampler can sample: it has neither triangles nor `intersect`."""
 
     sample_widths = (0, 2)
 
@@ -48,7 +48,7 @@ class Elsewhere(Surface):
 
 
 class Fronts:
-    """A rule that keeps fronts alone."""
+    """A rule for hidden samples that keeps the fronts alone."""
 
     settles, size = False, 0.0
 
@@ -74,7 +74,7 @@ class SamplerConformance(Conformance):
 
     @pytest.fixture
     def parts(self) -> list[Part]:
-        """The parts to sample: triangles that are closed, culled, moved, and in a heap."""
+        """The parts to sample: triangles that are closed, culled, moved, and piled at random."""
         turned = np.array([(0.8, 0, 0.6, 0.1), (0, 1.2, 0, -0.1), (-0.6, 0, 0.8, 0.2), (0, 0, 0, 1)], np.float32)
         return [scenes.ball(), scenes.ball(cull="back", transform=turned), scenes.soup()]
 
@@ -86,19 +86,19 @@ class SamplerConformance(Conformance):
             claim_reprojected(part, scenes.find(part, camera, sampler, layers=3), camera, view)
 
     def test_it_agrees_with_the_reference(self, sampler: Any, parts: list[Part]) -> None:
-        """Triangles are those of `reference`; of the pixels at silhouettes at most one in a hundred differs."""
+        """Triangles are those of `reference`; at silhouettes at most one pixel in a hundred differs."""
         triangles = [p for p in parts if is_of_triangles(p)]
         if not triangles:
             pytest.skip("no triangles to compare with the reference")
         silhouettes = Silhouettes()
         for view, camera, part in _scenes(triangles):
             for layers in (1, 3):
-                found = scenes.find(part, camera, sampler, layers=layers)
-                silhouettes += claim_like(found, reference(part, camera, layers), f"{view}, {layers} layers")
+                sampled = scenes.find(part, camera, sampler, layers=layers)
+                silhouettes += claim_like(sampled, reference(part, camera, layers), f"{view}, {layers} layers")
         silhouettes.claim_few("")
 
     def test_layers_are_front_to_back(self, sampler: Any, parts: list[Part]) -> None:
-        """Layers of a pixel are sorted by depth, without gaps; asked for one layer, it gives the first of three."""
+        """Layers of a pixel are sorted by depth, without gaps; a single layer is the first of three."""
         for view, camera, part in _scenes(parts):
             one, three = (scenes.find(part, camera, sampler, layers=k) for k in (1, 3))
             claim_ordered(three, view)
@@ -106,7 +106,7 @@ class SamplerConformance(Conformance):
             claim(np.allclose(one.depth, first, rtol=1e-6), f"{view}: one layer is not the first of three")
 
     def test_background_is_empty(self, sampler: Any, parts: list[Part]) -> None:
-        """`row` is −1, and depth and image 0, where nothing is seen; no row stands twice."""
+        """Empty cells have `row` −1, depth 0 and image 0; no row appears twice."""
         for view, camera, part in _scenes(parts):
             sampled = scenes.find(part, camera, sampler)
             claim_empty_where_empty(sampled, view)
@@ -127,44 +127,44 @@ class SamplerConformance(Conformance):
     # -------------------------------------------------------------------------------------- the contract
 
     def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
-        """Two calls agree to the last bit; what was sampled between, new arrays on the same surfaces, is right."""
+        """Two calls agree to the last bit; new arrays on the same surfaces, sampled between, are right."""
         between = [_scaled(part, 0.9) for part in parts]
         expected = [right(part, scenes.AXES[2], sampler) for part in between]
         silhouettes = Silhouettes()
         for view, camera, part in _scenes(parts):
             first = scenes.find(part, camera, sampler)
             for i, (other, like) in enumerate(zip(between, expected, strict=True)):
-                found = scenes.find(other, scenes.AXES[2], sampler)
-                silhouettes += claim_like(found, like, f"part {i} with new arrays in θ, after {view}")
+                sampled = scenes.find(other, scenes.AXES[2], sampler)
+                silhouettes += claim_like(sampled, like, f"part {i} with new arrays in θ, after {view}")
             _claim_same(scenes.find(part, camera, sampler), first, view)
         silhouettes.claim_few("with new arrays in θ, ")
 
     def test_prepared_parts_are_sampled_alike(self, sampler: Any, parts: list[Part]) -> None:
-        """What `rts.prepare` builds once for a part that stays gives the right samples, wherever it is moved."""
+        """Data that `rts.prepare` builds once for a part give the right samples, wherever the part is moved."""
         turn = np.array([(0, -1, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0.1), (0, 0, 0, 1)], np.float32)
         silhouettes = Silhouettes()
         for index, part in enumerate(parts):
             held = prepare(part, sampler, camera=scenes.CAMERA, size=scenes.SIZE)
             for moved in (part, part.replace(transform=turn)):
-                found = sample(
+                sampled = sample(
                     held.replace(transform=moved.transform), scenes.CAMERA, scenes.SIZE, layers=scenes.LAYERS
                 )
-                silhouettes += claim_like(found, right(moved, scenes.CAMERA, sampler), f"part {index}, prepared")
+                silhouettes += claim_like(sampled, right(moved, scenes.CAMERA, sampler), f"part {index}, prepared")
         silhouettes.claim_few("prepared, ")
 
     def test_it_follows_theta(self, sampler: Any, parts: list[Part]) -> None:
-        """Each of several θ on one surface is sampled rightly: more than are kept, built, updated or found again."""
+        """Several θ in turn on one surface are sampled right: more than the cache keeps, built, updated or reused."""
         silhouettes = Silhouettes()
         for i, part in enumerate(parts):
             for call, scale in enumerate(SCALES):
                 moved = _scaled(part, scale)
-                found = scenes.find(moved, sampler=sampler)
+                sampled = scenes.find(moved, sampler=sampler)
                 what = f"part {i}, call {call + 1} on one surface, each with another θ (is `update` right?)"
-                silhouettes += claim_like(found, right(moved, scenes.CAMERA, sampler), what)
+                silhouettes += claim_like(sampled, right(moved, scenes.CAMERA, sampler), what)
         silhouettes.claim_few("with one θ after another, ")
 
     def test_it_sees_arrays_that_change_in_place(self, sampler: Any, parts: list[Part]) -> None:
-        """A change of arrays in place is seen: what is built is kept by their values, not by their identity."""
+        """A change of arrays in place is seen: the cache compares values, not identity."""
         for i, part in enumerate(parts):
             values, join = split(part.theta)
             changing = [v.copy() for v in values]
@@ -173,94 +173,97 @@ class SamplerConformance(Conformance):
             for v in changing:
                 v *= 0.9
             expected = again(part.replace(theta=join([v.copy() for v in changing])), scenes.CAMERA, sampler)
-            found = scenes.find(changed, sampler=sampler)
-            if _differing(found, expected.sampled).any():
-                stale = not _differing(found, before).any()
+            sampled = scenes.find(changed, sampler=sampler)
+            if _differing(sampled, expected.sampled).any():
+                stale = not _differing(sampled, before).any()
                 claim(not stale, "a change in place of the arrays of θ is not seen; keep what is built by their values")
-                claim_like(found, expected, f"part {i}, after a change in place of the arrays of θ").claim_few("")
+                claim_like(sampled, expected, f"part {i}, after a change in place of the arrays of θ").claim_few("")
 
     def test_capacity_drops_the_deepest_layers_first(self, sampler: Any, parts: list[Part]) -> None:
-        """`capacity` gives exactly so many rows; the deepest layers are dropped first, and counted."""
+        """`capacity` is the exact number of rows; the deepest layers are dropped first, and counted."""
         part = parts[0]
         everything = np.asarray(scenes.find(part, sampler=sampler).row)
         hits, front = (everything >= 0).sum(), (everything[0] >= 0).sum()
         capacity = int((hits + front) // 2)
-        found = scenes.find(part, sampler=sampler, capacity=capacity)
-        samples, row = found.samples[0], np.asarray(found.row)
+        sampled = scenes.find(part, sampler=sampler, capacity=capacity)
+        samples, row = sampled.samples[0], np.asarray(sampled.row)
         rows = len(samples.ids), len(samples.params)
         claim(rows == (capacity, capacity), f"{rows} rows of ids and params; the capacity is {capacity}")
-        dropped = int(found.overflow)
+        dropped = int(sampled.overflow)
         claim(dropped == hits - capacity, f"overflow is {dropped}; {hits - capacity} were dropped")
         claim((row >= 0).sum() == capacity, f"{(row >= 0).sum()} cells have samples; the capacity is {capacity}")
         claim((row[0] >= 0).sum() == front, "samples of the front layer were dropped before those behind")
 
     def test_hidden_samples_are_left_out_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
-        """A sampler that follows `Request.hidden` gives fronts alone if the rule keeps only these."""
+        """A sampler that follows `Request.hidden` returns fronts alone if the rule keeps only these."""
         chosen, part = check_sampler(sampler), scenes.checked(parts[0])
         whole = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, Request())
-        found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, Request(hidden=Fronts()))
-        if "hidden" not in found.followed:
-            claim_close(np.asarray(found.row), np.asarray(whole.row), 0, "row, though `hidden` was not followed,")
+        fronts = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, Request(hidden=Fronts()))
+        if "hidden" not in fronts.followed:
+            claim_close(np.asarray(fronts.row), np.asarray(whole.row), 0, "row, though `hidden` was not followed,")
             pytest.skip("the sampler leaves hidden samples to the core")
-        claim((np.asarray(found.row)[1] < 0).all(), "samples that are not needed are kept")
-        kept = (np.asarray(found.row)[0] >= 0) == (np.asarray(whole.row)[0] >= 0)
+        claim((np.asarray(fronts.row)[1] < 0).all(), "samples that are not needed are kept")
+        kept = (np.asarray(fronts.row)[0] >= 0) == (np.asarray(whole.row)[0] >= 0)
         claim(kept.all(), "samples that are needed are left out")
 
     def test_listed_cells_are_those_of_the_whole_grid(self, sampler: Any, parts: list[Part]) -> None:
-        """A sampler that follows `Request.cells` finds there what these cells of the grid have, and nothing for −1."""
+        """A sampler that follows `Request.cells` returns the grid's samples in these cells, and none for −1."""
         chosen, (height, width) = check_sampler(sampler), scenes.SIZE
         cells = np.random.default_rng(0).permutation(height * width)[: height * width // 2 // 8 * 8].astype(np.int32)
         cells[::7] = -1
         for index, part in enumerate(map(scenes.checked, parts)):
-            whole, found = (
+            whole, listed = (
                 chosen.sample(part, scenes.CAMERA.within(part.transform), scenes.SIZE, 3, request)
                 for request in (Request(), Request(cells=cells.reshape(-1, 8)))
             )
-            if "cells" not in found.followed:
-                same = found.row.shape == whole.row.shape
-                claim(same, f"part {index}: row has shape {found.row.shape}, though `cells` was not followed")
+            if "cells" not in listed.followed:
+                same = listed.row.shape == whole.row.shape
+                claim(same, f"part {index}: row has shape {listed.row.shape}, though `cells` was not followed")
                 pytest.skip("the sampler samples whole grids")
             row, depth = (np.asarray(x).reshape(len(x), -1)[:, cells] for x in (whole.row, whole.depth))
-            claim(found.row.shape == (len(row), len(cells) // 8, 8), f"part {index}: row has shape {found.row.shape}")
+            claim(
+                listed.row.shape == (len(row), len(cells) // 8, 8),
+                f"part {index}: row has shape {listed.row.shape}",
+            )
             covered = (row >= 0) & (cells >= 0)
-            seen = np.asarray(found.row).reshape(row.shape)
+            seen = np.asarray(listed.row).reshape(row.shape)
             claim(((seen >= 0) == covered).all(), f"part {index}: other cells are covered than in the whole grid")
-            near = np.abs(np.asarray(found.depth).reshape(row.shape) - depth) <= 1e-5 * np.abs(depth)
+            near = np.abs(np.asarray(listed.depth).reshape(row.shape) - depth) <= 1e-5 * np.abs(depth)
             claim((near | ~covered).all(), f"part {index}: depths are not those of the cells in the whole grid")
 
     def test_exits_lie_on_the_part_behind_its_front(self, sampler: Any, parts: list[Part]) -> None:
-        """A sampler that tells exits names rows of their own, which lie on the ray where it meets the part again."""
+        """Exits, if a sampler gives them, have rows of their own, where the ray meets the part again."""
         chosen, told = check_sampler(sampler), []
         for index, part in enumerate(map(scenes.checked, parts)):
             if part.cull != "back":
                 continue
             camera = scenes.CAMERA.within(part.transform)
             try:
-                found = chosen.sample(part, camera, scenes.SIZE, 1, Request(exits=True))
-            except InputError:  # It cannot leave out what is seen from behind.
+                sampled = chosen.sample(part, camera, scenes.SIZE, 1, Request(exits=True))
+            except InputError:  # This sampler cannot cull.
                 continue
-            if found.exit is None:
+            if sampled.exit is None:
                 continue
-            exits, row = np.asarray(found.exit), np.asarray(found.row)
+            exits, row = np.asarray(sampled.exit), np.asarray(sampled.row)
             there = exits >= 0
             told.append(there.any())
             claim(exits.shape == row.shape[1:], f"part {index}: exit has shape {exits.shape}")
             claim((row[0] >= 0)[there].all(), f"part {index}: there is an exit where the part is not seen")
             claim(not np.isin(exits[there], row).any(), f"part {index}: exits are named by row, too")
             whole = chosen.sample(part.replace(cull="none"), camera, scenes.SIZE, 8, Request())
-            points = np.asarray(part.surface.evaluate(part.theta, found)["position"])[exits[there]]
+            points = np.asarray(part.surface.evaluate(part.theta, sampled)["position"])[exits[there]]
             depth = np.asarray(camera.project(points, scenes.SIZE))[:, 2]
             layers, covered = np.asarray(whole.depth)[:, there], np.asarray(whole.row)[:, there] >= 0
             met = ((np.abs(layers - depth) <= 1e-4 * np.abs(depth)) & covered).any(axis=0)
             claim(met.all(), f"part {index}: {np.sum(~met)} exits lie where the rays do not meet the part")
-            behind = depth >= np.asarray(found.depth)[0][there] * (1 - 1e-5)
+            behind = depth >= np.asarray(sampled.depth)[0][there] * (1 - 1e-5)
             claim(behind.all(), f"part {index}: {np.sum(~behind)} exits lie before the front")
         if not told:
             pytest.skip("the sampler tells no exits")
         claim(any(told), "no cell has an exit")
 
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
-        """A surface with neither triangles nor an intersection is an `rts.InputError` that says what to do."""
+        """A surface with neither triangles nor `intersect` raises an `rts.InputError` that says what to do."""
         part = Part(Elsewhere(), {"center": np.zeros(3, np.float32)})
         what = "a surface without triangles and intersection"
         claim(refusal(lambda: scenes.find(part, sampler=sampler), what), f"{what} is accepted")
@@ -282,10 +285,10 @@ class SamplerConformance(Conformance):
             at = derivatives.on(chosen, values)
             for how, f in (("", sampled), (", compiled", chosen.jit(sampled))):
                 with no_error(f"sampling in {engine}{how}"):
-                    found = derivatives.host(chosen, f(at))
-                claim(found.row.shape == expected.row.shape, f"in {engine}{how}, row has shape {found.row.shape}")
-                same = (found.row >= 0) == (expected.row >= 0)
-                same &= np.abs(found.depth - expected.depth) <= 1e-4 * expected.depth
+                    result = derivatives.host(chosen, f(at))
+                claim(result.row.shape == expected.row.shape, f"in {engine}{how}, row has shape {result.row.shape}")
+                same = (result.row >= 0) == (expected.row >= 0)
+                same &= np.abs(result.depth - expected.depth) <= 1e-4 * expected.depth
                 claim(same.mean() >= 0.99, f"in {engine}{how}, {np.sum(~same)} of {same.size} cells are not NumPy's")
 
     def test_engines_agree(self, sampler: Any, parts: list[Part]) -> None:
@@ -333,8 +336,8 @@ class Expected(NamedTuple):
 
     Attributes:
         sampled: the samples.
-        edge: (H, W) bool, pixels at silhouettes, where others may be right, too.
-        source: what found them, in words.
+        edge: (H, W) bool, pixels at silhouettes, where other samples may be right, too.
+        source: name of their sampler, in words.
     """
 
     sampled: Sampled
@@ -343,17 +346,17 @@ class Expected(NamedTuple):
 
 
 class Silhouettes(NamedTuple):
-    """How many pixels are at silhouettes, and how many of them differ from what was expected."""
+    """The number of pixels at silhouettes, and of those among them that differ from the expected ones."""
 
     pixels: int = 0
     different: int = 0
 
     def __add__(self, other: Any) -> Silhouettes:
-        """The counts of both, added up."""
+        """The sums of both counts."""
         return Silhouettes(self.pixels + other[0], self.different + other[1])
 
     def claim_few(self, what: str) -> None:
-        """Fail if more than one in a hundred differ."""
+        """Fail if more than one pixel in a hundred differs."""
         claim(
             self.different <= 0.01 * self.pixels,
             f"{what}{self.different} of {self.pixels} pixels at silhouettes differ from what they should be; expected "
@@ -369,7 +372,7 @@ def reference(part: Part, camera: Camera, layers: int = scenes.LAYERS) -> Expect
 
 
 def again(part: Part, camera: Camera, sampler: Any) -> Expected:
-    """The samples of a new object of the sampler's class, or of the reference where none can be made."""
+    """The samples of a new object of the sampler's class, or of the reference if none can be made."""
     new = _new(sampler)
     if new is None and is_of_triangles(part):
         return reference(part, camera)
@@ -378,12 +381,12 @@ def again(part: Part, camera: Camera, sampler: Any) -> Expected:
 
 
 def right(part: Part, camera: Camera, sampler: Any) -> Expected:
-    """The samples of the reference, or for a surface without triangles those of a new object of the sampler."""
+    """The samples of the reference; for a surface without triangles, those of a new object of the sampler."""
     return reference(part, camera) if is_of_triangles(part) else again(part, camera, sampler)
 
 
 def _new(sampler: Any) -> Any:
-    """Another object of a sampler's class; None if it might have been made with arguments."""
+    """A new object of a sampler's class; None if the class may need arguments."""
     kind = type(registry.instance("rts.samplers", sampler) if isinstance(sampler, str) else sampler)
     plain = kind.__init__ is object.__init__ or len(inspect.signature(kind.__init__).parameters) == 1
     if not (isinstance(sampler, str) or plain):
@@ -394,28 +397,28 @@ def _new(sampler: Any) -> Any:
         return None
 
 
-def claim_like(found: Sampled, expected: Expected, what: str) -> Silhouettes:
-    """Fail unless samples have the ids and depths expected, save at silhouettes."""
+def claim_like(actual: Sampled, expected: Expected, what: str) -> Silhouettes:
+    """Fail unless samples have the expected ids and depths, except at silhouettes."""
     sampled, edge, source = expected
-    different = (_ids(found) != _ids(sampled)).any(axis=(0, -1)) | (_covered(found) != _covered(sampled)).any(axis=0)
+    different = (_ids(actual) != _ids(sampled)).any(axis=(0, -1)) | (_covered(actual) != _covered(sampled)).any(axis=0)
     inside = different & ~edge
     claim(
         not inside.any(),
         f"{what}: {inside.sum()} of {(~edge).sum()} pixels inside have other triangles than {source}, the first at "
         f"{tuple(np.argwhere(inside)[0].tolist()) if inside.any() else ()} of the grid",
     )
-    off = _off(found, sampled) & ~different
+    off = _off(actual, sampled) & ~different
     claim(not off.any(), f"{what}: the depth of {off.sum()} samples is not that of {source}, by more than 1e-5 of it")
     return Silhouettes(int(edge.sum()), int((different & edge).sum()))
 
 
 def is_of_triangles(part: Part) -> bool:
-    """Whether the part's surface gives triangles."""
+    """True if the part's surface has triangles."""
     return isinstance(scenes.checked(part).surface, TriangleSurface)
 
 
 def _edges(sampled: Sampled) -> np.ndarray:
-    """(H, W) bool, pixels whose number of layers is not that of all around."""
+    """Mask (H, W) bool of pixels whose number of layers differs from a neighbour's."""
     count = np.pad(_covered(sampled).sum(axis=0), 1, mode="edge")
     height, width = scenes.GRID
     around = np.stack([count[i : i + height, j : j + width] for i in range(3) for j in range(3)])
@@ -426,15 +429,15 @@ def _covered(sampled: Sampled) -> np.ndarray:
     return np.asarray(sampled.row) >= 0
 
 
-def _off(found: Sampled, expected: Sampled) -> np.ndarray:
-    """(K, H, W) bool, cells whose depths differ by more than a share of 1e-5."""
-    depth, other = np.asarray(found.depth), np.asarray(expected.depth)
+def _off(actual: Sampled, expected: Sampled) -> np.ndarray:
+    """Mask (K, H, W) bool of cells whose depths differ by more than 1e-5 of themselves."""
+    depth, other = np.asarray(actual.depth), np.asarray(expected.depth)
     return np.abs(depth - other) > 1e-5 * other
 
 
-def _differing(found: Sampled, expected: Sampled) -> np.ndarray:
-    """(K, H, W) bool, cells that hold other ids, or other depths."""
-    return (_ids(found) != _ids(expected)).any(axis=-1) | _off(found, expected)
+def _differing(actual: Sampled, expected: Sampled) -> np.ndarray:
+    """Mask (K, H, W) bool of cells with different ids or depths."""
+    return (_ids(actual) != _ids(expected)).any(axis=-1) | _off(actual, expected)
 
 
 def _scaled(part: Part, scale: float) -> Part:
@@ -444,7 +447,7 @@ def _scaled(part: Part, scale: float) -> Part:
 
 
 def _ids(sampled: Sampled) -> np.ndarray:
-    """(K, H, W, I) the ids in each cell, −1 where empty."""
+    """Ids (K, H, W, I) in each cell; −1 in empty ones."""
     row = np.asarray(sampled.row)
     return np.where((row >= 0)[..., None], np.asarray(sampled.samples[0].ids)[row], -1)
 
@@ -453,7 +456,7 @@ def _scenes(parts: list[Part]) -> list[tuple[str, Camera, Part]]:
     return [(f"part {i}, {view}", c, p) for i, p in enumerate(parts) for view, c in scenes.VIEWS.items()]
 
 
-def _claim_same(found: Sampled, expected: Sampled, view: str) -> None:
-    pairs = zip(leaves(found), leaves(expected), strict=True)
+def _claim_same(actual: Sampled, expected: Sampled, view: str) -> None:
+    pairs = zip(leaves(actual), leaves(expected), strict=True)
     same = all(np.array_equal(a, b) for a, b in pairs)
     claim(same, f"{view}: the same call gives other samples after another one")

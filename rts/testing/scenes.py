@@ -1,4 +1,4 @@
-"""Cameras and parts that the kit looks at; everything lies about the origin, within two units of it."""
+"""Cameras and parts for the kit's checks; everything lies about the origin, within two units of it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
 
 
 def _rounded(camera: Camera) -> Camera:
-    """The camera rounded to float32, so that every engine sees the same one."""
+    """The camera rounded to float32, the same for every engine."""
     return camera.map(single)
 
 
@@ -32,7 +32,7 @@ def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: A
 
 
 def shifted(camera: Camera, by: float, axis: int) -> Camera:
-    """A camera whose picture is shifted by a part of a pixel, along x (axis 0) or y."""
+    """A camera whose image is shifted by part of a pixel, along x (axis 0) or y."""
     shift = np.eye(4)
     shift[axis, 3] = 2 * by / SIZE[1 - axis]
     return camera.replace(projection=shift @ camera.projection)
@@ -43,7 +43,7 @@ AWAY = _look((0, 0, 5), (0, 0, 9))
 AFAR = _look((5, 9, 18))
 BESIDE = _look((0, 0, 5), (40, 0, 5.5))
 NEAR = _look((0.9, 1.6, 3.2), near=3.4, far=4.2)
-"""Its near plane cuts through what is about the origin, and its far plane too."""
+"""A camera whose near and far planes cut through the parts about the origin."""
 
 INSIDE = _look((0.1, 0.05, 0.2), (0.6, 0.2, -1), near=0.05, far=20, fov_y=75)
 PARALLEL = _rounded(
@@ -78,7 +78,7 @@ def flat() -> Part:
 
 
 def checked(part: Part) -> Part:
-    """The part as samplers and the core see it."""
+    """The part as the core checks it for samplers."""
     return check_scene(part, CAMERA)[0][0]
 
 
@@ -88,7 +88,7 @@ def find(part: Part, camera: Camera = CAMERA, sampler: Any = "auto", layers: int
 
 
 def frozen(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Sampled:
-    """Samples of NumPy arrays to evaluate at in any engine, always of the same number of rows."""
+    """Samples of NumPy arrays, to evaluate in any engine; their number of rows is fixed."""
     sampled = find(part, camera, sampler, capacity=CAPACITY)
     claim(
         (np.asarray(sampled.row) >= 0).sum() >= 20,
@@ -98,10 +98,10 @@ def frozen(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Sample
 
 
 def shown(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Array:
-    """An image, in the engine of the part; with the splatter that costs least and has derivatives everywhere."""
+    """An image in the engine of the part, by the cheapest splatter with derivatives everywhere."""
     return render(part, camera, SIZE, sampler=sampler, splatter="single", layers=LAYERS, capacity=CAPACITY)
 
 
 def shown_at(sampled: Sampled, part: Part, camera: Camera = CAMERA) -> Array:
-    """The image of samples that were found before."""
+    """The image of given samples."""
     return render_samples(sampled, part, camera, splatter="single")

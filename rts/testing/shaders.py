@@ -1,4 +1,4 @@
-"""What every shader must do."""
+"""Checks that every shader must pass."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ TOLERANCE = 1e-5
 class ShaderConformance(Conformance):
     """Checks of a shader.
 
-    Override the fixture `shader`: its name, an object or a function; `theta` where it reads any of θ; and `gbuffer`
-    where it reads entries other than position, normal, uv and color.
+    Override the fixture `shader`: its name, an object or a function; `theta` if it reads entries of θ; and `gbuffer` if
+    it reads entries other than position, normal, uv and color.
     """
 
     @pytest.fixture
@@ -52,7 +52,7 @@ class ShaderConformance(Conformance):
     def test_it_gives_a_premultiplied_color_for_each_sample(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """Colours are (N, 4) in the G-buffer's dtype, within [0, 1], and none is above alpha.
 
-        Of a shader with other `channels` it is (N, C + 1), and only alpha is within [0, 1].
+        A shader with other `channels` gives (N, C + 1), of which only alpha must be within [0, 1].
         """
         rgba = _shaded(shader, theta, gbuffer)
         expected = ROWS, _instance(shader).channels + 1
@@ -68,25 +68,28 @@ class ShaderConformance(Conformance):
         """A sample's colour depends neither on the order of samples nor on the other samples."""
         rgba = _shaded(shader, theta, gbuffer)
         order = np.random.default_rng(1).permutation(ROWS)
-        found = _shaded(shader, theta, {name: value[order] for name, value in gbuffer.items()})
-        claim_close(found, rgba[order], TOLERANCE, "the colour of permuted samples")
+        permuted = _shaded(shader, theta, {name: value[order] for name, value in gbuffer.items()})
+        claim_close(permuted, rgba[order], TOLERANCE, "the colour of permuted samples")
         half = _shaded(shader, theta, {name: value[: ROWS // 2] for name, value in gbuffer.items()})
         claim_close(half, rgba[: ROWS // 2], TOLERANCE, "the colour of samples shaded without the others")
 
     def test_lengths_of_directions_have_no_effect(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Normals, and the direction of θ["light"], may be of any length: colours are the same."""
+        """Colours do not depend on the lengths of normals, or of the direction in θ["light"]."""
         rgba = _shaded(shader, theta, gbuffer)
         if "normal" in gbuffer:
             lengths = np.random.default_rng(2).uniform(0.25, 4, (ROWS, 1)).astype(np.float32)
-            found = _shaded(shader, theta, {**gbuffer, "normal": lengths * gbuffer["normal"]})
+            other = _shaded(shader, theta, {**gbuffer, "normal": lengths * gbuffer["normal"]})
             claim_close(
-                found, rgba, TOLERANCE, "the colour with normals of other lengths (see `unit` of rts.plugin_api.arrays)"
+                other,
+                rgba,
+                TOLERANCE,
+                "the colour with normals of other lengths (see `unit` of rts.plugin_api.arrays)",
             )
         light = theta.get("light")
         if isinstance(light, Mapping) and "direction" in light:
             longer = {**theta, "light": {**light, "direction": 3 * np.asarray(light["direction"])}}
-            found = _shaded(shader, longer, gbuffer)
-            claim_close(found, rgba, TOLERANCE, "the colour with a light's direction three times as long")
+            other = _shaded(shader, longer, gbuffer)
+            claim_close(other, rgba, TOLERANCE, "the colour with a light's direction three times as long")
 
     def test_opaque_is_true(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that promises to be opaque has alpha 1, exactly."""
@@ -96,7 +99,7 @@ class ShaderConformance(Conformance):
         claim((alpha == 1).all(), f"the shader promises to be opaque; alpha is {alpha.min():.3g} somewhere")
 
     def test_uniform_is_one_color(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """A shader that promises one colour gives it to all samples, through any camera."""
+        """A shader that promises to be uniform gives all samples one colour, through any camera."""
         instance, theta = _instance(shader), map_leaves(derivatives.single, theta)
         if not promised(instance, "uniform"):
             pytest.skip("the shader does not promise one colour")
@@ -107,18 +110,18 @@ class ShaderConformance(Conformance):
             claim((rgba == first).all(), f"the shader promises one colour; from {view} there are others")
 
     def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Given only position and the entries that `reads` names, of the G-buffer and of θ, colours are the same."""
+        """Colours need only position and the entries that `reads` names, of the G-buffer and of θ."""
         reads = promised(_instance(shader), "reads")
         if reads is None:
             pytest.skip("the shader does not say what it reads")
         fewer = {name: value for name, value in gbuffer.items() if name in ("position", *reads)}
         few = {name: value for name, value in theta.items() if name in reads}
         with no_error(f"shading with position, {', '.join(reads)} only, as `reads` says"):
-            found = _shaded(shader, few, fewer)
-        claim_close(found, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads`")
+            colors = _shaded(shader, few, fewer)
+        claim_close(colors, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads`")
 
     def test_samples_of_several_views_are_shaded_as_by_each(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """A shader that takes samples of several views gives each the colour that it has through its own camera."""
+        """A shader that takes samples of several views gives each the colour seen by its own camera."""
         own: Any = _instance(shader)
         if not promised(own, "takes_views"):
             pytest.skip("the shader does not take samples of several views")
@@ -129,10 +132,10 @@ class ShaderConformance(Conformance):
         cameras, single = [scenes.CAMERA, scenes.NEAR], map_leaves(derivatives.single, theta)
         number = np.repeat(np.array([1, 2], np.int32), [ROWS // 4, ROWS - ROWS // 4])
         with no_error("shading samples of two views with RowCameras"):
-            found = own(single, GBuffer(gbuffer), RowCameras.of(cameras, number))
+            colors = own(single, GBuffer(gbuffer), RowCameras.of(cameras, number))
         first, second = (np.asarray(own(single, GBuffer(gbuffer), camera)) for camera in cameras)
         expected = np.where(number[:, None] == 1, first, second)
-        claim_close(found, expected, TOLERANCE, "the colour of samples of two views")
+        claim_close(colors, expected, TOLERANCE, "the colour of samples of two views")
 
     # -------------------------------------------------------------------------------------- derivatives
 
@@ -148,7 +151,7 @@ class ShaderConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_are_finite_differences(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
-        """The gradient in every entry of θ is that of finite differences."""
+        """The gradient in every entry of θ agrees with finite differences."""
         chosen, (values, join) = differentiating(engine), split(theta)
         values = [v.astype(np.float64) for v in values]
         if not values:
@@ -183,13 +186,13 @@ class ShaderConformance(Conformance):
             return _call(shader, join(x), chosen)
 
         ones = np.ones((ROWS, _instance(shader).channels + 1))
-        found = derivatives.derivatives(chosen, f, values, derivatives.directions(values), ones)
-        claim_finite(found, f"in {engine}, the colour of awkward samples or its derivative")
+        result = derivatives.derivatives(chosen, f, values, derivatives.directions(values), ones)
+        claim_finite(result, f"in {engine}, the colour of awkward samples or its derivative")
 
     # ------------------------------------------------------------------------------------------- errors
 
     def test_what_is_missing_is_refused_in_one_line(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Without an entry of θ or the G-buffer a shader works, or raises an `rts.InputError` that says what to do."""
+        """A shader without an entry of θ or the G-buffer works, or raises an `rts.InputError` that says what to do."""
         for name in theta:
             fewer = {k: v for k, v in theta.items() if k != name}
             refusal(lambda fewer=fewer: _shaded(shader, fewer, gbuffer), f"theta without {name!r}")
@@ -199,7 +202,7 @@ class ShaderConformance(Conformance):
 
 
 def random_gbuffer() -> dict[str, np.ndarray]:
-    """What surfaces usually provide, at points about the origin."""
+    """Usual entries of the G-buffer, at random points about the origin."""
     rng = np.random.default_rng(0)
     normal = rng.standard_normal((ROWS, 3))
     return {
@@ -234,7 +237,7 @@ def _instance(shader: Any) -> Shader:
 
 
 def _call(shader: Any, inputs: dict, engine: Engine | None) -> Any:
-    """The colours for {"theta": …, "gbuffer": …}, constants made those of the engine."""
+    """The colours for {"theta": …, "gbuffer": …}, with constants of the engine."""
     engine = engine or engine_of(inputs)
     inputs, camera = constants((inputs, scenes.CAMERA), engine, None)
     return _instance(shader)(inputs["theta"], GBuffer(inputs["gbuffer"]), camera)

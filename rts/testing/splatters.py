@@ -1,4 +1,4 @@
-"""What every splatter must do."""
+"""Checks that every splatter must pass."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ TOLERANCE = 1e-5
 class SplatterConformance(Conformance):
     """Checks of a splatter.
 
-    Override the fixture `splatter`: its name, or an object. Set `moves_edges = False` for one that deliberately has no
-    derivative where surfaces end.
+    Override the fixture `splatter`: its name, or an object. Set `moves_edges = False` if it has no derivative at
+    outlines, on purpose.
     """
 
     moves_edges = True
@@ -52,7 +52,7 @@ class SplatterConformance(Conformance):
             claim_close(inside, expected, TOLERANCE, f"a constant colour of {layers} layers")
 
     def test_the_front_layer_hides_those_behind(self, splatter: Any) -> None:
-        """A front layer that is opaque and covers everything hides all others."""
+        """An opaque front layer that covers everything hides all others."""
         splats = everywhere(LAYERS)
         rgba = splats.rgba.copy()
         rgba[splats.row[0].ravel()] = [1, 0, 0, 1]
@@ -62,7 +62,7 @@ class SplatterConformance(Conformance):
         claim_close(image, np.broadcast_to([1, 0, 0, 1], image.shape), TOLERANCE, "the color of a covered surface")
 
     def test_empty_cells_stay_empty(self, splatter: Any) -> None:
-        """An image of zeros where no cell within reach has a sample: row −1 is no sample."""
+        """The image is zero where no cell within reach has a sample: row −1 is no sample."""
         splats = everywhere(LAYERS)
         image = _splat(splatter, splats.replace(row=np.full_like(splats.row, -1)))
         claim((image == 0).all(), "an image without samples is not zero; row −1 means that there is none")
@@ -91,7 +91,7 @@ class SplatterConformance(Conformance):
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image of permuted rows")
 
     def test_rows_of_no_cell_have_no_effect(self, splatter: Any) -> None:
-        """Rows that only pad have no effect on the image, whatever their values."""
+        """Padding rows have no effect on the image, whatever their values."""
         splats = scattered()
         unused = np.setdiff1d(np.arange(CELLS), splats.row)
         positions, rgba = splats.positions.copy(), splats.rgba.copy()
@@ -100,7 +100,7 @@ class SplatterConformance(Conformance):
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
 
     def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
-        """Without the samples that `needed` leaves out, image and derivative are the same."""
+        """Samples that `needed` leaves out affect neither image nor derivative."""
         chosen = _instance(splatter)
         if not overrides(chosen, "needed", Splatter):
             pytest.skip("the splatter does not say which samples it needs")
@@ -114,11 +114,11 @@ class SplatterConformance(Conformance):
         claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
         for engine in installed()[:1]:
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
-            found, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
-            claim_close(found, expected, 1e-4, "the derivative of needed samples")
+            actual, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
+            claim_close(actual, expected, 1e-4, "the derivative of needed samples")
 
     def test_settled_cells_show_the_colors_that_they_name(self, splatter: Any) -> None:
-        """Settled cells show the colour of the sample that they name; what only they need may be missing."""
+        """Settled cells show the colour of the sample that they name; samples that only they need may be missing."""
         chosen = _instance(splatter)
         if not promised(chosen, "fills_interiors"):
             pytest.skip("the splatter does not read which cells are settled")
@@ -133,13 +133,13 @@ class SplatterConformance(Conformance):
         claim_close(_splat(splatter, known), _splat(splatter, splats), TOLERANCE, "the image of settled cells")
         for engine in installed()[:1]:
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
-            found, expected = (_along(engine, splatter, s, along) for s in (known, splats))
-            claim_close(found, expected, 1e-4, "the derivative of settled cells")
-            found, expected = (_gradients_of_colors(engine, splatter, s) for s in (known, splats))
-            claim_close(found, expected, 1e-4, "the gradients of the colours that settled cells show")
+            actual, expected = (_along(engine, splatter, s, along) for s in (known, splats))
+            claim_close(actual, expected, 1e-4, "the derivative of settled cells")
+            actual, expected = (_gradients_of_colors(engine, splatter, s) for s in (known, splats))
+            claim_close(actual, expected, 1e-4, "the gradients of the colours that settled cells show")
 
     def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
-        """`cropped` gives the image of all cells, without the border."""
+        """`cropped` returns the image of all cells, without the border."""
         whole = _splat(splatter, scattered())
         for border in (1, 2):
             image = np.asarray(_instance(splatter).cropped(scattered().replace(border=border)))
@@ -161,7 +161,7 @@ class SplatterConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_a_shape_that_moves_brightens_what_it_moves_into(self, splatter: Any, engine: str) -> None:
-        """The derivative of a square that moves to the right, and down, has the right sign at its edges."""
+        """The derivative of a square has the right sign at its edges as it moves to the right, and down."""
         if not self.moves_edges:
             pytest.skip("the splatter deliberately has no derivative at edges")
         chosen, splats = differentiating(engine), square()
@@ -184,14 +184,14 @@ class SplatterConformance(Conformance):
             claim_close(image, _splat(splatter, splats), TOLERANCE, f"the image in {engine}")
 
     def test_engines_agree(self, splatter: Any) -> None:
-        """Engines agree on image, gradient and derivative along a direction; both modes are one derivative."""
+        """Engines agree on image, gradient and derivative along a direction; forward and reverse mode agree."""
         splats = scattered(LAYERS + 1)
         f, given = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
         derivatives.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
-        """Rows of no cell have a gradient of zero, as have all where nothing is seen; none is NaN."""
+        """Rows of no cell have a gradient of zero, as have all rows of an empty image; none is NaN."""
         chosen, splats = differentiating(engine), scattered()
         for row in (splats.row, np.full_like(splats.row, -1)):
             f = _of_positions_and_colors(splatter, row)
@@ -214,7 +214,7 @@ def everywhere(layers: int) -> Splats:
 
 
 def scattered(layers: int = LAYERS) -> Splats:
-    """Samples off the centres of some cells, of any colour and depth; a layer only behind another one."""
+    """Samples off the centres of some cells, of random colour and depth; deeper layers only behind others."""
     rng, count = np.random.default_rng(5), HEIGHT * WIDTH * layers
     splats = everywhere(layers)
     off = rng.uniform(-0.2, 0.2, (count, 3)) + np.linspace(0, 1, count)[:, None] * [0, 0, 0.3]
@@ -227,7 +227,7 @@ def scattered(layers: int = LAYERS) -> Splats:
 
 
 def steps() -> Splats:
-    """Opaque samples on centres: a square before a sheet, whose own back is behind it, and a hole in both."""
+    """Opaque samples at centres: a sheet with its back behind it, a square before both, and a hole through all."""
     splats = everywhere(LAYERS + 1)
     positions, row = splats.positions.copy(), splats.row.copy()
     positions[:, 2] += 0.05 * positions[:, 0]
@@ -243,7 +243,7 @@ def steps() -> Splats:
 
 
 def two_colors() -> tuple[Splats, np.ndarray]:
-    """Opaque samples on centres, of one colour on the left and of another, and `Splats.settled` amid either."""
+    """Opaque samples at centres, of one colour on the left and of another on the right, with cells settled in both."""
     splats, settled = everywhere(1), np.full((HEIGHT, WIDTH), -1, np.int32)
     rgba = np.where(_on_the_left(splats)[:, None], LEFT, RIGHT).astype(np.float32)
     settled[1:-1, 1 : SEAM - 1] = splats.row[0, 0, SEAM - 1]
@@ -252,7 +252,7 @@ def two_colors() -> tuple[Splats, np.ndarray]:
 
 
 def _on_the_left(splats: Splats) -> np.ndarray:
-    """Which samples (N,) of `two_colors` have the colour on the left."""
+    """Mask (N,) of the samples of `two_colors` with the colour on the left."""
     return splats.positions[:, 0] < SEAM
 
 
@@ -293,10 +293,10 @@ def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.
 
 
 def _gradients_of_colors(engine: Any, splatter: Any, splats: Splats) -> np.ndarray:
-    """(2, 4) the gradients of a sum over the image in the two colours of `two_colors`."""
+    """Gradients (2, 4) of a sum over the image in the two colours of `two_colors`."""
     weights, left = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4)), _on_the_left(splats)
     given, w = derivatives.on(engine, (splats, weights))
     image, xp = _instance(splatter).cropped, engine.namespace
-    _, found = engine.value_and_grad(lambda x: xp.sum(image(given.replace(rgba=x[0])) * w))([given.rgba])
-    (gradient,) = derivatives.host(engine, found)
+    _, gradients = engine.value_and_grad(lambda x: xp.sum(image(given.replace(rgba=x[0])) * w))([given.rgba])
+    (gradient,) = derivatives.host(engine, gradients)
     return np.stack([gradient[left].sum(axis=0), gradient[~left].sum(axis=0)])

@@ -1,4 +1,4 @@
-"""What every surface must do."""
+"""Checks that every surface must pass."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ STEP = 1e-5
 class SurfaceConformance(Conformance):
     """Checks of a surface.
 
-    Override the fixture `part`: an `rts.Part` of it about the origin, within two units, whose θ holds NumPy arrays; and
-    `sampler` where "auto" is not to choose.
+    Override the fixture `part`: an `rts.Part` of it about the origin, within two units, whose θ holds NumPy arrays. To
+    try another sampler than "auto" chooses, override `sampler`, too.
     """
 
     @pytest.fixture
@@ -58,7 +58,7 @@ class SurfaceConformance(Conformance):
             claim_ordered(scenes.find(part, camera, sampler), view)
 
     def test_refine_keeps_samples_on_their_rays(self, part: Part) -> None:
-        """`refine` makes of each sample a point of the surface on its ray, at its depth, or sets `row` to −1."""
+        """`refine` moves each sample along its ray onto the surface, with its depth, or sets `row` to −1."""
         surface = scenes.checked(part).surface
         if not (isinstance(surface, TriangleSurface) and surface.refines):
             pytest.skip("the surface has no refine")
@@ -68,7 +68,7 @@ class SurfaceConformance(Conformance):
             claim_misses_dropped(part, surface)
 
     def test_rays_from_before_a_hit_find_it(self, part: Part) -> None:
-        """`intersect` from just short of each hit gives that hit: a tracer that steps through the surface fails."""
+        """`intersect` from just before each hit finds that hit: a tracer that steps through the surface fails."""
         surface = scenes.checked(part).surface
         if not isinstance(surface, RaySurface):
             pytest.skip("the surface does not intersect rays itself")
@@ -76,7 +76,7 @@ class SurfaceConformance(Conformance):
             claim_found_again(part, surface, camera, view)
 
     def test_rays_from_behind_hit_the_same_places(self, part: Part) -> None:
-        """`intersect` finds all hits of a ray, whichever way it goes."""
+        """`intersect` finds the same hits from either end of a ray."""
         surface = scenes.checked(part).surface
         if not isinstance(surface, RaySurface):
             pytest.skip("the surface does not intersect rays itself")
@@ -84,7 +84,7 @@ class SurfaceConformance(Conformance):
             claim_found_from_behind(part, surface, camera, view)
 
     def test_two_renders_are_the_same(self, part: Part, sampler: Any) -> None:
-        """Two renders agree to the last bit, whatever was rendered between; changes of arrays in place are seen."""
+        """Two renders agree to the last bit, despite others in between; changes of arrays in place are seen."""
         values, join = split(part.theta)
         other = part.replace(theta=join([0.9 * v for v in values]))
         first, different = (scenes.shown(p, sampler=sampler) for p in (part, other))
@@ -102,7 +102,7 @@ class SurfaceConformance(Conformance):
     # ----------------------------------------------------------------------------------------- evaluate
 
     def test_the_g_buffer_has_a_row_for_each_sample(self, part: Part, sampler: Any) -> None:
-        """The G-buffer holds (N, C) finite numbers in θ's dtype, even where a row is only padding: all zeros."""
+        """The G-buffer holds (N, C) finite numbers in θ's dtype, even in padding rows of zeros."""
         samples = map_leaves(derivatives.single, scenes.find(part, sampler=sampler).samples[0])
         widths, declared = (samples.ids.shape[1], samples.params.shape[1]), tuple(part.surface.sample_widths)
         claim(widths == declared, f"samples have ids and params of widths {widths}; sample_widths says {declared}")
@@ -117,7 +117,7 @@ class SurfaceConformance(Conformance):
                 claim_finite(value, f"{name!r} of {kind} samples")
 
     def test_triangles_have_their_corners_on_the_surface(self, part: Part) -> None:
-        """The `proxy`'s ids and parameters of a corner evaluate to that corner, also when θ has changed."""
+        """The `proxy`'s ids and parameters of a corner evaluate to that corner, also after θ has changed."""
         surface = triangles_of(part)
         values, join = split(part.theta)
         for scale, when in ((1.0, ""), (0.9, ", asked again with another θ (is something kept on the object?)")):
@@ -133,40 +133,40 @@ class SurfaceConformance(Conformance):
         claim_inputs_change(part, triangles_of(part), sampler)
 
     def test_normals_stand_upright(self, part: Part, sampler: Any) -> None:
-        """Normals are not zero, and perpendicular to the surface where it is more than its triangles."""
+        """Normals are not zero; they are perpendicular to the surface, unless it consists of its triangles."""
         claim_upright(part, sampler)
 
     def test_the_surface_follows_theta(self, part: Part, sampler: Any) -> None:
-        """Points at kept samples stay on the surface while θ changes a little: `evaluate` moves as the surface does."""
+        """Points at kept samples stay on the surface while θ changes a little."""
         claim_followed(part, sampler)
 
     def test_tessellate_gives_a_mesh_on_the_surface(self, part: Part, sampler: Any) -> None:
-        """A mesh of the surface lies on it, has as many triangles as the rate says, and is nearer at a higher rate."""
+        """A mesh of the surface lies on it, has the rate's number of triangles, and is closer at a higher rate."""
         claim_tessellated(part, triangles_of(part), sampler)
 
     def test_rates_are_the_surface_coarser_or_finer(self, part: Part, sampler: Any) -> None:
-        """Each of `rates` has a setting and work, and shows the surface; more work shows it better."""
+        """Each of `rates` has a setting and an amount of work, and shows the surface; more work shows it better."""
         if not part.surface.rates(_single(part.theta)):
             pytest.skip("the surface has no rates")
         claim_rates(part, sampler)
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
-        """`evaluate` looks at no value of θ, and uses nothing but its namespace."""
+        """`evaluate` reads no value of θ, and uses its namespace alone."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
         samples = derivatives.on(chosen, sampled)
         with no_error(f"evaluate compiled by {engine}"):
             evaluate = chosen.jit(lambda x: part.surface.evaluate(joined(chosen, join, x), samples)["position"])
-            found = chosen.to_numpy(evaluate(derivatives.on(chosen, values)))
+            positions = chosen.to_numpy(evaluate(derivatives.on(chosen, values)))
         expected = _evaluated(part, _single(part.theta), sampled)["position"]
-        claim_close(found, expected, 1e-5, f"position compiled by {engine}")
+        claim_close(positions, expected, 1e-5, f"position compiled by {engine}")
 
     # -------------------------------------------------------------------------------------- derivatives
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_at_frozen_samples_are_finite_differences(self, part: Part, sampler: Any, engine: str) -> None:
-        """Gradients of every entry of the G-buffer in every entry of θ are those of finite differences."""
+        """Gradients of every entry of the G-buffer in every entry of θ agree with finite differences."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         values = [v.astype(np.float64) for v in values]
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
@@ -191,7 +191,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_forward_and_reverse_mode_agree(self, part: Part, sampler: Any, engine: str) -> None:
-        """Both modes of differentiation give one derivative of the whole G-buffer, weighted at random."""
+        """Forward and reverse mode agree on the whole G-buffer, weighted at random."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         samples = scenes.frozen(part, sampler=sampler).samples[0]
         rows = _evaluated(part, part.theta, samples)
@@ -202,8 +202,8 @@ class SurfaceConformance(Conformance):
             gbuffer = part.surface.evaluate(joined(chosen, join, x), on_device)
             return chosen.namespace.concat([gbuffer[name] for name in rows], axis=1)
 
-        found = derivatives.derivatives(chosen, everything, values, along, weights)
-        derivatives.claim_consistent(found, along, weights, f"the G-buffer ({', '.join(rows)}) in {engine}")
+        result = derivatives.derivatives(chosen, everything, values, along, weights)
+        derivatives.claim_consistent(result, along, weights, f"the G-buffer ({', '.join(rows)}) in {engine}")
 
     def test_engines_agree(self, part: Part, sampler: Any) -> None:
         """Engines agree on image, gradient and derivative along a direction, at the same samples."""
@@ -243,7 +243,7 @@ class SurfaceConformance(Conformance):
         claim_awkward_views_are_finite(part, sampler, differentiating(engine))
 
     def test_wrong_theta_is_refused_in_one_line(self, part: Part, sampler: Any) -> None:
-        """An entry that is missing or has a wrong shape is an `rts.InputError` that says what to do."""
+        """A missing entry, or one of a wrong shape, raises an `rts.InputError` that says what to do."""
         reads = scenes.checked(part).surface.reads(part.theta)
         part = part.replace(shader="silhouette")
 

@@ -17,14 +17,14 @@ from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_finite, no_error
 
 CUTS = 4, 8
-"""Cuts along each side of a patch: twice as many make four times as many triangles, and lie four times as near."""
+"""Cuts along each side of a patch: twice as many make four times the triangles, at a quarter of the distance."""
 
 FOURFOLD = 3.4, 5.0
 NEARER, EXACT = 0.5, 2e-4
-"""What share of the distance is left at twice the rate, and which distance is none."""
+"""The share of the distance that may remain at twice the rate, and the distance that counts as none."""
 
 OFF = 0.02
-"""How far a mesh may be off the surface, as a rate in the units of θ."""
+"""The largest distance of a mesh from the surface, as a rate, in the units of θ."""
 
 
 def claim_tessellated(part: Part, surface: TriangleSurface, sampler: Any) -> None:
@@ -55,7 +55,7 @@ def claim_tessellated(part: Part, surface: TriangleSurface, sampler: Any) -> Non
 
 
 def claim_rates(part: Part, sampler: Any) -> None:
-    """Fail unless each of `rates` is the surface in another form, and more work comes nearer to it."""
+    """Fail unless each of `rates` gives a form of the surface, and more work comes nearer to it."""
     part = part.replace(theta=map_leaves(derivatives.single, part.theta))
     depths, off = _front(part, sampler), []
     for rate in part.surface.rates(part.theta):
@@ -93,16 +93,16 @@ def _claim_mesh(vertices: Any, faces: Any, what: str) -> None:
 
 
 def _front(part: Part, sampler: Any) -> np.ndarray:
-    """The depths (H, W) of what is seen first, NaN where nothing is."""
+    """Depths (H, W) of the front layer; NaN in empty cells."""
     try:
-        found = scenes.find(part, sampler=sampler)
+        sampled = scenes.find(part, sampler=sampler)
     except InputError as error:
         raise AssertionError(f"a coarser or finer form is refused: {error}") from error
-    return np.where(np.asarray(found.row)[0] >= 0, np.asarray(found.depth)[0], np.nan)
+    return np.where(np.asarray(sampled.row)[0] >= 0, np.asarray(sampled.depth)[0], np.nan)
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:
-    """How far two depths are apart in the middle, where both see the surface."""
+    """The median difference of two depths, over cells where both see the surface."""
     apart = np.abs(one - other)
     both = np.isfinite(apart)
     claim(both.sum() >= 0.3 * np.isfinite(one).sum(), "a coarser or finer form is seen elsewhere than the surface")

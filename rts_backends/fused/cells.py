@@ -1,8 +1,8 @@
 """The splatters of `rts.splatting` and their first derivatives as compiled loops on all cores, NumPy in and out.
 
 Every target collects from its nine sources, and in the reverse direction every source from its nine targets, each in
-one fixed order: results do not depend on the number of threads. Most targets are plain (`stencil.py`); what is
-decided for the others, the mixed ones (`mixed_targets.py`), is decided once and kept in `Cells`.
+one fixed order: results do not depend on the number of threads. Most targets are plain (`stencil.py`). Choices for
+the others, the mixed ones (`mixed_targets.py`), are made once and kept in `Cells`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rts_backends.fused.rows import Grid
 from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
-"""Samples whose colours settled targets show, beyond which gradients are added one by one."""
+"""The most samples shown by settled targets for which gradients are summed line by line; more are added one by one."""
 
 
 class Settings(NamedTuple):
@@ -37,9 +37,9 @@ class Settings(NamedTuple):
         epsilon: excess of the weights' sum over one.
         gamma: the calibration.
         border: rows and columns at each side of the cells that are no part of the image.
-        one_part: whether all samples are known to be of one part.
-        rims: whether coverage moves as outlines do, in `visible`.
-        crossings: whether lines where surfaces cross move as their depths say, in `visible`.
+        one_part: whether all samples belong to one part.
+        rims: `visible` only: whether coverage moves as outlines do.
+        crossings: `visible` only: whether lines of crossing move as depths say.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Settings(NamedTuple):
 
 
 class Choices(NamedTuple):
-    """The targets whose sources are not all paired front to front, and which layers these take.
+    """Mixed targets, whose sources are not all paired front to front, and the layers that they take.
 
     Attributes:
         mixed: (H, W) uint8, 1 at such targets.
@@ -62,11 +62,12 @@ class Choices(NamedTuple):
         ranges: (M, 9, 3, 2), first and last + 1 of the layers that each source gives to each buffer; source 3 (v + 1) +
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
-        states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
-        ends: (H, W) uint16, where fronts end, and targets that outlines may cover in part (`survey.py`); or no rows.
+        states: (H, W) uint8, states of targets (`uniform_cells.py`); mixed ones are EMPTY here.
+        ends: (H, W) uint16, where fronts end, and targets that outlines may cover in part (`uniform_cells.py`); or no
+            rows.
         listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
-        extent: of the fronts' depths, the camera's included.
+        extent: largest less least depth of the fronts, the camera's 0 included.
     """
 
     mixed: np.ndarray
@@ -89,15 +90,15 @@ class Cells:
         positions: (N, 3) float32 or float64, pixel position and linear depth.
         rgba: (N, 4), of the same dtype, premultiplied colours.
         row: (K, H, W) signed integers, the sample of each cell, or −1.
-        choices: the choices for the same samples, if they are known.
-        part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known, or where all are
-            of one.
-        facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
+        choices: choices made earlier for the same samples, if any.
+        part: (K, H, W) integers, the part of each sample; None, or no layers, if unknown, or if all belong to one.
+        facing: (K, H, W) integers, the number of each sample's piece, its sign the side it shows; None, or no layers,
+            if unknown.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
-        settled: (H, W) integers, targets that show the colour of a sample, whatever moves, or −1; None, or no rows, for
-            none.
-        exits: (H, W) integers, the sample where the ray leaves the part of the front, or −1; None, or no rows, where
-            that is not told.
+        settled: (H, W) integers, the sample whose colour a target shows, whatever moves, or −1; None, or no rows, for
+            no such targets.
+        exits: (H, W) integers, the sample where the ray leaves the part of the front, or −1; None, or no rows, if
+            unknown.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -131,7 +132,7 @@ class Cells:
         self._settled = np.empty((0, row.shape[2]), np.int8) if settled is None else np.asarray(settled)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         if self._wanted is not None and len(self._settled):
-            # Beside settled targets those that nobody looks at may lack their samples, and seem to end there.
+            # Beside settled targets unwanted ones may lack their samples, so that fronts seem to end there.
             self._wanted = self._wanted & (self._settled < 0)
         self.visible, self.border, self.one_part = settings.kind == "visible", settings.border, settings.one_part
         self.rims = self.visible and settings.rims
@@ -148,11 +149,11 @@ class Cells:
 
     @cached_property
     def _shows_several(self) -> bool:
-        """Whether settled targets show the colours of other samples than that of row 0."""
+        """True if settled targets show the colours of other samples than that of row 0."""
         return self._settled.max(initial=-1) > 0
 
     def _paint(self, colors: np.ndarray, images: np.ndarray) -> None:
-        """Give settled targets of images (T, H, W, 4) the colours (T, N, 4) of samples; zeros of none."""
+        """Give settled targets of images (T, H, W, 4) the colours (T, N, 4) of samples; zeros where N is 0."""
         parallel(paint, images.shape[1], self.settled, self.border, read_only(colors), images, work=images.size // 8)
 
     @property
@@ -187,10 +188,10 @@ class Cells:
 
     @cached_property
     def choices(self) -> Choices:
-        """What is decided for each target."""
+        """The choices for each target, made on first use."""
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
-        # The codes of targets that are not settled, and that are.
+        # EMPTY for targets that are not settled, SETTLED for those that are.
         amid = self._settled >= 0
         states = amid.view(np.uint8).copy() if len(amid) else np.zeros((height, width), np.uint8)
         hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.bool_)
@@ -214,8 +215,8 @@ class Cells:
             parallel(listing.find, height, *given, marks, marked, work=self.row.size)
         # How an outline moves is decided by pairs up to two cells away.
         if layers > 1 and self._wanted is not None:
-            found, marks = marks, np.empty_like(marks)
-            parallel(listing.narrow, height, found, self._wanted, marks, marked, work=self.row[0].size)
+            before, marks = marks, np.empty_like(marks)
+            parallel(listing.narrow, height, before, self._wanted, marks, marked, work=self.row[0].size)
         if len(amid) and not self.visible:
             marks &= ~amid
             marked = marks.sum(axis=1, dtype=np.int64)
@@ -232,7 +233,7 @@ class Cells:
 
     @cached_property
     def outlines(self) -> Outlines:
-        """How outlines move, and what that changes; nothing without rims."""
+        """Motions of outlines, and the colours that they change; empty without rims."""
         _, height, width = self.row.shape
         choices, kind = self.choices, self.positions.dtype
         ends, counts = choices.ends, choices.listed
@@ -241,7 +242,7 @@ class Cells:
             given = choices.ends, self._wanted, ends, counts
             parallel(outlines.narrow, height, *given, work=self.row[0].size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        found = Outlines(
+        result = Outlines(
             np.empty((height, width), kind),
             np.empty((height, width), np.int32),
             offsets,
@@ -250,21 +251,21 @@ class Cells:
             np.empty((offsets[-1], 9, 2), kind),
             np.empty((offsets[-1], 2, 4), kind),
         )
-        if len(found.columns):
+        if len(result.columns):
             rules = outlines.Rules(*map(kind.type, Visible.RIMS))
             decide = self.part, self.one_part, self.exits, kind.type(choices.extent), rules, self._pairs[0]
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
             given = self.grid, *decide, *listed, ends
-            parallel(outlines.fill, height, *given, found, work=90 * len(found.columns))
+            parallel(outlines.fill, height, *given, result, work=90 * len(result.columns))
             if self._crossed:
-                self.crossings.still(found.offsets, found.columns, found.changes)
-        return found
+                self.crossings.still(result.offsets, result.columns, result.changes)
+        return result
 
     @cached_property
     def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bits (H, W) of pairs beside lines of crossing, and which rows (H,) have some; no rows where there are none.
+        """Bits (H, W) of pairs beside lines of crossing, and the rows (H,) that have some (see `crossing_pairs.py`).
 
-        See `crossing_pairs.py`.
+        No rows without pairs.
         """
         if not self.crosses:
             return crossing_pairs.nothing(self.row.shape[2])
@@ -280,7 +281,7 @@ class Cells:
 
     @property
     def _crossed(self) -> bool:
-        """Whether there may be targets of `crossings`."""
+        """True if `crossings` may have targets."""
         return len(self.crossings.columns) > 0
 
     def image(self, out: np.ndarray) -> None:
@@ -292,7 +293,7 @@ class Cells:
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
                 )
-            if self._shows_several:  # What has no sample of its own shows that of row 0 so far.
+            if self._shows_several:  # Targets without a sample of their own show that of row 0 so far.
                 self._paint(self.rgba[None], out[None])
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
@@ -306,7 +307,7 @@ class Cells:
             if self._shows_several:
                 parallel(note, len(settled), settled, noted, work=settled.size // 8)
             shown = np.flatnonzero(noted)
-            if len(shown) > MANY:  # Sums of each line take their memory. Those of parts are few.
+            if len(shown) > MANY:  # Sums by line take memory for each of them; usually a part shows one.
                 inner = settled[self.border : self.border + len(g), self.border : self.border + g.shape[1]]
                 there = inner >= 0
                 np.add.at(g_rgba, inner[there], g[there])
@@ -323,7 +324,7 @@ class Cells:
             self._vjp_of_repeated(g, g_positions, g_rgba)
             return
         kind = self.positions.dtype
-        found = (
+        gradients = (
             np.empty((0, 3), kind) if g_positions is None else g_positions,
             np.empty((0, 4), kind) if g_rgba is None else g_rgba,
         )
@@ -332,15 +333,15 @@ class Cells:
             states = states.copy()
             states[self.crossings.cells()] = EMPTY
         plain = self.plain_grid, states, self.border
-        parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
-        self._pull_mixed(g, *found)
+        parallel(stencil.pull, height, *plain, g, *gradients, work=self._plain_work)
+        self._pull_mixed(g, *gradients)
         if self._crossed:
-            crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *found)
+            crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *gradients)
         if self.rims and g_positions is not None:
             outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
     def _pull_mixed(self, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
-        """Add to the gradients what mixed targets give; to those of no rows, nothing."""
+        """Add mixed targets' shares to the gradients; a gradient of no rows gets none."""
         count, height = len(self.choices.columns), self.row.shape[1]
         if not (count and (len(g_positions) or len(g_rgba))):
             return
@@ -348,7 +349,7 @@ class Cells:
         parallel(mixed_targets.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
         given = height, *self.mixed_arguments, adjoints
         if self._crossed:
-            # Lines of crossing take the place of what samples would give to positions, but not to colours.
+            # Lines of crossing replace the samples' share in the gradients of positions, but not of colours.
             if len(g_rgba):
                 parallel(mixed_targets.pull, *given, g_positions[:0], g_rgba, work=work)
             adjoints[self.crossings.among_mixed()], g_rgba = 0, g_rgba[:0]
@@ -386,18 +387,18 @@ class Cells:
         copy = object.__new__(Cells)
         copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False))
         copy.row, copy.exits = read_only(own), read_only(exits)
-        copy.__dict__.pop("outlines", None)  # They name samples.
+        copy.__dict__.pop("outlines", None)  # They refer to samples by number.
         copy.__dict__.pop("crossings", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
-        found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
-        copy._pull(g, *found)
-        for result, values in zip(results, found, strict=True):
+        gradients = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
+        copy._pull(g, *gradients)
+        for result, values in zip(results, gradients, strict=True):
             if result is not None and values is not None:
                 np.add.at(result, index, values)
 
 
 def _check_grids(shape: tuple[int, ...], **given: np.ndarray | None) -> None:
-    """Refuse what is told of cells in another shape; None, or nothing at all, is told of none."""
+    """Refuse arrays of another shape than the grid's; None, or an empty array, stands for an absent one."""
     for name, x in given.items():
         if x is not None and len(x) and x.shape != shape:
             raise InputError(f"{name} has shape {x.shape}; expected {shape}, as row says")
@@ -412,18 +413,18 @@ def _scale_and_peak(settings: Settings) -> tuple[float, float]:
 
 @lru_cache
 def _reach(settings: Settings) -> float:
-    """How far, in pixels along x and y, samples may lie off their cells' centres while weights surely sum up to one."""
+    """The largest offset of samples, pixels along x and y, at which weights are sure to sum up to one."""
     if settings.epsilon < Visible.LEAST_EPSILON:
         return -1.0
     scale, low, high = 1 / (2 * settings.sigma**2), 0.0, 1.0
     full = 1 + 2 * math.exp(-scale)
 
     def least(off: float) -> float:
-        off = settings.gamma * off  # The nine splats are off in the worst way.
+        off = settings.gamma * off  # All nine splats are off in the worst direction.
         side = (math.exp(-(off**2) * scale) + 2 * math.exp(-((1 + off) ** 2) * scale)) / full
         return (1 + settings.epsilon) * side**2
 
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if least(middle) >= 1 else (low, middle)
-    return 0.9 * low  # Less than that, since weights are rounded.
+    return 0.9 * low  # A margin, since weights are rounded.

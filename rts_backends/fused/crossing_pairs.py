@@ -1,7 +1,7 @@
-"""Between which cells lines run where surfaces cross: the pairs of `rts.splatting.crossings`, compiled.
+"""Pairs of cells between which a line of crossing runs: those of `rts.splatting.crossings`, compiled.
 
-They are found by a test that vector instructions do and that few other cells pass: beside a line the gap between two
-layers is small, and grows.
+A quick test by vector instructions leaves few other cells: beside a line the gap between two layers is small, and
+grows.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from rts.plugin_api.splats import Visible
 from rts.plugin_api.threads import parallel, read_only
 
 BORDER = 3
-"""Rows around those of arrays of depths (2, ·, W), and rows and columns around those of their gaps (·, ·): so far from
-a cell are those that decide whether it is in a pair with a neighbour. Rows y below count from the first of all."""
+"""Rows added on each side of depths (2, ·, W), and rows and columns of gaps (·, ·).
+
+Cells as far away as this decide whether two neighbours form a pair. Rows y below count from the first added one."""
 STEPS = np.array([(1, 0), (0, 1), (1, 1), (1, -1)])
-"""Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
+"""Steps (x, y) from one cell of a pair to the other, for bits 0 to 3."""
 CHUNK = 32
-"""Cells that are passed over at once."""
+"""Cells that are skipped together."""
 ROWS = 32
-"""That are looked at together, so that they stay near the processor."""
+"""Rows that are searched together, few enough to stay in the processor's cache."""
 
 
 class Rules(NamedTuple):
-    """Numbers of `rts.splatting.crossings`, in the dtype of the depths."""
+    """Limits of `rts.splatting.crossings`, in the dtype of the depths."""
 
     least: float
     largest: float
@@ -36,14 +37,14 @@ class Rules(NamedTuple):
 
     @classmethod
     def of(cls, extent: Any) -> Rules:
-        """For fronts whose depths have an extent, the camera's included, in their dtype."""
+        """The rules for an extent of the fronts' depths, in its dtype; it includes the camera's 0."""
         kind = type(extent)
         least, (*numbers, slack, _) = kind(Visible.TIE) * extent, Visible.CROSSINGS
         return cls(least, *map(kind, numbers), slack=kind(slack) * least)
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
-    """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
+    """Mark in `kept` (K, H, W) the samples that `rts.splatting.crossings.sheets` keeps."""
     _, height, width = covered.shape
     bits, some = _no_pairs(height, width)
     parallel(_find_candidates, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
@@ -52,19 +53,19 @@ def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np
 
 
 def _no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """No pairs: bits (H, W) of the steps from each cell to the other of a pair, and whether there are any in a row."""
+    """Arrays to fill, without pairs so far: bits (H, W) as in `pairs`, and marks (H,) of rows that have some."""
     return np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
 
 
 def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> tuple[np.ndarray, np.ndarray]:
-    """Bits (H, W) uint8 of the steps from each cell to the other of a pair, and whether there are any in a row (H,).
+    """Bits (H, W) uint8 of the steps from each cell to the other of a pair, and marks (H,) of rows that have some.
 
-    There are no rows where there are no pairs.
+    Both have no rows if there are no pairs.
 
     Args:
         positions: (N, 3).
         row: (K, H, W).
-        extent: of the fronts' depths, the camera's included.
+        extent: largest less least depth of the fronts, the camera's 0 included.
     """
     _, height, width = row.shape
     if len(row) > 1:
@@ -76,22 +77,22 @@ def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> tuple[
 
 
 def nothing(width: int) -> tuple[np.ndarray, np.ndarray]:
-    """What `pairs` gives where there are none."""
+    """The result of `pairs` if there are none."""
     return read_only(np.empty((0, width), np.uint8)), np.empty(0, np.bool_)
 
 
 @loop
 def gather(start, stop, positions, row, some, z, gap):
-    """Fill those rows of depths and gaps, in [start, stop) of all that there are, that decide about pairs in others.
+    """Fill the rows of depths and gaps, within [start, stop), that decide about pairs.
 
     Args:
-        start: first row, of those of z.
+        start: first row, as z counts them.
         stop: end of the rows.
         positions: (N, 3).
         row: (K, H, W).
-        some: (H,), whether there are pairs in a row.
-        z: (2, H + 2 BORDER, W), to be filled with depths of the first two layers, where there are both.
-        gap: (H + 2 BORDER, W + 2 BORDER), to be filled with how far they are apart, or infinity.
+        some: (H,), whether a row has pairs.
+        z: (2, H + 2 BORDER, W), to be filled with depths of the first two layers, where a cell has both.
+        gap: (H + 2 BORDER, W + 2 BORDER), to be filled with their distance, or infinity.
     """
     height = len(some)
     for at in range(start, stop):
@@ -121,7 +122,7 @@ def find_in_cells(start, stop, positions, row, rules, bits, some):
 
 @loop
 def _find_candidates(start, stop, covered, depth, rules, bits, some):
-    """Find what may be pairs, whatever hidden layers are left out, whose first cell lies in rows [start, stop)."""
+    """Find possible pairs whose first cell lies in rows [start, stop), whichever hidden layers are left out later."""
     _, height, width = covered.shape
     z, gap, most = _window(width, depth.dtype)
     for top in range(start, stop, ROWS):
@@ -141,15 +142,15 @@ def _find_candidates(start, stop, covered, depth, rules, bits, some):
 
 @compiled
 def _window(width, kind):
-    """Arrays of depths and gaps for some rows and those around them, and of the largest gaps there."""
+    """Empty arrays for a window of rows with its border: depths, gaps, and the largest gaps."""
     rows = ROWS + 2 * BORDER
     return np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind), np.empty((rows, width), kind)
 
 
 @compiled
 def _load_cells(z, gap, positions, row, y):
-    """Fill depths (2, W) of a row and gaps, of its cells of two layers; whether there are any."""
-    width, found = row.shape[2], False
+    """Fill depths (2, W) and gaps of a row, for its cells of two layers; return whether it has any."""
+    width, some = row.shape[2], False
     for left in range(0, width, CHUNK):
         right = min(left + CHUNK, width)
         last = row.dtype.type(-1)
@@ -162,13 +163,13 @@ def _load_cells(z, gap, positions, row, y):
             if j >= 0 and i >= 0:
                 z[0, x], z[1, x] = positions[i, 2], positions[j, 2]
                 gap[x + BORDER] = positions[j, 2] - positions[i, 2]
-                found = True
-    return found
+                some = True
+    return some
 
 
 @compiled
 def _copy(to, given):
-    # A loop, since for arrays that are assigned numba compiles an error that tells their shapes, which takes a second.
+    # A loop, since for assigned arrays numba also compiles an error about their shapes, which takes a second.
     for x in range(len(to)):
         to[x] = given[x]
 
@@ -182,16 +183,16 @@ def _subtract(gap, covered0, covered1, depth0, depth1):
 
 @compiled
 def _any(flags):
-    # A loop that the compiler makes vector instructions of, as it does not of methods of arrays.
-    found = np.uint8(0)
+    # A loop, which becomes vector instructions; methods of arrays do not.
+    largest = np.uint8(0)
     for flag in flags:
-        found = max(found, np.uint8(flag))
-    return found > 0
+        largest = max(largest, np.uint8(flag))
+    return largest > 0
 
 
 @compiled
 def _find(start, stop, z, gap, most, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, in a window of rows, the first cells of which lie in rows [start, stop)."""
+    """Find pairs, or `candidates`, whose first cell lies in rows [start, stop), in a window of rows."""
     width = z.shape[2]
     rows, marks = stop - start + 2 * BORDER, np.empty(width, np.uint8)
     for y in range(BORDER - 2, rows - BORDER + 2):
@@ -205,13 +206,13 @@ def _find(start, stop, z, gap, most, rules, candidates, bits, some):
             for x in range(left, right):
                 suspected |= marks[x]
             for x in range(left, right if suspected else left):
-                if marks[x]:  # Calls with arrays are dear: few come so far.
+                if marks[x]:  # Few cells get so far: calls with arrays are dear.
                     _find_around(start, y, x, z, gap, rules, candidates, bits, some)
 
 
 @compiled
 def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, whose first or second cell is this one of a window of rows."""
+    """Find pairs, or `candidates`, that a cell of a window of rows belongs to."""
     rows, width = z.shape[1:]
     for n in range(8):
         u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
@@ -222,17 +223,17 @@ def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
         if not _grows(*gaps, candidates) or not inside:
             continue
         if candidates:
-            found = _may_cross(z, gap, rules, qy, qx, v, u)
+            paired = _may_cross(z, gap, rules, qy, qx, v, u)
         else:
-            found = _crosses(z, gap, rules, qy, qx, v, u)
-        if found:
+            paired = _crosses(z, gap, rules, qy, qx, v, u)
+        if paired:
             bits[start + qy - BORDER, qx] |= np.uint8(1 << (n & 3))
             some[start + qy - BORDER] = True
 
 
 @compiled
 def _largest(most, before, here, after):
-    """The largest gap of each cell and its neighbours in the row, of those that are known; −1 if none is."""
+    """The largest finite gap of each cell and its neighbours in the row, or −1."""
     infinity, none = most.dtype.type(np.inf), most.dtype.type(-1)
     for x in range(len(most)):
         a, b, c = before[x], here[x], after[x]
@@ -243,10 +244,10 @@ def _largest(most, before, here, after):
 
 @compiled
 def _suspect(marks, gap, above, level, below):
-    """Mark cells of two layers, beside which there is a gap that is larger by far.
+    """Mark cells of two layers that have a much larger gap beside them.
 
-    Of the two cells of each pair one at least is among them, whatever rounding does: with gaps h and t, and b and a
-    beyond them, R is at least |b − 2 h − t| + |a − 2 t − h|, or twice one of these, and less than half of h + t.
+    At least one of the two cells of each pair is marked, whatever rounding does: with gaps h and t, and b and a beyond
+    them, R is at least |b − 2 h − t| + |a − 2 t − h|, or twice one of these, and less than half of h + t.
     """
     infinity, times = gap.dtype.type(np.inf), gap.dtype.type(1.7)
     for x in range(len(marks)):
@@ -258,7 +259,7 @@ def _suspect(marks, gap, above, level, below):
 
 @compiled
 def _crosses(z, gap, rules, y, x, v, u):
-    """Whether a line runs between a cell and the one a step (u, v) farther on."""
+    """True if a line runs between a cell and the one a step (u, v) farther on."""
     ratio = _ratio(z, gap, rules, y, x, v, u)
     if not ratio < rules.largest:
         return False
@@ -267,13 +268,13 @@ def _crosses(z, gap, rules, y, x, v, u):
 
 @compiled
 def _grows(b, h, t, a, candidates):
-    """Whether the gap grows beyond a pair's two cells as it must (see `_suspect`), but for rounding.
+    """True if the gap grows beyond two cells as that of a pair must (see `_suspect`), rounding allowed for.
 
-    It does so on either side or, of `candidates`, on one.
+    It must grow on both sides; of `candidates`, on one.
     """
     infinity, most = np.float32(np.inf), np.float32(0.52) * (h + t)
     before, after = abs(b - h - h - t), abs(a - t - t - h)
-    # What is not known is infinite, and the other side counts twice; without either gap all is infinite, or no number.
+    # A missing gap is infinite, and the other side counts twice; if both are missing, sums are infinite or NaN.
     before, after = before if b < infinity else after, after if a < infinity else before
     if candidates:
         before = after = min(before, after)
@@ -282,13 +283,13 @@ def _grows(b, h, t, a, candidates):
 
 @compiled
 def has_two(gap, y, x):
-    """Whether a cell has two layers."""
+    """True if a cell has two layers."""
     return gap[y, x + BORDER] < np.inf
 
 
 @compiled
 def _ratio(z, gap, rules, y, x, v, u):
-    """R / (h(q) + h(p)) of a cell q and the one p a step (u, v) farther on; infinity where they are no pair."""
+    """R / (h(q) + h(p)) of a cell q and the cell p a step (u, v) farther on; infinity where they are no pair."""
     two = gap.dtype.type(2)
     total, before, after, change0, change1, direct0, direct1 = _step(z, gap, y, x, v, u)
     change = change0 + change1 if before and after else two * min(change0, change1)
@@ -299,7 +300,7 @@ def _ratio(z, gap, rules, y, x, v, u):
 
 @compiled
 def _may_cross(z, gap, rules, y, x, v, u):
-    """Whether two cells may form a pair, whichever of the cells beyond them have two layers."""
+    """True if two cells may form a pair, whichever of the cells beyond them have two layers."""
     two = gap.dtype.type(2)
     total, before, after, change0, change1, direct0, direct1 = _step(z, gap, y, x, v, u)
     if not total > rules.least - rules.slack:
@@ -318,11 +319,11 @@ def _is_small(change, direct, total, rules):
 
 @compiled
 def _step(z, gap, y, x, v, u):
-    """The terms of R and D (see `rts.splatting.crossings`) of a cell q and the one p a step (u, v) farther on.
+    """The terms of R and D (see `rts.splatting.crossings`) of a cell q and the cell p a step (u, v) farther on.
 
     Returns:
-        h(q) + h(p); whether the cells before q and after p have two layers; the shares in R of q and p, and those in D:
-        infinite where these cells do not. No cell has, unless q and p have.
+        h(q) + h(p); whether the cell before q, and the one after p, count; the shares of q and p in R, and in D. A cell
+        counts if it, q and p have two layers; a share is infinite if the cell does not count.
     """
     infinity, two = gap.dtype.type(np.inf), gap.dtype.type(2)
     here = has_two(gap, y, x) and has_two(gap, y + v, x + u)
@@ -344,15 +345,15 @@ def _step(z, gap, y, x, v, u):
 
 @compiled
 def steps(bits, y, x):
-    """The steps from a cell to the others of its pairs."""
-    height, found = len(bits), 0
+    """Bits 3 (v + 1) + (u + 1) of the steps (u, v) from a cell to its partners in pairs."""
+    height, directions = len(bits), 0
     for i in range(4):
         u, v = STEPS[i, 0], STEPS[i, 1]
         if bits[y, x] >> i & 1:
-            found |= 1 << (3 * (v + 1) + u + 1)
+            directions |= 1 << (3 * (v + 1) + u + 1)
         if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
-            found |= 1 << (3 * (1 - v) + 1 - u)
-    return found
+            directions |= 1 << (3 * (1 - v) + 1 - u)
+    return directions
 
 
 @loop

@@ -1,7 +1,7 @@
-"""Lines where surfaces pass through one another, as `rts.splatting.crossings` says, for the compiled `Visible`.
+"""Lines of crossing, where surfaces pass through one another: `rts.splatting.crossings` for the compiled `Visible`.
 
-Targets beside a line have their derivative in positions from here, in place of all that others add, and that in colours
-where they are not mixed. They are few: the gradient adds up in their order, on one thread.
+The derivatives of targets beside a line are computed here: in positions always, in colours unless the target is mixed.
+These targets are few: one thread adds up their gradients, in order.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from rts_backends.fused.rows import Grid
 from rts_backends.fused.uniform_cells import BUSY, SETTLED
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
-"""What a source is: of neither sheet, or of one."""
+"""A source's sheet: none, or one of two."""
 
 
 class Crossings(NamedTuple):
-    """The targets beside lines, and what their derivative is made of.
+    """Targets beside lines of crossing, and the terms of their derivatives.
 
     Attributes:
         offsets: (H + 1,) int64, where the cells of each row begin in the lists below.
-        columns: (M,) int32, their columns; −1 where the derivative is none of a line after all.
+        columns: (M,) int32, their columns; −1 where the derivative turns out not to be that of a line.
         mixed: (M,) int64, their places in the list of mixed targets (`rts_backends.fused.cells.Choices`), or −1.
-        sheets: (M, 9) uint8, of which sheet each source is; source 3 (v + 1) + (u + 1) lies at −(u, v).
+        sheets: (M, 9) uint8, the sheet of each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
         weights: (M, 9, 3), of the sources' fronts: the share of their colour in that of a target that is not mixed; and
-            the slopes of the weight with their position, in the weight of all.
+            the slopes of their weight with their position, over the sum of all weights.
         colors: (M, 2, 4), the sheets' mean colours.
-        slopes: (M, 5), by how much of the difference of these the colour changes with the rate of ġ; ∇z of the sheets.
+        slopes: (M, 5), the share of the difference of these colours that a unit of ġ moves; and ∇z of both sheets.
     """
 
     offsets: np.ndarray
@@ -49,7 +49,7 @@ class Crossings(NamedTuple):
         return np.repeat(rows, np.diff(self.offsets))[own], self.columns[own]
 
     def still(self, offsets: np.ndarray, columns: np.ndarray, changes: np.ndarray) -> None:
-        """Have the colours of these targets not change with their coverage, where they are in the list of `Outlines`.
+        """Clear these targets' changes with coverage in the list of `Outlines`: lines of crossing replace them.
 
         Args:
             offsets: (H + 1,), where the targets of each row begin in the list.
@@ -59,12 +59,12 @@ class Crossings(NamedTuple):
         parallel(_still, len(offsets) - 1, *self[:2], offsets, columns, changes, work=4 * len(columns))
 
     def among_mixed(self) -> np.ndarray:
-        """Places in the list of mixed targets of those that are mixed."""
+        """Places in the list of mixed targets, of the targets that are mixed."""
         return self.mixed[(self.columns >= 0) & (self.mixed >= 0)]
 
 
 def nothing(height: int, kind: np.dtype) -> Crossings:
-    """No targets in so many rows."""
+    """An empty list of targets, in `height` rows."""
     return _empty(np.zeros(height + 1, np.int64), kind)
 
 
@@ -82,9 +82,9 @@ def listed(grid: Grid, choices: Any, extent: np.floating, bits: np.ndarray, some
     Args:
         grid: the samples.
         choices: see `rts_backends.fused.cells.Choices`.
-        extent: of the fronts' depths, the camera's included.
+        extent: largest less least depth of the fronts, the camera's 0 included.
         bits: the pairs of `crossing_pairs.py`.
-        some: (H,) bool, whether there are any in a row.
+        some: (H,) bool, whether a row has pairs.
     """
     positions, row = grid.positions, grid.row
     height, width = bits.shape
@@ -95,9 +95,9 @@ def listed(grid: Grid, choices: Any, extent: np.floating, bits: np.ndarray, some
     around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
     seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
     parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
-    found = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
-    parallel(_fill, height, grid, *seen[1:], rules, around, found, work=1000 * len(found.columns))
-    return found
+    result = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
+    parallel(_fill, height, grid, *seen[1:], rules, around, result, work=1000 * len(result.columns))
+    return result
 
 
 @loop
@@ -114,9 +114,9 @@ def _still(start, stop, firsts, crossed, offsets, columns, changes):
 
 @loop
 def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, z, gap, rules, around, counts):
-    """Find targets of rows [start, stop): their pairs, as bits 3 (v + 1) + (u + 1) of steps; and how many there are.
+    """Find targets of rows [start, stop): bits 3 (v + 1) + (u + 1) of the steps to partners, and numbers by row.
 
-    A target amid one colour keeps the derivative it has, which is that of a line.
+    A target amid one colour is left out: its derivative is already that of a line.
     """
     height, width = bits.shape
     sheets, slopes = np.empty(9, np.uint8), np.empty(4, z.dtype)
@@ -125,18 +125,18 @@ def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, 
             continue
         m = firsts[y]
         for x in range(width):
-            found = 0 if SETTLED <= states[y, x] < BUSY else steps(bits, y, x)
-            if not found:
+            partners = 0 if SETTLED <= states[y, x] < BUSY else steps(bits, y, x)
+            if not partners:
                 continue
             m = _place(columns, m, mixed, y, x)
-            if _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, found, y, x):
-                around[y, x] = found
+            if _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, partners, y, x):
+                around[y, x] = partners
                 counts[y] += 1
 
 
 @compiled
 def _place(columns, m, mixed, y, x):
-    """Where in the list of mixed targets one stands that does not come before m, if it is mixed."""
+    """The place of a mixed target in the list of them, searched from m on; any place if it is not mixed."""
     while mixed[y, x] and columns[m] < x:
         m += 1
     return m
@@ -155,25 +155,25 @@ def _fill(
     gap,
     rules,
     around,
-    found,
+    result,
 ):
     """Fill the lists of the targets of rows [start, stop)."""
     row = grid.row
     slopes = np.empty(4, grid.positions.dtype)
     for y in range(start, stop):
-        d, m = found.offsets[y], firsts[y]
-        for x in range(row.shape[2] if found.offsets[y + 1] > d else 0):
+        d, m = result.offsets[y], firsts[y]
+        for x in range(row.shape[2] if result.offsets[y + 1] > d else 0):
             if around[y, x]:
                 m = _place(columns, m, mixed, y, x)
-                found.mixed[d] = m if mixed[y, x] else -1
-                _decide(found.sheets[d], slopes, row, mixed, ranges, m, z, gap, rules, around[y, x], y, x)
-                _weigh(d, found, slopes, grid, y, x)
+                result.mixed[d] = m if mixed[y, x] else -1
+                _decide(result.sheets[d], slopes, row, mixed, ranges, m, z, gap, rules, around[y, x], y, x)
+                _weigh(d, result, slopes, grid, y, x)
                 d += 1
 
 
 @compiled
 def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
-    """Find of which sheet the sources of a cell of a pair are, and the sheets' slopes; whether that is possible."""
+    """Sort the sources of a pair's cell into sheets, and find the sheets' slopes; return whether both are possible."""
     _sort(sheets, row, mixed[y, x], ranges, m, around, y, x)
     at = y + BORDER, x
     return _incline(slopes, sheets, z, gap, *at) and _complete(sheets, slopes, z, gap, rules.fit, *at)
@@ -181,7 +181,7 @@ def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
 
 @compiled
 def _sort(sheets, row, mixed, ranges, m, around, y, x):
-    """Tell sources of either sheet by pairs, and by layers paired front to front."""
+    """Sort sources into sheets, by pairs and by layers paired front to front."""
     _, height, width = row.shape
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
@@ -195,7 +195,7 @@ def _sort(sheets, row, mixed, ranges, m, around, y, x):
 
 @compiled
 def _incline(slopes, sheets, z, gap, y, x):
-    """Fill the slopes of the sheets a and b, along x and y each; whether they are known."""
+    """Fill the slopes of the sheets a and b, each along x and y; return whether all are known."""
     for axis in range(2):
         # The sources ahead and behind.
         ahead, behind = (3, 5) if axis == 0 else (1, 7)
@@ -217,7 +217,7 @@ def _incline(slopes, sheets, z, gap, y, x):
 
 @compiled
 def _complete(sheets, slopes, z, gap, fit, y, x):
-    """Sort sources of two layers that are of neither sheet yet by the planes through the target; whether all are."""
+    """Sort unsorted sources of two layers by the sheets' planes through the target; return whether all are sorted."""
     kind = slopes.dtype.type
     gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
     square = gx * gx + gy * gy
@@ -241,11 +241,11 @@ def _complete(sheets, slopes, z, gap, fit, y, x):
 
 
 @compiled
-def _weigh(d, found, slopes, grid, y, x):
-    """Fill what the derivative of a target is made of."""
+def _weigh(d, result, slopes, grid, y, x):
+    """Fill the terms of a target's derivative."""
     rgba, row, kind = grid.rgba, grid.row, grid.positions.dtype.type
     zero, one, slope = kind(0), kind(1), kind(2) * grid.scale * grid.gamma
-    weights, colors, sheets = found.weights[d], found.colors[d], found.sheets[d]
+    weights, colors, sheets = result.weights[d], result.colors[d], result.sheets[d]
     colors[:] = zero
     wa, wb, ax, ay, bx, by = zero, zero, zero, zero, zero, zero
     for n in range(9):
@@ -260,8 +260,8 @@ def _weigh(d, found, slopes, grid, y, x):
         else:
             wb, bx, by = wb + w, bx + weights[n, 1], by + weights[n, 2]
     # Weights may vanish, of samples that are not where they were cast.
-    found.columns[d] = x if wa > zero and wb > zero else -1
-    if found.columns[d] < 0:
+    result.columns[d] = x if wa > zero and wb > zero else -1
+    if result.columns[d] < 0:
         return
     over = one / (wa + wb)
     for n in range(9):
@@ -273,8 +273,8 @@ def _weigh(d, found, slopes, grid, y, x):
     share = wb * over
     gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
     along = ((one - share) * bx - share * ax) * over * gx + ((one - share) * by - share * ay) * over * gy
-    found.slopes[d, 0] = -along / (gx * gx + gy * gy)
-    found.slopes[d, 1:] = slopes
+    result.slopes[d, 0] = -along / (gx * gx + gy * gy)
+    result.slopes[d, 1:] = slopes
 
 
 @compiled
@@ -285,16 +285,16 @@ def rate(slopes, t_positions, i, j):
 
 
 @compiled
-def change_of(pixel, d, found, grid, ranges, sums, y, t_positions, t_rgba):
+def change_of(pixel, d, lines, grid, ranges, sums, y, t_positions, t_rgba):
     """The derivative (4,) of a listed target along tangents (N, 3) and (N, 4), or of no rows: zeros."""
-    rgba, row, x, m = grid.rgba, grid.row, found.columns[d], found.mixed[d]
-    colors, moves = found.colors[d], pixel.dtype.type(0)
+    rgba, row, x, m = grid.rgba, grid.row, lines.columns[d], lines.mixed[d]
+    colors, moves = lines.colors[d], pixel.dtype.type(0)
     if len(t_positions) > 0:
-        moves = found.slopes[d, 0] * rate(found.slopes[d], t_positions, row[0, y, x], row[1, y, x])
+        moves = lines.slopes[d, 0] * rate(lines.slopes[d], t_positions, row[0, y, x], row[1, y, x])
     for c in range(4):
         pixel[c] = moves * (colors[SHEET_B, c] - colors[SHEET_A, c])
     for n in range(9 if len(t_positions) > 0 else 0):
-        i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], found.weights[d, n], colors[found.sheets[d, n]]
+        i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], lines.weights[d, n], colors[lines.sheets[d, n]]
         change = weights[1] * t_positions[i, 0] + weights[2] * t_positions[i, 1]
         for c in range(4):
             pixel[c] += change * (rgba[i, c] - own[c])
@@ -302,49 +302,49 @@ def change_of(pixel, d, found, grid, ranges, sums, y, t_positions, t_rgba):
         tint_of(pixel, sums[m], grid, y, x, ranges[m], t_rgba)
     for n in range(9 if len(t_rgba) > 0 and m < 0 else 0):
         for c in range(4):
-            pixel[c] += found.weights[d, n, 0] * t_rgba[row[0, y + 1 - n // 3, x + 1 - n % 3], c]
+            pixel[c] += lines.weights[d, n, 0] * t_rgba[row[0, y + 1 - n // 3, x + 1 - n % 3], c]
 
 
 @loop
-def push(start, stop, grid, ranges, sums, found, t_positions, t_rgba, border, out):
-    """Put the derivatives of listed targets into rows [start, stop) of the tangents (T, H, W, 4)."""
+def push(start, stop, grid, ranges, sums, lines, t_positions, t_rgba, border, out):
+    """Write the derivatives of listed targets into rows [start, stop) of the tangents (T, H, W, 4)."""
     for y in range(start + border, stop + border):
-        for d in range(found.offsets[y], found.offsets[y + 1]):
-            x = found.columns[d] - border
+        for d in range(lines.offsets[y], lines.offsets[y + 1]):
+            x = lines.columns[d] - border
             if 0 <= x < out.shape[2]:
                 for t in range(len(out)):
-                    change_of(out[t, y - border, x], d, found, grid, ranges, sums, y, t_positions[t], t_rgba[t])
+                    change_of(out[t, y - border, x], d, lines, grid, ranges, sums, y, t_positions[t], t_rgba[t])
 
 
 @loop
-def pull(rgba, row, found, border, g, g_positions, g_rgba):
-    """Add to the gradients of positions (N, 3) and rgba (N, 4), or of no rows, what listed targets give.
+def pull(rgba, row, lines, border, g, g_positions, g_rgba):
+    """Add listed targets' shares to the gradients of positions (N, 3) and rgba (N, 4), or of no rows.
 
-    To that of rgba those give nothing that are mixed.
+    Mixed targets add nothing to that of rgba.
     """
     zero = g.dtype.type(0)
     for y in range(border, len(g) + border):
-        for d in range(found.offsets[y], found.offsets[y + 1]):
-            x = found.columns[d]
+        for d in range(lines.offsets[y], lines.offsets[y + 1]):
+            x = lines.columns[d]
             if not 0 <= x - border < g.shape[1]:
                 continue
-            h, colors, moves = g[y - border, x - border], found.colors[d], zero
+            h, colors, moves = g[y - border, x - border], lines.colors[d], zero
             for c in range(4):
                 moves += h[c] * (colors[SHEET_B, c] - colors[SHEET_A, c])
-            moves *= found.slopes[d, 0]
+            moves *= lines.slopes[d, 0]
             if len(g_positions) > 0:
                 for k, sign in ((0, moves), (1, -moves)):
                     i = row[k, y, x]
-                    g_positions[i, 0] -= sign * found.slopes[d, 1 + 2 * k]
-                    g_positions[i, 1] -= sign * found.slopes[d, 2 + 2 * k]
+                    g_positions[i, 0] -= sign * lines.slopes[d, 1 + 2 * k]
+                    g_positions[i, 1] -= sign * lines.slopes[d, 2 + 2 * k]
                     g_positions[i, 2] += sign
             for n in range(9):
-                i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], found.weights[d, n], colors[found.sheets[d, n]]
+                i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], lines.weights[d, n], colors[lines.sheets[d, n]]
                 change = zero
                 for c in range(4):
                     change += h[c] * (rgba[i, c] - own[c])
                 if len(g_positions) > 0:
                     g_positions[i, 0] += weights[1] * change
                     g_positions[i, 1] += weights[2] * change
-                for c in range(4 if len(g_rgba) > 0 and found.mixed[d] < 0 else 0):
+                for c in range(4 if len(g_rgba) > 0 and lines.mixed[d] < 0 else 0):
                     g_rgba[i, c] += weights[0] * h[c]

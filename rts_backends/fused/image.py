@@ -1,4 +1,4 @@
-"""A splatted image as an operation: compiled loops, and the specification that they equal."""
+"""The splatted image as an operation: compiled loops beside their specification."""
 
 from __future__ import annotations
 
@@ -88,12 +88,12 @@ def _pull(
 
 
 def used(operands: Sequence[np.ndarray]) -> int:
-    """How many rows cells refer to."""
+    """The number of rows in use: one more than the last row that cells refer to."""
     return rows_of(operands[2], *operands[6:8])
 
 
 def rows_of(*cells: np.ndarray | None) -> int:
-    """How many rows of samples there are at least, at least one, where cells name samples."""
+    """One more than the last row of samples that cells refer to; at least 1."""
     return 1 + max(int(x.max(initial=0)) for x in cells if x is not None)
 
 
@@ -113,4 +113,4 @@ IMAGE = Operation(
 """The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
 a border.
 
-The last five are those of `Splats`; (0, H, W) and (0, W) where they are not known."""
+The last five are fields of `Splats`; absent ones have no rows: (0, H, W) or (0, W)."""

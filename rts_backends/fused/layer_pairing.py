@@ -1,6 +1,6 @@
-"""The choices of the splatters where layers of different surfaces meet.
+"""Pairing of layers where those of different surfaces meet.
 
-A target is mixed where some source of it is not paired front to front. Few are, and each has a list of its own: for
+A target is mixed where one of its sources is not paired front to front. Few are. Each has a table of its own: for
 every source and each of the buffers in front, at the surface and behind, a range of the source's layers.
 
 Depths are compared in the dtype of the positions and in the order of `rts.splatting`, so that ties fall alike.
@@ -21,7 +21,7 @@ MORE_BEHIND = Cells.MORE_BEHIND
 
 @loop
 def find(start, stop, positions, row, beyond, hidden, states, mixed, counts):
-    """Mark mixed targets (H, W) of `Multi`, and count those of each row. `survey` finds those of `Visible`.
+    """Mark mixed targets (H, W) of `Multi`, and count them by row. `survey` finds those of `Visible`.
 
     Args:
         start: first row.
@@ -30,7 +30,7 @@ def find(start, stop, positions, row, beyond, hidden, states, mixed, counts):
         row: (K, H, W).
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
         hidden: (H, B) uint8, the blocks of columns in or beside which hidden layers are covered.
-        states: (H, W) of `survey.py`.
+        states: (H, W) of `uniform_cells.py`.
         mixed: (H, W) uint8, to be filled.
         counts: (H,) zeros, to be filled.
     """
@@ -57,7 +57,7 @@ def _any(states):
 def narrow(start, stop, mixed, wanted, kept, counts):
     """Leave out mixed targets of rows [start, stop) that decide nothing for wanted ones.
 
-    How an outline moves is decided by pairs up to two cells away.
+    The motion of an outline depends on pairs up to two cells away.
 
     Args:
         start: first row.
@@ -97,8 +97,8 @@ def choose(
 ):
     """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`.
 
-    Marks go by depths alone. Where `facing` (K, H, W) is told, which else has no layers, more fronts may pair. In
-    `ends` (H, W) of `survey.survey`, which may have no rows, come the directions in which fronts end before others.
+    Marks go by depths alone; with `facing` (K, H, W), which may have no layers, more fronts may pair. The directions
+    in which fronts end before others are added to `ends` (H, W) of `survey`, which may have no rows.
     """
     positions, row = grid.positions, grid.row
     layers, height, width = row.shape
@@ -145,7 +145,7 @@ def choose(
 
 @compiled
 def _sides(sides, facing, y, x):
-    """Which sides the layers of a target and its sources show (K, 9); 0 beyond the image."""
+    """Fill the sides (K, 9) that the layers of a target and its sources show; 0 beyond the image."""
     layers, height, width = facing.shape
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
@@ -156,9 +156,9 @@ def _sides(sides, facing, y, x):
 
 @compiled
 def _pairing(z, n, target, sides):
-    """The number s of `rts.splatting.Visible` before `continues`, and what the depths that it pairs are off.
+    """The number s of `rts.splatting.Visible` before `continues`, and the distance of the depths that it pairs.
 
-    `sides` (K, 9) are those of the layers of all sources; 0 where it is not told, and everywhere in `Multi`.
+    `sides` (K, 9) are those of the layers of all sources; 0 if unknown, and everywhere in `Multi`.
     """
     a, b = 0, 0
     front = z[0, n]
@@ -175,7 +175,7 @@ def _pairing(z, n, target, sides):
 
 @compiled
 def _opposite(hidden, front, behind):
-    """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
+    """True if a hidden layer shows the other side of a front's piece, and does not stand for layers behind it."""
     if front == 0 or (hidden > 0) == (front > 0):
         return False
     return hidden == -front or (not behind and abs(hidden) == abs(front) + MORE_BEHIND)
@@ -183,7 +183,7 @@ def _opposite(hidden, front, behind):
 
 @compiled
 def _continues(positions, row, y, x, n, fronts, limit):
-    """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
+    """True if one of two fronts lies within a limit of where the other's line leads: the source's or the target's."""
     _, height, width = row.shape
     v, u = n // 3 - 1, n % 3 - 1
     for steps, end, start in ((-1, fronts[n], fronts[4]), (2, fronts[4], fronts[n])):

@@ -14,7 +14,7 @@ FAR, LEAST_SHARE = Loss.FAR, Loss.LEAST_SHARE
 
 
 def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:
-    """A loss as loops take it: its place, and the scale as a number of the residuals' dtype."""
+    """A loss in the form that loops take: its number, and its scale in the residuals' dtype."""
     return loss.place, np.dtype(dtype).type(loss.f_scale)
 
 
@@ -39,7 +39,7 @@ def cost_and_weight(residual, loss):
 
 @compiled
 def curvature(weight, loss):
-    """What `Loss.weights` gives beside the weight of a residual."""
+    """The weight of a residual in the Hessian, the second result of `Loss.weights`."""
     place, scale = loss
     share, one = weight, type(scale)(1)
     if place == SOFT_L1:

@@ -1,4 +1,4 @@
-"""The splatters where layers of different surfaces meet, target by target, by the lists of `choices.py`."""
+"""Splatting onto mixed targets, where layers of different surfaces meet, by the tables of `layer_pairing.py`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rts_backends.fused.rows import Grid, compiled, exp, loop
 
 @compiled
 def splat(grid, i, y, x, u, v):
-    """Weight of sample i of cell (y, x) at offset (u, v), and how far the target lies from it along x and y."""
+    """Weight of sample i of cell (y, x) at offset (u, v), and the target's distance from it along x and y."""
     positions, peak, gamma = grid.positions, grid.peak, grid.gamma
     kind, half = positions.dtype.type, positions.dtype.type(0.5)
     dx = kind(u) - gamma * (positions[i, 0] - (kind(x) + half))
@@ -87,7 +87,7 @@ def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
 
 @compiled
 def _any(adjoints, d):
-    """Whether any adjoint of a target's sums is not zero: beside wanted targets many are."""
+    """True if any adjoint of a target's sums is not zero: beside wanted targets many are."""
     some = False
     for b in range(3):
         for c in range(5):
@@ -97,7 +97,7 @@ def _any(adjoints, d):
 
 @loop
 def pull(start, stop, grid, offsets, columns, choices, adjoints, g_positions, g_rgba):
-    """Add to the gradients of the samples of source rows [start, stop) what mixed targets give."""
+    """Add mixed targets' shares to the gradients of the samples of source rows [start, stop)."""
     height = grid.row.shape[1]
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
@@ -108,7 +108,7 @@ def pull(start, stop, grid, offsets, columns, choices, adjoints, g_positions, g_
 
 @compiled
 def _pull_target(d, column, v, grid, y, choices, adjoints, g_positions, g_rgba):
-    """`pull` of what a target v rows farther on gives to the sources of row y."""
+    """`pull` from one target, v rows farther on, to the sources of row y."""
     rgba, row, slope = grid.rgba, grid.row, grid.positions.dtype.type(2) * grid.scale * grid.gamma
     for u in range(-1, 2):
         x, n = column - u, 3 * (v + 1) + u + 1
@@ -156,8 +156,8 @@ def composited(total, change, c):
 
 @compiled
 def tint_of(pixel, total, grid, y, x, choice, t_rgba):
-    """Add to a pixel (4,) what a target changes by along a tangent (N, 4) of colours."""
-    # Weights do not change with colours: sums of their tangents are as those of colours.
+    """Add to a pixel (4,) the change of a target along a tangent (N, 4) of colours."""
+    # Weights do not change with colours: tangents are summed as colours are.
     change = np.empty((3, 5), total.dtype)
     tinted = Grid(grid.positions, t_rgba, grid.row, grid.scale, grid.peak, grid.gamma)
     sums_of(change, tinted, y, x, choice)

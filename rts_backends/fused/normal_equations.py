@@ -1,11 +1,11 @@
 """Normal equations of the difference between a splatted image and a target, without its Jacobian.
 
-A sweep goes over bands of rows: the derivatives of a row of a tile along all unknowns are made as in `stencil.py`
-and `mixed.py`, multiplied with one another and with the residuals, and forgotten. Bands have a fixed height and are
-added in their order, so results do not depend on the number of threads.
+A sweep goes over bands of rows. The derivatives of a row of a tile along all unknowns are computed as in `stencil.py`
+and `mixed_targets.py`, multiplied with one another and with the residuals, and dropped. Bands have a fixed height and
+are added in order, so results do not depend on the number of threads.
 
-Of a supersampled image the rows of cells that make one row of pixels are swept one after the other, their derivatives
-added up to those of the pixels' means, and only these are multiplied.
+In a supersampled image several rows of cells make one row of pixels. Their derivatives are averaged to those of the
+pixels first, and only these are multiplied.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ OPACITY = 3 * PITCH
 
 
 def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tuple[Array, ...] | None:
-    """`normal_equations` of arrays of any engine on the host, traced or not; None for others.
+    """`normal_equations` of arrays of any engine on the host, traced or not.
 
-    None, too, where a pixel has more cells than a tile.
+    None for arrays elsewhere, or if a pixel has more cells than a tile.
 
     Args:
         settings: the splatter, as numbers.
@@ -120,12 +120,12 @@ def normal_equations(
 
 
 def _cells_a_pixel(row: tuple[int, ...], border: int, target: tuple[int, ...]) -> int:
-    """How many cells a pixel has along each axis, for the shapes of `row` (K, ·, ·) and of the target (H, W, C)."""
+    """The cells of a pixel along each axis, from the shapes of `row` (K, ·, ·) and of the target (H, W, C)."""
     return max(1, (row[1] - 2 * border) // max(target[0], 1))
 
 
 def _any(tangents: np.ndarray) -> bool:
-    """Whether any is not zero; those of what does not depend on the unknowns may be one array that is repeated."""
+    """True if any tangent is not zero; tangents of constants may be one array, repeated by a stride of 0."""
     return bool((tangents[:1] if tangents.strides[0] == 0 else tangents).any())
 
 
@@ -133,9 +133,9 @@ def _any(tangents: np.ndarray) -> bool:
 def _accumulate(
     start, stop, planes, plain, grid, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
 ):
-    """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
+    """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop) of rows; lower triangles.
 
-    Of rows of pixels that are means of `fine` rows and columns of cells.
+    Each pixel is the mean of `fine` rows and columns of cells.
     """
     positions, rgba, row = grid.positions, grid.rgba, grid.row
     t_positions, t_rgba = tangents
@@ -147,7 +147,7 @@ def _accumulate(
         np.empty((many, 3 * layers * TANGENT), positions.dtype),
         np.empty((many, SUMS), positions.dtype),
     )
-    # One for each unknown, one for the residuals, and one for what their loss weighs them by.
+    # One for each unknown, one for the residuals, and one for the weights of their loss.
     products = np.empty((many + 2, channels * PITCH), positions.dtype)
     changes = np.empty((many, 3, 5), positions.dtype)
     loaded, least = np.empty(3, np.int64), FLAT if t_rgba.shape[1] > 0 else BUSY
@@ -195,7 +195,7 @@ def _accumulate(
 
 @compiled
 def _change(change, value, sources, moving, layers, y, count, planes):
-    """Values and tangents of a row of a tile as the stencil makes them."""
+    """Fill values and tangents of a row of a tile by the stencil."""
     normalised_sums(value, sources, layers, y, count)
     for n in range(len(change)):
         change_row(change[n], moving[n], sources, value, layers, y, count, planes)
@@ -204,7 +204,7 @@ def _change(change, value, sources, moving, layers, y, count, planes):
 
 @compiled
 def _add_means(to, row, fine, count):
-    """Add what a row of cells has to the means of the pixels in it."""
+    """Add a row of cells to the means of its pixels."""
     share = to.dtype.type(1 / fine**2)
     for c in range(4):
         for j in range(count):
@@ -216,7 +216,7 @@ def _add_means(to, row, fine, count):
 
 @compiled
 def _mix(change, value, grid, choices, tangents, border, y, left, count, changes):
-    """Values and tangents of the mixed targets of a row of a tile, in place of those of the stencil."""
+    """Replace the stencil's values and tangents of the mixed targets of a row of a tile."""
     offsets, columns = choices.offsets, choices.columns
     one = value.dtype.type(1)
     for d in range(offsets[y + border], offsets[y + border + 1]):
@@ -234,7 +234,7 @@ def _mix(change, value, grid, choices, tangents, border, y, left, count, changes
 
 @compiled
 def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
-    """Add what moving outlines change in a row of a tile."""
+    """Add the changes by moving outlines in a row of a tile."""
     for d in range(outlines.offsets[y + border], outlines.offsets[y + border + 1]):
         j = outlines.columns[d] - border - left
         if not 0 <= j < count:
@@ -247,7 +247,7 @@ def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
 
 @compiled
 def _move_lines(change, grid, choices, crossings, tangents, border, y, left, count):
-    """The derivatives of targets beside lines of crossing in a row of a tile, in place of all others."""
+    """Replace the derivatives of targets beside lines of crossing in a row of a tile."""
     t_positions, t_rgba = tangents
     pixel = np.empty(4, change.dtype)
     for d in range(crossings.offsets[y + border], crossings.offsets[y + border + 1]):
@@ -262,7 +262,7 @@ def _move_lines(change, grid, choices, crossings, tangents, border, y, left, cou
 
 @compiled
 def _counts(weights):
-    """Whether any weight (·, C) is not zero."""
+    """True if any weight (·, C) is not zero."""
     some = False
     for j in range(len(weights)):
         for c in range(weights.shape[1]):
@@ -272,7 +272,7 @@ def _counts(weights):
 
 @compiled
 def _settle(change, value, rgba, t_rgba, settled, moving):
-    """Values and tangents of the settled targets of a row of a tile; whether any of these changes."""
+    """Fill values and tangents of the settled targets of a row of a tile; return whether any of them changes."""
     some, colored = False, t_rgba.shape[1] > 0
     for j in range(len(settled)):
         some |= settled[j] >= 0
@@ -292,7 +292,7 @@ def _settle(change, value, rgba, t_rgba, settled, moving):
 
 @compiled
 def _multiply(sums, products, change, value, fields, loss, y, left, count, changing):
-    """Add the products of a row of a tile; where nothing changes, of the residuals alone."""
+    """Add the products of a row of a tile; if nothing changes in it, those of the residuals alone."""
     target, weights, background = fields
     channels, many = target.shape[2], len(change)
     first, one = 3 if channels == 1 else 0, value.dtype.type(1)
@@ -301,7 +301,7 @@ def _multiply(sums, products, change, value, fields, loss, y, left, count, chang
         for n in range(0 if changing else many, many + 1):
             to, shown = products[n, own : own + count], len(background) > 0
             if n < many:
-                # A loop, since for arrays that are assigned numba compiles an error that tells their shapes: a second.
+                # A loop, since for assigned arrays numba also compiles an error about their shapes: a second.
                 for j in range(count):
                     to[j] = change[n, p + j]
                 for j in range(count if shown else 0):
@@ -326,20 +326,20 @@ def _multiply(sums, products, change, value, fields, loss, y, left, count, chang
 
 @compiled
 def _weigh(products, many, loss, count):
-    """Scale tangents and residuals so that their products are those of a loss's normal equations; the sum of losses.
+    """Scale tangents and residuals to those of a loss's normal equations; return the sum of losses.
 
     Args:
         products: (many + 2, ·), tangents, residuals, and a row that is overwritten.
-        many: how many tangents.
+        many: number of tangents.
         loss: see `in_numbers`.
-        count: how many numbers in each row.
+        count: numbers in each row.
     """
     total, residuals, roots = 0.0, products[many], products[many + 1]
     for j in range(count):
         cost, weight = cost_and_weight(residuals[j], loss)
         total += cost
         roots[j] = math.sqrt(curvature(weight, loss))
-        # A weight too small for the dtype is zero: the residual has no say, but for its loss.
+        # A weight too small for the dtype is zero: the residual counts in the loss alone.
         residuals[j] *= weight / roots[j] if roots[j] > 0 else roots[j]
     for n in range(many):
         for j in range(count):

@@ -1,9 +1,8 @@
-"""Outlines that move as `rts.splatting.rims` says: what their motion adds to derivatives of the compiled `Visible`.
+"""Derivatives of the compiled `Visible` by moving outlines; these move as `rts.splatting.rims` says.
 
-With v̂ the motion of the outline beside a cell, and v that of its front, what a source of weight w adds to the
-derivative of a target is ∂w · (v̂ − v) times the change of the target's colour with the coverage of one buffer. Only
-targets count that a buffer covers in part. The gradient adds up in one order: every other band of rows, and then those
-between.
+Let v̂ be the motion of the outline beside a cell, and v that of its front. A source of weight w adds to a target's
+derivative ∂w · (v̂ − v), times the change of the target's colour with the coverage of one buffer. Only targets count
+that a buffer covers in part. Gradients add up in one order: every other band of rows first, then those between.
 """
 
 from __future__ import annotations
@@ -20,18 +19,20 @@ from rts_backends.fused.rows import exp
 from rts_backends.fused.uniform_cells import LISTED
 
 BAND = 16
-"""Rows whose gradients are added up by one thread, more than samples of which one target knows are apart."""
+"""Rows whose gradients one thread adds up: more than the distance of any two samples that one target refers to."""
 
 NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
-"""What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
-surface as the target's outline moves; of that at the surface, over nothing or another part, as its own does."""
+"""The coverage that a source gives to a target.
+
+NOTHING; that of the buffer in front, moving with the source's outline; that of the surface, moving with the target's
+outline; that of the surface, over nothing or another part, moving with the source's outline."""
 
 NEAR = 1e-3
 """Exponents below which four terms of its series give the exponential in double precision."""
 
 
 class Rules(NamedTuple):
-    """Numbers of `rts.splatting.rims`, in the dtype of the positions."""
+    """Limits of `rts.splatting.rims`, in the dtype of the positions."""
 
     least: float
     largest: float
@@ -41,16 +42,16 @@ class Rules(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """How outlines move, and the targets that they cover in part.
+    """Motions of outlines, and the targets that they cover in part.
 
     Attributes:
         beta: (H, W), β of the targets below that are covered; 0 where the front's own motion is the outline's.
         partner: (H, W) int32, the partner's sample where β is not 0.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
         columns: (M,) int32, their columns.
-        gives: (M, 9) uint8, what each source gives; source 3 (v + 1) + (u + 1) lies at −(u, v).
-        slopes: (M, 9, 2), of the weights of sources that give something, with their position.
-        changes: (M, 2, 4), of the target's colour with coverage in front, and at the surface.
+        gives: (M, 9) uint8, the kind of coverage from each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
+        slopes: (M, 9, 2), derivatives of these sources' weights with their position.
+        changes: (M, 2, 4), derivatives of the target's colour with coverage in front, and at the surface.
     """
 
     beta: np.ndarray
@@ -63,41 +64,41 @@ class Outlines(NamedTuple):
 
 
 DIRECTIONS = LISTED - 1
-"""Bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends, in `survey.survey`'s `ends`."""
+"""Bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends, in the `ends` of `survey`."""
 
 BESIDE = LISTED << 1
-"""Mark in `ends` of targets whose outline matters to listed ones beside them."""
+"""Mark in `ends` of targets whose outline affects listed ones beside them."""
 
 
 def _ordered(bits: int) -> list[int]:
-    """Nine places of directions: those of which the opposite one is not among the bits, the most outward first; −1."""
+    """Nine numbers: directions whose opposite is not among the bits, the most outward first, then −1."""
     steps = {n: np.array([n % 3 - 1, n // 3 - 1]) for n in range(9) if bits >> n & 1}
     outward = sum(steps.values(), np.zeros(2, int))
 
     def score(n: int) -> int:
-        """Ordered as n · outward / ‖n‖ is, in whole numbers."""
+        """A whole number that orders directions n as n · outward / ‖n‖ does."""
         along = int(steps[n] @ outward)
         return along * abs(along) * (3 - int(abs(steps[n]).sum()))
 
-    found = sorted((n for n in steps if not bits >> (8 - n) & 1), key=score, reverse=True)
-    return found + [-1] * (9 - len(found))
+    directions = sorted((n for n in steps if not bits >> (8 - n) & 1), key=score, reverse=True)
+    return directions + [-1] * (9 - len(directions))
 
 
 OUTWARD = np.array([_ordered(bits) for bits in range(LISTED)], np.int8)
-"""The order (512, 9) in which directions are looked at, by the bits of those in which a front ends."""
+"""The order (512, 9) in which directions are tried, by the bits of those in which a front ends."""
 
 
 @loop
 def narrow(start, stop, ends, wanted, kept, counts):
-    """Take marks of rows [start, stop) off targets that are neither wanted nor beside wanted ones.
+    """Clear marks of rows [start, stop) at targets that are neither wanted nor beside wanted ones.
 
     Args:
         start: first row.
         stop: end of the rows.
-        ends: (H, W) of `survey.survey` and `choices.choose`.
+        ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`.
         wanted: (H, W) uint8.
         kept: (H, W) uint16, to be filled as `ends`, and with marks BESIDE.
-        counts: (H,), to be filled with the number of those that are listed.
+        counts: (H,), to be filled with the number of listed targets.
     """
     height, width = ends.shape
     for y in range(start, stop):
@@ -112,7 +113,7 @@ def narrow(start, stop, ends, wanted, kept, counts):
 
 @compiled
 def _beside(ends, wanted, y, x):
-    """BESIDE where a target is beside a wanted one that is listed, or no mark."""
+    """BESIDE if a target is beside a wanted, listed one; 0 otherwise."""
     height, width = ends.shape
     for n in range(9):
         v, u = y + n // 3 - 1, x + n % 3 - 1
@@ -121,8 +122,8 @@ def _beside(ends, wanted, y, x):
     return 0
 
 
-# Helpers that are handed arrays have references to them counted, call by call, where the code has branches. So what is
-# done for each direction of a cell stands where the arrays are.
+# Each call of a helper with branches counts references to its arrays. So the work for each direction of a cell is
+# written out where the arrays are.
 
 
 @compiled
@@ -157,7 +158,7 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
             continue
         if partner < 0:
             beta, partner = rules.half, row[0, py, px]
-        # Where the surface does not go on in this direction, or does not fall, the next may be usable.
+        # If the surface ends in this direction, or does not fall, try the next.
         if not (0 <= qy < height and 0 <= qx < width and row[0, qy, qx] >= 0) or ends[py, px] >> (4 - 3 * v - u) & 1:
             continue
         middle = positions[row[0, py, px], 2]
@@ -186,28 +187,28 @@ def fill(
     ranges,
     sums,
     ends,
-    found,
+    result,
 ):
-    """Decide how outlines move in rows [start, stop), as `rts.splatting.rims.rules` does, and list the marked targets.
+    """Find the motions of outlines in rows [start, stop), as `rts.splatting.rims.rules` does; list marked targets.
 
     Args:
         start: first row.
         stop: end of the rows.
         grid: the samples.
         part: (K, H, W), the part of each sample, or no layers.
-        one_part: whether all are known to be of one.
+        one_part: whether all samples belong to one part.
         exits: (H, W), where rays leave the part of the front, or no rows.
-        extent: of the depths.
-        rules: numbers of the rules.
+        extent: largest less least depth of the fronts, the camera's 0 included.
+        rules: limits of the rules.
         crossed: (H, W) uint8, the pairs of `crossing_pairs.py`, or no rows.
-        mixed: (M,), columns of the mixed targets, see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
-        firsts: (H + 1,), where those of each row begin.
+        mixed: (M,), columns of the mixed targets; see `rts_backends.fused.cells.Choices`, also for the next three.
+        firsts: (H + 1,), where the mixed targets of each row begin.
         ranges: (M, 9, 3, 2).
         sums: (M, 3, 5).
-        ends: (H, W) of `survey.survey` and `choices.choose`, or of `narrow`.
-        found: `Outlines`, to be filled but for its offsets.
+        ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`, or of `narrow`.
+        result: `Outlines`, to be filled but for its offsets.
     """
-    beta, partner, offsets, columns, gives, slopes, changes = found
+    beta, partner, offsets, columns, gives, slopes, changes = result
     positions, row, peak = grid.positions, grid.row, grid.peak
     kind, width = positions.dtype.type, ends.shape[1]
     around, which, samples = np.empty((9, 3), positions.dtype), np.empty(9, np.int64), np.empty(9, np.int64)
@@ -253,14 +254,14 @@ def _any(ends):
     return some != 0
 
 
-# Not handed views of single targets, since to make these takes as long as the work.
+# Takes whole arrays: views of single targets take as long to make as the work itself.
 
 
 @compiled
 def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
-    """List the slopes of the weights of the fronts around a target, and what each gives if none is mixed.
+    """Fill the slopes of the weights of the fronts around a target, and their kinds of coverage if none is mixed.
 
-    Returns their sums, of colours and weights.
+    Returns the sums of their colours and weights.
     """
     positions, rgba, row, scale, _, gamma = grid
     _, height, width = row.shape
@@ -292,7 +293,7 @@ def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
 
 @compiled
 def _change(gives, changes, d, total):
-    """How the colour of a target changes with its coverage, to which all fronts around it give."""
+    """Fill the derivative of a target's colour with its coverage, to which all fronts around it add."""
     zero, one = changes.dtype.type(0), changes.dtype.type(1)
     partial = zero < total[4] < one
     over = one / total[4] if partial else zero
@@ -310,7 +311,7 @@ def _clear(gives, d):
 
 @compiled
 def _change_mixed(changes, d, sums, m):
-    """How the colour of a mixed target changes with the coverage of its buffers, and whether these may change."""
+    """Fill the derivatives of a mixed target's colour with its buffers' coverage; return which buffers are partial."""
     zero, one = sums.dtype.type(0), sums.dtype.type(1)
     front, surface = zero < sums[m, 0, 4] < one, zero < sums[m, 1, 4] < one
     over = one / sums[m, 0, 4] if front else zero
@@ -324,7 +325,7 @@ def _change_mixed(changes, d, sums, m):
 
 @compiled(inline="always")
 def _list(gives, d, ranges, m, front, surface):
-    """What the sources of a mixed target give, of which all those with a front are marked."""
+    """Fill the kinds of coverage that a mixed target gets; sources with a front are marked before."""
     for n in range(9):
         if gives[d, n] != NOTHING:
             if front and ranges[m, n, 0, 1] == 1:
@@ -335,7 +336,7 @@ def _list(gives, d, ranges, m, front, surface):
 
 @compiled
 def _part(gives, d, part, ends, y, x):
-    """Sources of other parts than the target's move as their own outlines, if any: there may be a gap between."""
+    """Have sources of other parts than the target's move as their own outlines, if any: a gap may lie between."""
     n = 0
     for v in range(-1, 2):
         for u in range(-1, 2):
@@ -353,20 +354,20 @@ def _outline(t_positions, row, beta, partner, y, x, axis):
 
 @compiled
 def gain(d, t_positions, row, outlines, y):
-    """What moving outlines add to the coverage of a target's buffers in front and at the surface, along a tangent."""
+    """The growth of a target's coverage by moving outlines along a tangent, in front and at the surface."""
     front, surface = outlines.slopes.dtype.type(0), outlines.slopes.dtype.type(0)
     x, beta, partner = outlines.columns[d], outlines.beta, outlines.partner
     for n in range(9):
-        given = outlines.gives[d, n]
-        if given == NOTHING:
+        kind = outlines.gives[d, n]
+        if kind == NOTHING:
             continue
         v, u = n // 3 - 1, n % 3 - 1
         i, qy, qx = row[0, y - v, x - u], y - v, x - u
-        if given == JOINED:
+        if kind == JOINED:
             qy, qx = y, x
         along = outlines.slopes[d, n, 0] * (_outline(t_positions, row, beta, partner, qy, qx, 0) - t_positions[i, 0])
         along += outlines.slopes[d, n, 1] * (_outline(t_positions, row, beta, partner, qy, qx, 1) - t_positions[i, 1])
-        if given == FRONT:
+        if kind == FRONT:
             front += along
         else:
             surface += along
@@ -375,7 +376,7 @@ def gain(d, t_positions, row, outlines, y):
 
 @loop
 def push(start, stop, row, outlines, t_positions, border, out):
-    """Add to rows [start, stop) of the tangents (T, H, W, 4)."""
+    """Add the changes by moving outlines to rows [start, stop) of the tangents (T, H, W, 4)."""
     for y in range(start + border, stop + border):
         for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
             x = outlines.columns[d] - border
@@ -389,7 +390,7 @@ def push(start, stop, row, outlines, t_positions, border, out):
 
 
 def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_positions: np.ndarray) -> None:
-    """Add to the gradients of positions (N, 3) what outlines give, from that of the image (H, W, 4)."""
+    """Add outlines' shares to the gradients of positions (N, 3), from the gradient of the image (H, W, 4)."""
     bands = -(-len(g) // BAND)
     for first in range(2):
         given = row, outlines, border, g, first, g_positions
@@ -398,7 +399,7 @@ def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_posi
 
 @loop
 def _pull(start, stop, row, outlines, border, g, first, g_positions):
-    """`pull` of every other band of rows, from band `first` on: these have no sample in common."""
+    """`pull` of every other band of rows, from band `first` on: these share no sample."""
     beta, partner, offsets, columns, gives, slopes, changes = outlines
     arrays = beta, partner, offsets, columns, gives, slopes, changes
     for band in range(start, stop):
@@ -429,12 +430,12 @@ def _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front,
     zero = g_positions.dtype.type(0)
     joined_x, joined_y = zero, zero
     for n in range(9):
-        given, py, px = gives[d, n], y + 1 - n // 3, x + 1 - n % 3
-        if given == NOTHING:
+        kind, py, px = gives[d, n], y + 1 - n // 3, x + 1 - n % 3
+        if kind == NOTHING:
             continue
-        h = front if given == FRONT else surface
+        h = front if kind == FRONT else surface
         h_x, h_y = h * slopes[d, n, 0], h * slopes[d, n, 1]
-        if given == JOINED:
+        if kind == JOINED:
             i = row[0, py, px]
             g_positions[i, 0] -= h_x
             g_positions[i, 1] -= h_y
@@ -450,7 +451,7 @@ def _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front,
 
 @compiled(inline="always")
 def _lead(g_positions, row, beta, partner, y, x, g_x, g_y):
-    """Hand on the gradient of what the outline beside a cell moves more than its front: to that, and to its partner."""
+    """Pass on the gradient of an outline's motion relative to its front: to the front's sample and its partner."""
     b = beta[y, x]
     if b != 0:
         i, j = row[0, y, x], partner[y, x]

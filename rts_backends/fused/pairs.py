@@ -1,4 +1,4 @@
-"""Which targets are mixed: those of which some source is not paired front to front, as depths say."""
+"""Mixed targets: those with a source that is not paired front to front, by depths."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 from rts.plugin_api.loops import compiled
 
 BLOCK = 16
-"""Columns that share a note of whether hidden layers are near."""
+"""Columns that share one mark of nearby hidden layers."""
 
 
 @compiled
 def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
-    """Mark the mixed targets of a row; returns how many there are.
+    """Mark the mixed targets of a row; return their number.
 
     Args:
         mixed: (W,) uint8, to be filled.
@@ -22,8 +22,8 @@ def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
         y: the row.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
         z: (3, K, W + 2), depths of this row and its neighbours, one more at each side; filled where `loaded` says so.
-        loaded: (3, B) int64, of which rows these are.
-        target: (K, BLOCK), to work with.
+        loaded: (3, B) int64, the rows that z holds.
+        target: (K, BLOCK), working memory.
     """
     layers, _, width = row.shape
     count = 0
@@ -51,7 +51,7 @@ def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
 
 @compiled
 def _load(z, positions, row, y, first, last, beyond):
-    """Depths of some cells of a row into z (K, ·): NaN where one holds nothing, `beyond` where it lacks the layer."""
+    """Load depths of some cells of a row into z (K, ·): NaN for an empty cell, `beyond` for a missing layer."""
     layers, height, width = row.shape
     nothing = z.dtype.type(np.nan)
     for x in range(first, last):
@@ -66,12 +66,12 @@ def _load(z, positions, row, y, first, last, beyond):
                 z[k, x - first] = positions[i, 2] if i >= 0 else beyond
 
 
-# Rows are handed over once, not for each source: to make views of so few cells takes as long as the work.
+# Rows are passed once, not for each source: views of so few cells take as long to make as the work.
 
 
 @compiled
 def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front, target_hidden):
-    """Mark targets where a hidden layer pairs nearer than the two fronts; rows begin a cell to the left of theirs."""
+    """Mark targets where a hidden layer pairs nearer than the two fronts; rows begin one cell left of the targets'."""
     for x in range(len(marks)):
         t, q = target_front[x], target_hidden[x]
         some = _nearer(front0, hidden0, x, t, q) | _nearer(front1, hidden1, x, t, q) | _nearer(front2, hidden2, x, t, q)

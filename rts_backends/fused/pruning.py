@@ -1,4 +1,4 @@
-"""Which hidden samples can reach the image: `rts.splatting.Kernel.needed`, compiled."""
+"""Hidden samples that can reach the image: `rts.splatting.Kernel.needed`, compiled."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from rts_backends.fused import crossing_pairs
 from rts_backends.fused.cells import Settings
 
 HALO = 3
-"""Rows that the decision for a row looks at on either side: its marks, their neighbours, and those one farther on."""
+"""Rows on either side that decide about a row: its marks depend on neighbours, and these on theirs."""
 
 UNSIGNED = np.int32(0x7FFFFFFF)
 """All bits of a float32 but the sign's."""
 
 MIXED, RING = 1, 2
-"""Marks of targets at which more than fronts may count, and of cells beside empty ones."""
+"""Marks: targets at which hidden layers may count, and cells beside empty ones."""
 
 
 def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.ndarray:
-    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible` or `Multi`."""
+    """Marks (K, H, W) of samples needed by `Visible` or `Multi`, from covered (K, H, W) bool and depth (K, H, W)."""
     layers, height, _ = covered.shape
     visible, rims = settings.kind == "visible", settings.rims
     if layers == 1 or not (visible or settings.epsilon >= Visible.LEAST_EPSILON):
@@ -38,21 +38,21 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
 
 
 def _extremes(covered: np.ndarray, depth: np.ndarray) -> tuple[np.floating, np.floating]:
-    """The least and the largest covered depth, and zero; none is NaN."""
+    """The least and the largest of the covered depths and zero; none of them may be NaN."""
     if depth.dtype != np.float32:
         return depth.min(initial=0, where=covered), depth.max(initial=0, where=covered)
     lines = depth.shape[0] * depth.shape[1]
-    bits, found = depth.reshape(lines, -1).view(np.int32), np.zeros((lines, 2), np.int32)
-    parallel(_find_extremes, lines, bits, covered.reshape(lines, -1), found, work=depth.size // 12)
-    low, high = found.max(axis=0, initial=0).view(np.float32)
+    bits, extremes = depth.reshape(lines, -1).view(np.int32), np.zeros((lines, 2), np.int32)
+    parallel(_find_extremes, lines, bits, covered.reshape(lines, -1), extremes, work=depth.size // 12)
+    low, high = extremes.max(axis=0, initial=0).view(np.float32)
     return -low, high
 
 
 @loop
-def _find_extremes(start, stop, bits, covered, found):
-    """Fill `found` (lines, 2) with how far floats of each line are below and above zero at most, as bits.
+def _find_extremes(start, stop, bits, covered, extremes):
+    """Fill `extremes` (lines, 2) with the largest amounts of each line's floats below and above zero, as bits.
 
-    Bits are below zero where the float has a sign. Integers' maxima become vector code, floats' do not.
+    The bits of a negative float are a negative integer. Maxima of integers become vector code, those of floats do not.
     """
     zero = np.int32(0)
     for i in range(start, stop):
@@ -62,12 +62,12 @@ def _find_extremes(start, stop, bits, covered, found):
             number = line[x] if taken[x] else zero
             high = np.int32(max(high, number))
             low = np.int32(max(low, np.int32(number & UNSIGNED) if number < zero else zero))
-        found[i, 0], found[i, 1] = low, high
+        extremes[i, 0], extremes[i, 1] = low, high
 
 
 @loop
 def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued, kept):
-    """Keep the fronts of rows [start, stop), and hidden layers around marks: of RING alone, the second."""
+    """Keep the fronts of rows [start, stop), and hidden layers around marks; around RING alone, only the second."""
     layers, height, width = covered.shape
     # From row start − HALO on: depths with a border, NaN where there is nothing; least and largest front, least hidden.
     rows = stop - start + 2 * HALO
@@ -104,7 +104,7 @@ def _load(z, covered, depth):
 
 @compiled
 def _bound(least, largest, hidden, front, second):
-    """Least and largest front of each cell and its two neighbours, and their least depth of the second layer."""
+    """Fill least and largest front of each cell and its two neighbours, and their least depth of the second layer."""
     infinity = least.dtype.type(np.inf)
     for x in range(len(least)):
         a, b, c = front[x], front[x + 1], front[x + 2]
@@ -140,12 +140,12 @@ def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
             marks[x] = near or empty
 
 
-# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
+# Rows are passed one by one: so the compiler sees that they do not overlap.
 
 
 @compiled
 def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2, hidden0, hidden1, hidden2, margin):
-    """Mark covered targets but where all that is hidden lies farther behind the fronts than these are apart: most."""
+    """Mark covered targets whose hidden layers are not all farther behind the fronts than these are apart: few."""
     for x in range(len(least0)):
         a, b, c = least0[x], least1[x], least2[x]
         least = b if b < a else a
@@ -162,7 +162,7 @@ def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2,
 
 @compiled
 def _near(z, r, x, margin):
-    """Whether a hidden layer is about as near as the fronts are; where there is nothing, NaN compares as false."""
+    """True if a hidden layer is about as near as the fronts are; NaN of an empty cell compares as false."""
     target = z[0, r, x + 1]
     for n in range(9):
         source = z[0, r - 1 + n // 3, x + n % 3]
@@ -175,7 +175,7 @@ def _near(z, r, x, margin):
 
 @compiled
 def _continued(z, r, x, beyond, margin, continued):
-    """Whether every source that is not nearest front to front continues the target's front along a line."""
+    """True if every source that is not nearest front to front continues the target's front along a line."""
     layers, rows, width = z.shape
     target = z[0, r, x + 1]
     for n in range(9):
@@ -210,7 +210,7 @@ def _mark_ring(marks, above, level, below):
 
 @compiled
 def _spread(kept, covered, which, above, level, below):
-    """Keep what lies around marks of some kinds."""
+    """Keep covered cells around marks of the given kinds."""
     for x in range(len(kept)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         kept[x] = covered[x] & (((around | below[x] | below[x + 1] | below[x + 2]) & which) != 0)

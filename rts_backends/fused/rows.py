@@ -1,11 +1,11 @@
-"""Rows of cells and of buffers as planes of numbers, which the plain part of the compiled splatters works on.
+"""Rows of cells and of buffers as planes of numbers, for the splatting of plain targets.
 
 A task owns a band of rows and works through it in tiles of columns. A row of a tile is kept as planes of `PITCH`
-numbers in one flat array, whose places are constants: that is what lets the compiler see that planes do not overlap,
-and use vector instructions. Source rows roll through three slots; a target row is finished when the source row below
-it has been read.
+numbers in one flat array. The planes' places are constants: so the compiler sees that they do not overlap, and uses
+vector instructions. Source rows roll through three slots; a target row is finished when the source row below it has
+been read.
 
-Buffers here are one or two: the surface, which takes the front layers, and, where `row` has more layers, what is behind
+There are one or two buffers: the surface, which takes the front layers, and, if `row` has more layers, the one behind
 it, which takes all the others.
 
 Helpers are not cached on disk, only the loops that call them (see `rts_backends.triangles`): after a change here,
@@ -33,7 +33,7 @@ COLOR, ONE, WX, WY, RX, RY, SOURCE = (PITCH * p for p in (0, 4, 5, 8, 11, 12, 13
 """Places in a source's slot: colour, 1 if covered, weights by u and by v, offset from the cell's centre."""
 
 SUM, SUMS = 5 * PITCH, 10 * PITCH
-"""How many numbers a buffer's sums take, and those of two buffers: colours and the weight."""
+"""Numbers of one buffer's sums, and of two buffers': colours and the weight."""
 
 compiled = partial(loops.compiled, fastmath={"contract"})
 loop = partial(loops.loop, fastmath={"contract"})
@@ -69,14 +69,14 @@ def _exp(x):
 
 
 class Grid(NamedTuple):
-    """Samples in their cells, and the numbers of a splatter, as loops take them; all floats of one dtype.
+    """Samples in their cells and a splatter's numbers, in the form that loops take; all floats have one dtype.
 
     Attributes:
         positions: (N, 3).
         rgba: (N, 4).
         row: (K, H, W) int32, the sample of each cell, or −1.
         scale: the exponent's factor.
-        peak: of the weights, along one axis.
+        peak: the largest weight, along one axis.
         gamma: the calibration.
     """
 
@@ -88,7 +88,7 @@ class Grid(NamedTuple):
     gamma: float
 
 
-# Helpers get views, so that the compiler knows that no index is negative: it would have to count from the end.
+# Helpers get views, so that the compiler knows that no index is negative: that would count from the end.
 
 
 @compiled
@@ -107,7 +107,7 @@ def tile(width, t):
 
 @compiled
 def busy(states, y, first, count, least):
-    """Whether some target of a row is of at least this state."""
+    """True if a target of a row has at least this state."""
     height, width = states.shape
     if not 0 <= y < height:
         return False
@@ -150,7 +150,7 @@ def load(s, grid, k, y, first, count):
 
 @compiled
 def add_row(to, s, v, count):
-    """Add a source row's splats to a buffer's row; v leads from source to target; target j lies over source j + 1."""
+    """Add a source row's splats to a buffer's row, v rows farther on; target j lies over source j + 1."""
     wy = s[WY + (v + 1) * PITCH :]
     for j in range(count):
         w0, w1, w2 = s[WX + 2 * PITCH + j] * wy[j], s[WX + PITCH + j + 1] * wy[j + 1], s[WX + j + 2] * wy[j + 2]
@@ -161,7 +161,7 @@ def add_row(to, s, v, count):
 
 @compiled
 def normalised_sums(total, sources, layers, y, count):
-    """Both buffers of target row y: colours over the weight, taken as at least one, and the weight."""
+    """Normalise both buffers of target row y: colours over the weight, taken as at least one, beside the weight."""
     one = total.dtype.type(1)
     total[: min(layers, 2) * SUM] = total.dtype.type(0)
     for k in range(layers):
@@ -177,7 +177,7 @@ def normalised_sums(total, sources, layers, y, count):
 
 @compiled
 def composite(total, layers, count):
-    """Composite the surface over what is behind, in place of the surface's colours."""
+    """Composite the surface over the buffer behind, in place of the surface's colours."""
     one = total.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -188,7 +188,7 @@ def composite(total, layers, count):
 
 @compiled
 def fill(s, rgba, cells, states, left, count):
-    """Fill planes without busy targets: the colour of targets that are FLAT, and zeros."""
+    """Fill planes of a row without busy targets: the colours of FLAT targets, and zeros."""
     for j in range(count):
         for c in range(4):
             s[c * PITCH + j] = rgba[cells[left + j], c] if states[left + j] == FLAT else s.dtype.type(0)

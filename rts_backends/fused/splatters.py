@@ -1,6 +1,7 @@
-"""The splatters of `rts.splatting`, compiled for the CPU; what does not fit is left to the specification.
+"""The splatters of `rts.splatting`, compiled for the CPU.
 
-What fits is float32 or float64 in the memory of the host. Second derivatives are those of the specification.
+Compiled loops take float32 or float64 arrays in the host's memory; the specification takes all others, and gives second
+derivatives.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from rts_backends.fused.image import IMAGE
 
 @dataclass(frozen=True)
 class _Fused(SummingSplatter):
-    """Splatter by compiled loops, with the settings of one in array code.
+    """Base of the compiled splatters; each has the settings of one in array code.
 
     Attributes:
         sigma: see `rts.splatting`, as are the others.
@@ -40,7 +41,7 @@ class _Fused(SummingSplatter):
 
     @functools.cached_property
     def array_code(self) -> Any:
-        """The specification with these settings, to which what does not fit is left."""
+        """The specification with these settings, for arrays that the compiled loops do not take."""
         return self.specification(**{field.name: getattr(self, field.name) for field in fields(self)})
 
     @functools.cached_property
@@ -70,7 +71,7 @@ class _Fused(SummingSplatter):
         return IMAGE(*self._operands(splats), settings=self._settings_of(splats))
 
     def _operands(self, splats: Splats) -> tuple[Array, ...]:
-        """Those of `IMAGE`."""
+        """Operands of `IMAGE`; absent fields of the splats become arrays without rows."""
         part = splats.row[:0, :, :] if splats.part is None else splats.part
         facing = self._facing(splats)
         facing = splats.row[:0, :, :] if facing is None else facing
@@ -90,24 +91,24 @@ class _Fused(SummingSplatter):
 
     @property
     def _own_image(self) -> bool:
-        """Whether the image is that of the compiled loops: a subclass may have one of its own."""
+        """True if the image is that of the compiled loops: a subclass may have its own."""
         return type(self).image is _Fused.image
 
     @property
     def _sweeps(self) -> bool:
-        """Whether sums may be taken by the compiled loops."""
+        """True if the compiled loops may compute the normal equations."""
         return self._own_image and type(self).cropped is _Fused.cropped
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.array_code.gamma, border, one_part, *self._motions)
 
     def _settings_of(self, splats: Splats) -> Settings:
-        # Parts that are told count, as they do in `Splats.parts`.
+        # `part` has the last word over `one_part`, as in `Splats.parts`.
         return self._settings(splats.border, splats.one_part and splats.part is None)
 
     @property
     def _motions(self) -> tuple[bool, ...]:
-        """Whether outlines, and lines of crossing, have motions of their own, where the splatter knows of these."""
+        """The settings `rims` and `crossings`; none for a splatter without them."""
         return ()
 
     def normal_equations(

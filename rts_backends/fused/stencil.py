@@ -1,4 +1,4 @@
-"""The splatters where all pairs of cells continue front to front: a 3 × 3 stencil, a row of a tile at a time."""
+"""Splatting onto plain targets, with all sources paired front to front: a 3 × 3 stencil, row by row of a tile."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rts_backends.fused.rows import (
 from rts_backends.fused.uniform_cells import BUSY, FLAT, SETTLED
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
-"""The planes of a tangent that count, as tuples whose length compiled code knows: all five, or alpha and the weight."""
+"""Planes of a tangent that count, as tuples whose length the compiler knows: all five, or alpha and the weight."""
 
 X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 """Places in a tangent's slot, after five planes D: w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
@@ -36,7 +36,7 @@ X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 
 @compiled
 def load_around(sources, loaded, grid, y, first, count):
-    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; returns the first row that was not."""
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; return the first row that was not."""
     start = y + 2
     for v in range(y + 1, y - 2, -1):
         if loaded[(v + 3) % 3] != v:
@@ -75,7 +75,7 @@ def forward(start, stop, grid, states, border, image):
 
 @compiled
 def _copy(image, rgba, cells, states, most):
-    """Give targets of a row that are amid one colour this colour: those of states up to `most`."""
+    """Copy the colour of their cell to the targets of a row with states up to `most`: they lie amid one colour."""
     for x in range(len(image)):
         if SETTLED <= states[x] <= most:
             i = max(cells[x], 0)  # Without a sample any colour will do.
@@ -98,7 +98,7 @@ def add_adjoint(to, total, g, count):
 
 @compiled
 def adjoint_row(to, total, g, layers, count):
-    """Adjoints of both buffers' sums in a row, from those of the image at `g`, which are overwritten."""
+    """Adjoints of both buffers' sums in a row, from the image's in `g`, which is overwritten."""
     one = to.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -114,7 +114,7 @@ def adjoint_row(to, total, g, layers, count):
 
 @compiled
 def load_image(s, image, states, least, border, y, first, count):
-    """Cells of an image as planes, zero beyond it and at targets whose state is below `least`."""
+    """Load cells of an image as planes; zero beyond it and at targets whose state is below `least`."""
     height, width, _ = image.shape
     within = 0 <= y - border < height
     for j in range(count):
@@ -129,7 +129,7 @@ def load_image(s, image, states, least, border, y, first, count):
 
 @compiled
 def _any(planes, count):
-    """Whether any number of four planes is not zero."""
+    """True if any number of four planes is not zero."""
     some = False
     for c in range(4):
         for j in range(count):
@@ -164,11 +164,11 @@ def gather(to, s, above, level, below, count):
 
 @loop
 def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
-    """Gradients of what source rows [start, stop) give to targets that are not mixed; each cell collects its own."""
+    """Fill gradients of the samples of source rows [start, stop) from plain targets; each cell collects its own."""
     row = grid.row
     layers, _, width = row.shape
     sources, total = np.empty(3 * layers * SOURCE, g.dtype), np.empty(SUMS, g.dtype)
-    adjoints, given, found = np.empty(3 * SUMS, g.dtype), np.empty(SUMS, g.dtype), np.empty(8 * PITCH, g.dtype)
+    adjoints, given, gathered = np.empty(3 * SUMS, g.dtype), np.empty(SUMS, g.dtype), np.empty(8 * PITCH, g.dtype)
     loaded, active = np.empty(3, np.int64), np.empty(3, np.bool_)
     slope, least = g.dtype.type(2) * grid.scale * grid.gamma, FLAT if len(g_rgba) > 0 else BUSY
     for t in range((width + TILE - 1) // TILE):
@@ -193,23 +193,23 @@ def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
                 b = SUM if k > 0 else 0
                 above, level = slot(adjoints, 0, y - 2, SUMS)[b:], slot(adjoints, 0, y - 1, SUMS)[b:]
                 s = slot(sources, k, y - 1, SOURCE)[2:]
-                gather(found, s, above, level, adjoint[b:], count)
-                scatter(g_positions, g_rgba, row[k, y - 1], left, found, s, slope, count)
+                gather(gathered, s, above, level, adjoint[b:], count)
+                scatter(g_positions, g_rgba, row[k, y - 1], left, gathered, s, slope, count)
 
 
 @compiled
-def scatter(g_positions, g_rgba, row, left, found, s, slope, count):
-    """Hand what a row of cells has gathered to their samples."""
+def scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
+    """Pass the sums that a row of cells has gathered on to their samples."""
     for j in range(count):
         i = row[left + j]
         if i >= 0:
             if len(g_rgba) > 0:
                 for c in range(4):
-                    g_rgba[i, c] = found[c * PITCH + j]
+                    g_rgba[i, c] = gathered[c * PITCH + j]
             if len(g_positions) > 0:
-                h = found[5 * PITCH + j]
-                g_positions[i, 0] = slope * (found[6 * PITCH + j] - s[RX + j] * h)
-                g_positions[i, 1] = slope * (found[7 * PITCH + j] - s[RY + j] * h)
+                h = gathered[5 * PITCH + j]
+                g_positions[i, 0] = slope * (gathered[6 * PITCH + j] - s[RX + j] * h)
+                g_positions[i, 1] = slope * (gathered[7 * PITCH + j] - s[RY + j] * h)
 
 
 @compiled
@@ -234,7 +234,7 @@ def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope, pla
 
 @compiled
 def load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, y, first, count, planes=COLORS):
-    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet, and beside them those of tangents."""
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet, and the tangents' slots beside them."""
     slope = sources.dtype.type(2) * grid.scale * grid.gamma
     for v in range(load_around(sources, loaded, grid, y, first, count), y + 2):
         for k in range(len(grid.row)):

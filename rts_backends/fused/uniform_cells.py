@@ -1,6 +1,6 @@
-"""Where a splatted image is the same colour all around: there it is that colour, and no motion of splats changes it.
+"""Targets amid splats of one colour: the image has that colour there, and no motion of splats changes it.
 
-The same look at all samples tells where the fronts of `Visible` end.
+The same pass over all samples finds where the fronts of `Visible` end.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from rts.plugin_api.loops import compiled, loop
 from rts_backends.fused.pairs import BLOCK, mark
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
-"""Targets that no splat reaches, that are told to show the colour of a sample, that are amid splats of one colour, and
-all others."""
+"""States of targets: no splat reaches it; `settled` names the sample whose colour it shows; it lies amid splats of one
+colour; all others."""
 
 
 LISTED = 1 << 9
-"""Beside bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends: mixed targets, and those that may be
-covered in part."""
+"""Mark of `ends`, beside bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends: the target is mixed, or
+may be covered in part."""
 
 NOTHING, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
-"""Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
+"""Bits of a cell: inside the array without a sample, with one, and not sure to fill its share of its neighbours."""
 
 
 @loop
@@ -45,8 +45,8 @@ def survey(
 ):
     """Find the states of the targets of rows [start, stop), and fill the other arrays that describe the cells.
 
-    Which targets of `Visible` are mixed is seen on the way: there, other than in `Multi`, it does not go by how far
-    depths reach, which is not known yet.
+    Mixed targets of `Visible` are marked in the same pass. Those of `Multi` are not: they depend on the extent of all
+    depths, which is not known yet.
 
     Args:
         start: first row.
@@ -56,24 +56,25 @@ def survey(
         row: (K, H, W).
         exits: (H, W), samples where rays leave the part of the front, or no rows.
         fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
-        reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
+        reach: the largest offset of a sample from its cell's centre, pixels, at which weights are sure to sum to one.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2, 2) zeros, for the least and the largest depth, and zero, of each row's fronts and hidden layers.
-        seen: (N,) bool, zeros, to be marked: samples that some cell refers to.
+        seen: (N,) bool, zeros, to be marked: samples that a cell refers to.
         counts: (H,) zeros, for the number of such cells, of `row` and `exits`.
-        mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows where nobody asks.
+        mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows if not wanted.
         marked: (H,) zeros, to be filled with their number in each row.
-        ends: (H, W) uint16, to be filled with where fronts end before nothing, and LISTED; no rows where nobody asks.
+        ends: (H, W) uint16, to be filled with directions in which fronts end before nothing, and LISTED; no rows if
+            not wanted.
         listed: (H,) zeros, to be filled with the number of targets that are LISTED in each row.
     """
     layers, height, width = row.shape
     blocks, kind, asks = hidden.shape[1], positions.dtype, len(mixed) > 0
-    # For three rows: in or beside which blocks hidden layers are, and depths of those.
+    # For three rows: blocks in or beside which hidden layers are, and the depths of these.
     near, z = np.zeros((3, blocks), np.uint8), np.empty((3, layers, width + 2 if asks else 0), kind)
     asked, loaded = np.empty(blocks, np.uint8), np.full((3, blocks), -9, np.int64)
     target, beyond = np.empty((layers, BLOCK), kind), kind.type(np.inf)
-    # For three rows of cells: which are covered, which amid three alike, and which alike with the cell above.
+    # For three rows, marks of cells: covered; amid three alike; alike with the cell above.
     cells = np.zeros((3, 3, width + 2), np.uint8)
     covered, calm, joins = cells[0], cells[1], cells[2]
     kinds, partial = np.empty((3, width + 2), np.uint8), np.empty(width, np.uint8)
@@ -81,8 +82,8 @@ def survey(
         now, before = (y + 3) % 3, (y + 2) % 3
         covered[now], calm[now], joins[now], near[now], kinds[now] = 0, 0, 0, 0, LOOSE
         if 0 <= y < height:
-            above, found = row[0, max(y - 1, 0)], (covered[now], calm[now], joins[now], kinds[now, 1:-1])
-            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, *found)
+            above, marks = row[0, max(y - 1, 0)], (covered[now], calm[now], joins[now], kinds[now, 1:-1])
+            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, *marks)
             if len(ends) > 0:
                 _fill_settled(kinds[now, 1:-1], states[y])
             for k in range(len(row)):
@@ -95,7 +96,7 @@ def survey(
             if start <= y < stop:
                 if len(exits) > 0:
                     counts[y] += _note_exits(exits[y], seen)
-                for b in range(blocks):  # To copy an array compiles errors that tell shapes, a second long.
+                for b in range(blocks):  # Assigning arrays compiles an error about their shapes as well: a second.
                     near[now, b] = hidden[y, b]
         if y > start and asks:
             for b in range(blocks):
@@ -115,7 +116,7 @@ def survey(
 
 @compiled
 def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins, kinds):
-    """Fill what is to be known of a row of cells; places are one to the right of the cells', but for their kinds."""
+    """Fill the marks of a row of cells; places are one to the right of the cells', but for `kinds`."""
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0
     for x in range(len(cells)):
@@ -135,7 +136,7 @@ def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joi
         last = i
         if run >= 3:
             calm[x] = 1
-        # Whether the other is centred is seen where its own row is calm.
+        # The other cell is centred if it is calm in its own row.
         if above[x] >= 0 and _alike(rgba, i, above[x]):
             joins[x + 1] = 1
 
@@ -156,7 +157,7 @@ def _cover(covered, cells):
 
 @compiled
 def _note(cells, positions, behind, hidden, depths, seen):
-    """Take note of a row of a layer; returns how many of its cells are covered."""
+    """Note the samples and depths of a row of a layer; return the number of covered cells."""
     count, last = 0, len(cells) - 1
     least, largest = depths[0], depths[1]
     for x in range(len(cells)):
@@ -173,7 +174,7 @@ def _note(cells, positions, behind, hidden, depths, seen):
 
 @compiled
 def _note_exits(cells, seen):
-    """Take note of a row of exits; returns how many there are."""
+    """Note the samples of a row of exits; return their number."""
     count = 0
     for x in range(len(cells)):
         if cells[x] >= 0:
@@ -184,7 +185,7 @@ def _note_exits(cells, seen):
 
 @compiled
 def _hide(cells, hidden):
-    """Take note of where a row of a hidden layer is covered, as `_note` does."""
+    """Mark the blocks in or beside which a row of a hidden layer is covered, as `_note` does."""
     last = len(cells) - 1
     for x in range(len(cells)):
         if cells[x] >= 0:
@@ -193,7 +194,7 @@ def _hide(cells, hidden):
 
 @compiled
 def _keep_covered(mixed, cells):
-    """Leave out marks of targets without a sample; returns how many are left."""
+    """Clear marks of targets without a sample; return the number of those left."""
     count = 0
     for x in range(len(cells)):
         mixed[x] &= np.uint8(cells[x] >= 0)
@@ -212,7 +213,7 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
 
 @compiled
 def _fill_settled(kinds, states):
-    """Settled targets have nothing loose beside them, unless samples there were dropped for want of room."""
+    """Mark settled targets as not loose: no loose cell lies beside them, unless samples overflowed."""
     for x in range(len(kinds)):
         kinds[x] = COVERED if states[x] == SETTLED else kinds[x]
 
@@ -229,7 +230,7 @@ def _mark_partial(partial, above, level, below, fronts):
 
 @compiled
 def _unite(partial, mixed, y):
-    """Mark the mixed targets of a row, too; returns how many are marked."""
+    """Mark the mixed targets of a row, too; return the number of marks."""
     count = 0
     for x in range(len(partial) if len(mixed) > 0 else 0):
         partial[x] |= mixed[y, x]
@@ -257,9 +258,9 @@ def _empty(kinds, x, n):
 
 @loop
 def paint(start, stop, settled, border, colors, images):
-    """Give settled targets of rows [start, stop) of images (T, H, W, 4), which have no border, colours (T, N, 4).
+    """Give settled targets of rows [start, stop) of images (T, H, W, 4), without a border, the colours (T, N, 4).
 
-    They are zero where there are none.
+    Colours are zero if N is 0.
     """
     zero, some = images.dtype.type(0), colors.shape[1] > 0
     for n in range(len(images)):
@@ -286,9 +287,9 @@ def note(start, stop, settled, shown):
 
 @loop
 def collect(start, stop, settled, number, border, g, sums):
-    """Sums (H, S, 4) of the gradient (H, W, 4) of an image without a border at settled targets of rows [start, stop).
+    """Sum the gradient (H, W, 4) of an image without a border over settled targets of rows [start, stop).
 
-    Those of the samples whose colours are shown, which have numbers (N,).
+    The sums (H, S, 4) are by row and by the sample whose colour is shown; `number` (N,) numbers these samples.
     """
     width = g.shape[1]
     for y in range(start, stop):

@@ -61,7 +61,7 @@ class JaxEngine(Engine):
         return jnp.asarray(array)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[jax.Array, ...]:
-        """Call `fn`; packed rows are padded to a bucket where values are known, to the largest shape under a trace."""
+        """Call `fn`; packed rows are padded: to a bucket if values are known, to the largest shape under a trace."""
         # Under grad and jvp this yields the plain value; only jit and vmap leave a tracer.
         args = tuple(jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a for a in args)
         if not any(isinstance(a, Tracer) for a in args):
@@ -111,7 +111,7 @@ class JaxEngine(Engine):
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
-        """See `Engine.by_host`. A traced program decides when its device is known."""
+        """See `Engine.by_host`. A traced program decides once its device is known."""
         if any(isinstance(x, Tracer) for x in arrays):
             return jax.lax.platform_dependent(*arrays, cpu=f, default=otherwise)
         return super().by_host(f, otherwise, *arrays)
@@ -148,13 +148,13 @@ class JaxEngine(Engine):
     def by_rows_in_use(
         self, f: Callable[[dict[str, jax.Array]], jax.Array], rows: Mapping[str, jax.Array], row: jax.Array, whole: Any
     ) -> jax.Array:
-        """See `Engine.by_rows_in_use`: in a traced program piece after piece. Other devices take all at once."""
+        """See `Engine.by_rows_in_use`: a traced program on the CPU goes piece by piece, others take all at once."""
         if not isinstance(row, Tracer) or jax.default_backend() != "cpu":
             return whole
         used = jnp.max(row) + 1
 
         def few(*own: jax.Array) -> jax.Array:
-            # Of small pieces array code takes less time than a call to the host.
+            # For small pieces array code takes less time than a call to the host.
             with operations.by_specification():
                 return f(dict(zip(rows, own, strict=True)))
 
@@ -182,7 +182,7 @@ class JaxEngine(Engine):
         return state
 
     def map_rows(self, f: Callable[[jax.Array], jax.Array], rows: jax.Array, size: int) -> jax.Array:
-        """See `Engine.map_rows`; all calls are of the shape of one, so that a program holds `f` only once."""
+        """See `Engine.map_rows`; all calls have one shape, so that a program holds `f` only once."""
         count = rows.shape[0]
         if count <= size:
             return f(rows)
@@ -202,7 +202,7 @@ class JaxEngine(Engine):
             count, state = counted
             return (count < most) & going(state)
 
-        # A loop wants dtypes that stay; numbers in the state may be weakly typed.
+        # A loop needs constant dtypes; numbers in the state may be weakly typed.
         state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
         return jax.lax.while_loop(on, step, (jnp.int32(0), state))[1]
 
@@ -215,7 +215,7 @@ class JaxEngine(Engine):
         return jax.value_and_grad(f)
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
-        """`jax.checkpoint` of `f`. The result of `make` is kept: to trace `make` would fix the shapes of its arrays."""
+        """`jax.checkpoint` of `f`. The result of `make` is kept, since tracing `make` would fix its arrays' shapes."""
         operand = make()
         return jax.checkpoint(lambda: f(operand))()
 

@@ -59,10 +59,13 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
-    """A function without the equations that its arguments do not enter; it takes their results, returned, first."""
+    """Split a function into equations that depend on its arguments, and the values of all others.
+
+    Returns the function of the former, which takes the latter as its first arguments; and these values.
+    """
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
-        # Numbers spread over the rows of a piece are no less to keep than to make.
+        # To keep a number spread over the rows of a piece costs no less than to compute it.
         if equation.primitive.name in _SPREADING or not variables([equation]).keys().isdisjoint(varying):
             rest.append(equation)
             varying.update(equation.outvars)

@@ -1,4 +1,4 @@
-"""Blocks of the cells that are asked for; the rasterizer passes over triangles that touch none of them."""
+"""Blocks of requested cells; the rasterizer skips triangles that touch none of them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from rts import InputError
 from rts.plugin_api.loops import compiled, loop
 
 SIDE = 16
-"""Cells along each side of a block, which are as many as rows of a band of the rasterizer."""
+"""Cells along each side of a block: as many as a band of the rasterizer has rows."""
 
 ALL = np.uint32(2**SIDE - 1)
 
 
 class Blocks(NamedTuple):
-    """The cells that are asked for, in blocks of the grid.
+    """Requested cells, in blocks of the grid.
 
     Attributes:
-        table: (Y, X) int32, the number of each block that holds any, or −1.
-        numbers: (B, SIDE, SIDE) int32, where in the list each cell of such a block is, or −1.
-        bits: (H, X) uint16, the cells of each line of the grid that are asked for, a number for SIDE of them.
+        table: (Y, X) int32, the number of each block with requested cells, or −1.
+        numbers: (B, SIDE, SIDE) int32, the place in the list of each cell of such a block, or −1.
+        bits: (H, X) uint16, bits of the requested cells in each line of the grid, SIDE to a number.
     """
 
     table: np.ndarray
@@ -33,7 +33,7 @@ class Blocks(NamedTuple):
         """The blocks of cells (L, C), flat indices in a grid of (height, width), or −1.
 
         Raises:
-            InputError: a cell is not in the grid, or there twice.
+            InputError: a cell is not in the grid, or listed twice.
         """
         height, width = size
         table = np.full((-(-height // SIDE), -(-width // SIDE)), -1, np.int32)
@@ -53,7 +53,7 @@ EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int
 
 @loop
 def _fill(cells, width, table, numbers, bits):
-    """Number the blocks that hold any cells, and fill in their cells. Returns the number of blocks.
+    """Number the blocks with requested cells, and fill in these cells. Returns the number of blocks.
 
     The second result is −1, or the place of a cell outside of the grid or listed twice, where the loop stops.
     """
@@ -65,7 +65,7 @@ def _fill(cells, width, table, numbers, bits):
             continue
         if cell >= size:
             return count, m
-        # Most follow on each other: as many at once as do so in a line of a block.
+        # Most cells follow one another: take a run within a line of a block at once.
         y, x = np.uint32(cell) // np.uint32(width), np.uint32(cell) % np.uint32(width)
         first = np.int64(x % side)
         some = _following(cells[m : m + min(SIDE - first, width - np.int64(x))], cell)
@@ -103,10 +103,10 @@ def _following(cells, first):
 
 @compiled
 def touching(places, box, begin, end, bits):
-    """Put places first whose boxes hold cells that are asked for in some lines. Returns their number.
+    """Move the places of boxes with requested cells to the front. Returns their number.
 
-    `box` has the first and last column, and the first and last row, of each box (4, ·). All is in one loop, since
-    compiled code counts references to arrays that it hands on.
+    Only lines from `begin` to `end` − 1 count. `box` (4, ·) has first and last column, and first and last row. One loop
+    does all, since compiled code counts references to arrays that it passes on.
     """
     count, side, one, three = 0, np.uint32(SIDE), np.uint32(1), np.uint32(3)
     for h in range(len(places)):
@@ -114,7 +114,7 @@ def touching(places, box, begin, end, bits):
         left, right = np.uint32(box[0, n]), np.uint32(box[1, n])
         top = np.uint32(max(np.int32(box[2, n]), np.int32(begin)))
         bottom = np.uint32(min(np.int32(box[3, n]), np.int32(end - 1)))
-        # In two words of four lines at most. Branches would be foreseen every other time.
+        # Most boxes fit into two words of four lines. A branch would be mispredicted every other time.
         first, last, below, above = left // side, right // side, min(top + one, bottom), max(bottom, top + one) - one
         low = bits[top, first] | bits[below, first] | bits[above, first] | bits[bottom, first]
         high = bits[top, last] | bits[below, last] | bits[above, last] | bits[bottom, last]
@@ -128,7 +128,7 @@ def touching(places, box, begin, end, bits):
 
 @compiled
 def _some(bits, left, right, top, bottom):
-    """Cells that are asked for in lines of a box, as bits."""
+    """Bits that are not zero if lines of a box hold requested cells."""
     side, one, some = np.uint32(SIDE), np.uint32(1), np.uint32(0)
     first, last = left // side, right // side
     for y in range(top, bottom + one):

@@ -1,8 +1,8 @@
-"""Clusters of triangles that lie together: a cluster out of view, or that faces away, is passed over as a whole.
+"""Clusters of neighbouring triangles: a cluster out of view, or facing away, is skipped as a whole.
 
-They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their
-middles, those that face other ways apart, and vertices in the order of their use. Of each cluster a box tells where it
-is, and a cone which ways it faces.
+They are made of a mesh that stays (`rts.prepare`). Triangles are sorted along a Morton curve through their middles and
+by direction, and vertices by first use. Each cluster has a box, which bounds its positions, and a cone, which bounds
+its normals.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ SIZE = 256
 """Triangles of a cluster, and vertices of a block."""
 
 FRONTS, BACKS = 1, 2
-"""Bits of a cluster: it may hold triangles that face as asked for; it may hold others."""
+"""Bits of a cluster: it may hold triangles that face the requested way; it may hold others."""
 
 AROUND = 1e-9
-"""Rounding of a sum in float64, as a share of its terms: a cluster so near to the border of the view is kept."""
+"""Rounding error of a sum in float64, as a share of its terms: clusters this near to the view are kept."""
 
 NOISE = 1e-13
 """Rounding error of the determinant of three corners, as a share of the product of the largest numbers in it."""
 
 STEPS = np.float64(2**10 - 1)
-"""The largest place on an axis."""
+"""The largest integer position on an axis of the Morton curve."""
 
 COARSE = 2
-"""Bits of a place on an axis that come before which eighth of all ways a triangle faces, the others after it."""
+"""Leading bits of a position on an axis: first in a key. The octant of the normal follows, then the other bits."""
 
 
 class Clusters(NamedTuple):
@@ -41,10 +41,10 @@ class Clusters(NamedTuple):
     Attributes:
         vertices: (V, 3) float32, those that triangles use, in the order of their first use.
         faces: (T, 3) int32, triangles in the order of clusters, SIZE in each.
-        order: (T,) int32, which triangle of the proxy each is.
+        order: (T,) int32, the index of each triangle in the proxy.
         boxes: (6, C) float32, the least and the largest x, y and z of each cluster.
-        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 where
-            nothing is known, and the least length of (b − a) × (c − a).
+        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 if
+            unknown, and the least length of (b − a) × (c − a).
         offsets: (C + 1,) int64, where each cluster's blocks of vertices begin in `blocks`.
         blocks: int32, numbers of the blocks of SIZE vertices that hold its corners.
     """
@@ -84,16 +84,16 @@ class Clusters(NamedTuple):
         Args:
             matrix: (4, 4) to homogeneous pixels.
             size: (height, width).
-            keep: sign of the determinants of triangles that are asked for; 0 for all.
-            both: True if the others are asked for, too.
-            asked: the blocks of cells that are asked for.
+            keep: sign of the determinants of requested triangles; 0 for all.
+            both: True if the other triangles are requested, too.
+            asked: the blocks of requested cells.
 
         Returns:
-            Numbers of clusters (N,) int32, the triangles that these may hold (N,) uint8 as bits `FRONTS` and `BACKS`,
+            Numbers of clusters (N,) int32; bits `FRONTS` and `BACKS` of the triangles that they may hold (N,) uint8;
             and numbers of blocks of vertices, int32.
         """
         height, width = size
-        # Positions a pixel outside of the image are not rounded into it.
+        # Positions more than a pixel outside of the image cannot be rounded into it.
         sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
         planes, rows = np.array(sums) @ matrix, matrix[[0, 1, 3]]
         kept, sides = np.empty(self.boxes.shape[1], np.int32), np.empty(self.boxes.shape[1], np.uint8)
@@ -123,7 +123,7 @@ def _extent(vertices):
 
 @loop
 def _keys(start, stop, vertices, faces, low, scale, keys):
-    """Fill in keys of triangles: 33 bits of their place, and below them the index. Keys sort alike on every machine."""
+    """Fill in keys of triangles: 33 bits of their place, then the index. Their order is the same on every machine."""
     for t in range(start, stop):
         key = np.uint64(0)
         for r in range(3):
@@ -144,7 +144,7 @@ def _keys(start, stop, vertices, faces, low, scale, keys):
 
 @loop
 def _renumber(vertices, faces, order, new_vertices, new_faces):
-    """Fill in the triangles in this order, and the vertices in the order of their use. Returns the vertices' number."""
+    """Fill in the triangles in this order, and the vertices by first use. Returns the number of vertices."""
     numbers, count = np.full(len(vertices), -1, np.int32), 0
     for t in range(len(order)):
         for c in range(3):
@@ -160,7 +160,7 @@ def _renumber(vertices, faces, order, new_vertices, new_faces):
 
 @loop
 def _find_blocks(faces, last, offsets, blocks):
-    """Fill in the blocks of vertices that each cluster uses, and where these begin. Returns their number."""
+    """Fill in the blocks of vertices that each cluster uses, and where each cluster's begin. Returns their number."""
     count = 0
     for t in range(len(faces)):
         cluster = t // SIZE
@@ -193,7 +193,7 @@ def _bound(start, stop, vertices, faces, boxes, cones):
         for b in range(len(block)):
             i, j, k = block[b, 0], block[b, 1], block[b, 2]
             if _same(vertices, i, j) or _same(vertices, j, k) or _same(vertices, k, i):
-                continue  # One of its edge functions is 0 everywhere: it covers nothing.
+                continue  # Two corners coincide: an edge function is 0 everywhere, and the triangle covers nothing.
             normal = normals[count]
             for r in range(3):
                 normal[r] = _normal(vertices, i, j, k, r)
@@ -216,7 +216,7 @@ def _bound(start, stop, vertices, faces, boxes, cones):
 
 @compiled
 def _normal(vertices, i, j, k, r):
-    """A number of (b − a) × (c − a) of corners a, b, c."""
+    """Component r of (b − a) × (c − a) of corners a, b, c."""
     p, q = (r + 1) % 3, (r + 2) % 3
     x, y = np.float64(vertices[i, p]), np.float64(vertices[i, q])
     return (vertices[j, p] - x) * (vertices[k, q] - y) - (vertices[j, q] - y) * (vertices[k, p] - x)
@@ -229,17 +229,17 @@ def _same(vertices, i, j):
 
 @loop
 def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
-    """Fill in the clusters that may hold wanted triangles, and bits of these triangles. Returns the clusters' number.
+    """Fill in the clusters that may hold wanted triangles, and bits of these triangles. Returns the number of clusters.
 
     Args:
         boxes: see `Clusters`.
         cones: see `Clusters`.
         planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
         rows: (3, 4) to homogeneous pixels (x, y, w).
-        keep: sign of the determinants of triangles that are asked for; 0 for all.
-        wanted: bits, FRONTS, BACKS.
-        kept: (C,) int32.
-        sides: (C,) uint8.
+        keep: sign of the determinants of requested triangles; 0 for all.
+        wanted: bits FRONTS and BACKS of the wanted triangles.
+        kept: (C,) int32, to be filled with the clusters.
+        sides: (C,) uint8, to be filled with the bits.
     """
     # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
     q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
@@ -261,7 +261,7 @@ def _minor(rows, i, j, k):
 
 @compiled(inline="always")
 def _test(boxes, cones, planes, towards, rows, sides):
-    """Fill in for each cluster as bits which triangles it may hold: FRONTS, BACKS; none if it is out of view."""
+    """Fill in the bits of each cluster: FRONTS, BACKS; none if it is out of view."""
     qx, qy, qz, s = towards
     for cluster in range(len(sides)):
         x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
@@ -281,16 +281,16 @@ def _test(boxes, cones, planes, towards, rows, sides):
         across = np.sqrt(max(gx * gx + gy * gy + gz * gz - along * along, 0.0))
         cosine, least = cones[3, cluster], cones[4, cluster]
         spread = across * np.sqrt(1 - cosine * cosine + AROUND) + abs(s) * np.sqrt(dx * dx + dy * dy + dz * dz)
-        # Of the normal that is turned away most.
+        # For the normal farthest from the cone's axis.
         sure = (abs(along) * cosine - spread) * least > noise
         sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
 
 
 @loop
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
-    """Mark the clusters that may touch blocks that are asked for; `there` counts these blocks from the first.
+    """Mark the clusters that may touch requested blocks; `there` holds cumulative counts of these blocks.
 
-    Where a box reaches behind the eye, its cluster may.
+    A cluster whose box reaches behind the eye is always marked.
     """
     corner, side = np.empty(3), np.empty((3, 3))
     for n in range(start, stop):
@@ -312,7 +312,7 @@ def _touch(start, stop, kept, boxes, rows, height, width, there, near):
             x0, x1, y0, y1 = min(x0, x / w), max(x1, x / w), min(y0, y / w), max(y1, y / w)
         near[n] = True
         if ahead:
-            # A pixel more all around, since positions are rounded; what is out of view is known.
+            # One pixel more on each side, since positions are rounded. Clusters out of view are dropped before.
             left, right = int(max(x0 - 1, 0.0)) // SIDE, int(min(x1 + 1, width - 1.0)) // SIDE + 1
             top, bottom = int(max(y0 - 1, 0.0)) // SIDE, int(min(y1 + 1, height - 1.0)) // SIDE + 1
             if left < right and top < bottom:
@@ -328,8 +328,8 @@ def _use(kept, offsets, blocks, used):
         for cluster in kept:
             for n in range(offsets[cluster], offsets[cluster + 1]):
                 marks[blocks[n]] = True
-    found = 0
+    count = 0
     for block in range(len(used)):
-        used[found] = block
-        found += marks[block]
-    return found
+        used[count] = block
+        count += marks[block]
+    return count

@@ -1,7 +1,7 @@
 """The second pass of the rasterizer: listed triangles drawn into the layers of pixels, a band of rows at a time.
 
 Loops run over arrays of one short block (a row for each number, a column for each triangle) and have no branches, so
-that they compile to vector instructions and no jump is mispredicted; what is rare is sorted out last.
+that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ NUMBERS = 18
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
     """Fill the three fragment arrays (K, H · W), band by band.
 
-    `listed` is the sign of determinants to draw, the order of bands, where the items of each begin, these, and what is
-    known of each triangle; `asked` are the arrays of `Blocks` for all cells, and `size` is (H, W).
+    `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `Blocks` for all cells; `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
     layers, (height, width), (table, numbers, bits) = len(triangle_ids), size, asked
@@ -49,7 +48,7 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
     """`draw` for a list of M cells: fills arrays (K, M), which `clear` has emptied, but no depths.
 
-    `asked` are the arrays of `Blocks`. Where it `narrows`, triangles may touch none of these cells.
+    `asked` are the arrays of `Blocks`. If `narrows` is set, triangles that touch none of these cells are skipped.
     """
     triangle_ids, barycentrics, _ = fragments
     table, numbers, bits = asked
@@ -66,7 +65,7 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows
 
 @loop
 def clear(start, stop, nearest, fragments, drawn):
-    """Empty the layers of cells [start, stop) of arrays (K, M), or, once they are drawn, fill in the depths."""
+    """Empty the layers of cells [start, stop) of arrays (K, M), or, if `drawn`, fill in the depths."""
     triangle_ids, barycentrics, depths = fragments
     infinity = nearest.dtype.type(np.inf)
     for k in range(len(nearest)):
@@ -88,15 +87,15 @@ def _depths(depths, nearest):
 
 @compiled
 def _draw(items, given, top, end, width, asked, layered):
-    """Insert the triangles of a band of rows from `top` to the one before `end`, `width` wide, into layers of cells.
+    """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
-    Of `layered` arrays (K, M, ·) the first begins with the cell whose number comes before all.
+    `layered` are the number of the first cell in the first array, and the arrays (K, M, ·).
     """
     rows, vertices, matrix, view_depth, keep = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most = 4 * BLOCK
-    # What is left from a row, four of each small triangle, and one more row.
+    # Room for hits left from a row, four for each small triangle, and one more row.
     room = 2 * most + width
     hits, cells, sure = np.empty((room, 2), np.int32), np.empty(room, np.uint32), np.empty(room, np.bool_)
     met = cells, sure, np.empty(room), np.empty((2, room), np.float32)
@@ -106,14 +105,14 @@ def _draw(items, given, top, end, width, asked, layered):
         _gather(block, rows, vertices, entries, points)
         _set_up(len(block), points, matrix, view_depth, keep, top, end - 1, entries, numbers, clips)
         _cover(len(block), entries, numbers, covers)
-        found = 0
+        count = 0
         for b in range(len(block)):
             i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
             place = b * BAND_ROWS + j0 - top
             if (i1 - i0 < 2) & (j1 - j0 < 2):
                 for n in range(4):
-                    hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
-                    found += (covers[b] >> n) & 1
+                    hits[count, 0], hits[count, 1] = place + (n >> 1), i0 + (n & 1)
+                    count += (covers[b] >> n) & 1
                 continue
             for j in range(j0, j1 + 1):
                 y = j + 0.5
@@ -122,24 +121,24 @@ def _draw(items, given, top, end, width, asked, layered):
                 for i in range(i0, i1 + 1):
                     x = i + 0.5
                     ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
-                    hits[found, 0], hits[found, 1] = place, i
-                    found += (ea >= 0) & (eb >= 0) & (ec >= 0)
+                    hits[count, 0], hits[count, 1] = place, i
+                    count += (ea >= 0) & (eb >= 0) & (ec >= 0)
                 place += 1
-                if found > most - 4:
-                    _insert(hits[: _asked(hits, found, top, asked, cells)], met, drawn, layered)
-                    found = 0
-        _insert(hits[: _asked(hits, found, top, asked, cells)], met, drawn, layered)
+                if count > most - 4:
+                    _insert(hits[: _asked(hits, count, top, asked, cells)], met, drawn, layered)
+                    count = 0
+        _insert(hits[: _asked(hits, count, top, asked, cells)], met, drawn, layered)
 
 
 @compiled
-def _asked(hits, found, top, asked, cells):
-    """Drop hits (n, 2) in cells that are not asked for, and number the rest if only some are. Returns their number."""
+def _asked(hits, count, top, asked, cells):
+    """Drop hits (n, 2) in cells that are not requested, and number the cells of the rest. Returns their number."""
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
     if len(bits) == 0:
-        return found
+        return count
     kept = 0
-    for h in range(found):
+    for h in range(count):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         row, block = place % side, np.uint32(max(table[0, i // side], 0))
         hits[kept, 0], hits[kept, 1], cells[kept] = place, i, numbers[block, row, i % side]
@@ -147,7 +146,7 @@ def _asked(hits, found, top, asked, cells):
     return kept
 
 
-# numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
+# numba itself must inline these helpers: only with known lengths of rows do their loops become vector code.
 
 
 @compiled(inline="always")
@@ -168,9 +167,9 @@ def _gather(block, rows, vertices, entries, points):
 
 @compiled(inline="always")
 def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
-    """Work out the numbers (NUMBERS, BLOCK) of triangles, and which may need clipping.
+    """Compute the numbers (NUMBERS, BLOCK) of triangles, and mark those that may need clipping.
 
-    Rows are cut to the band; none are left of a triangle of no area, or facing away.
+    Rows are cut to the band; a triangle of no area, or facing away, keeps none.
     """
     corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
     for c in range(3):
@@ -205,7 +204,7 @@ def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, c
 
 @compiled(inline="always")
 def _cover(count, entries, numbers, covers):
-    """Bits of the first 2 × 2 pixels of each triangle's box that it may cover."""
+    """Fill bits of the first 2 × 2 pixels of each triangle's box that it may cover."""
     for b in range(count):
         bits = 0
         for n in range(4):
@@ -236,7 +235,7 @@ def _insert(hits, met, drawn, layered):
 
 @compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and True for hits that are certain."""
+    """Fill in each hit's depth (n,) and first two barycentrics (2, n), and True for certain hits."""
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
@@ -252,7 +251,7 @@ def _meet(hits, top, numbers, clips, sure, depths, within):
 
 @compiled
 def _covers(b, x, y, numbers, clips):
-    """True if triangle b of a block covers a point that may lie on its edges, or where it is clipped."""
+    """True if triangle b of a block covers a point, edges and clipping taken into account."""
     xa, ya, xb, yb, xc, yc = numbers[0, b], numbers[1, b], numbers[3, b], numbers[4, b], numbers[6, b], numbers[7, b]
     ea, eb, ec = (
         xa * x + (ya * y + numbers[2, b]),
@@ -266,13 +265,13 @@ def _covers(b, x, y, numbers, clips):
 
 @compiled(inline="always")
 def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers of a cell, at its place of `nearest` and of the rest: behind hits that are as near."""
+    """Put a hit into the layers of a cell, by depth, then by the triangle's index."""
     moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, place], triangle_ids[k, cell]
         old_p, old_q = barycentrics[k, cell, 0], barycentrics[k, cell, 1]
-        before = z < old  # A branch would be foreseen every other time.
-        if z == old:  # Of clusters triangles come in another order than that of their indices.
+        before = z < old  # A branch would be mispredicted every other time.
+        if z == old:  # In clusters triangles are not in the order of their indices.
             before = own < old_t
         nearest[k, place], triangle_ids[k, cell] = moved if before else old, t if before else old_t
         barycentrics[k, cell, 0], barycentrics[k, cell, 1] = p if before else old_p, q if before else old_q

@@ -1,14 +1,14 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
-Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, rounded, and
-lists those that may cover one; of a mesh that stays it passes over whole clusters (`rts_backends.raster.clusters`). The
-second draws the image in bands of rows, each by one thread. The result depends neither on the number of threads nor on
-the order of the list. For blocks of listed triangles it works out, in
-float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`, finds the pixels that they may cover, and
-inserts these into the layers.
+Most triangles of a large mesh cover no pixel's centre. A first pass reads only their rounded corners on screen, and
+lists the triangles that may cover one. In a mesh that stays it skips whole clusters (`rts_backends.raster.clusters`).
+
+A second pass draws the image in bands of rows, each by one thread. For blocks of listed triangles it computes, in
+float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`. It finds the pixels that they may cover,
+and inserts them into the layers. The result depends neither on the number of threads nor on the order of the list.
 
 Loops run over arrays of one short block (a row for each number, a column for each triangle) and have no branches, so
-that they compile to vector instructions and no jump is mispredicted; what is rare is sorted out last.
+that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from rts_backends.raster.drawing import BAND_ROWS, LISTED, clear, draw, draw_cel
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
 LONG_BLOCK = SIZE
-"""The block for loops that keep little of each triangle or vertex."""
+"""Length of a block for loops that keep few numbers of each triangle or vertex."""
 
 PER_CHUNK = 8
 CHUNK = PER_CHUNK * LONG_BLOCK
 
 LIMIT = np.float32(2**15 - 2)
-"""Steps from the middle of the image to two pixels outside of it; a position beyond is put there.
+"""Steps from the middle of the image to two pixels outside of it; positions beyond are clamped there.
 
 Positions on screen take 16 bits, so that those of a million triangles stay in caches.
 """
@@ -43,13 +43,13 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
 
 MANY = 1 << 16
-"""Triangles from which on they are put in clusters; fewer gain nothing."""
+"""The least number of triangles that is put in clusters; fewer gain nothing."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
 """Stands for the order of triangles by index."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
-"""In place of a position: before the near plane (or NaN), beyond the far plane."""
+"""Codes in place of a position: before the near plane (or NaN), beyond the far plane."""
 
 
 class Raster(TriangleSampler):
@@ -61,7 +61,7 @@ class Raster(TriangleSampler):
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Give every instance room to keep scratch memory, whatever `__init__` a subclass has."""
         self = super().__new__(cls, *args, **kwargs)
-        self._scratch = (), []  # Of one size alone; whoever draws takes his out, so threads never share.
+        self._scratch = (), []  # Memory of one size. A thread that draws takes a piece out, so threads never share.
         return self
 
     def __getstate__(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Raster(TriangleSampler):
         cull: str,
         cells: np.ndarray,
     ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
+        """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are skipped."""
         blocks = Blocks.of(cells, size)
         with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
             return mesh.draw_cells(mesh.select()[0], layers, cells, blocks)
@@ -98,7 +98,7 @@ class Raster(TriangleSampler):
     def rasterize_exits(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """See `TriangleSampler.rasterize_exits`: all triangles are looked at once, for both."""
+        """See `TriangleSampler.rasterize_exits`: one pass over the triangles serves both."""
         if not self._draws:
             return super().rasterize_exits(prepared, camera, size, layers, beside)
         with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
@@ -109,7 +109,7 @@ class Raster(TriangleSampler):
 
     @property
     def _draws(self) -> bool:
-        """True unless a subclass draws, which may look at what was prepared."""
+        """True unless a subclass draws: it may read the prepared proxy."""
         kind = type(self)
         return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
 
@@ -125,8 +125,8 @@ class Raster(TriangleSampler):
     ) -> Iterator[_Seen]:
         """A mesh as a camera sees it, in scratch memory.
 
-        Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
-        room for every vertex and triangle, but only what is used is ever touched.
+        Drawn repeatedly, a mesh touches the same pages of memory, which the system clears only once. The memory has
+        room for every vertex and triangle, but unused pages are never touched.
         """
         key = len(prepared.vertices), len(prepared.faces)
         scratch = self._scratch
@@ -141,11 +141,11 @@ class Raster(TriangleSampler):
 
 
 class _List(NamedTuple):
-    """Triangles that may cover a pixel's centre, as `draw` takes them.
+    """Triangles that may cover a pixel's centre, in the form that `draw` takes.
 
     Attributes:
         keep: sign of the determinants of triangles to draw, or 0.
-        turns: (bands,), bands of rows, those with most items first: so threads end together.
+        turns: (bands,), bands of rows, those with most items first, so that threads end together.
         offsets: (bands + 1,), where the items of each band begin.
         items: uint32, places in `rows`, in the order of the search.
         rows: (T, LISTED) int32, the numbers listed for each triangle.
@@ -166,8 +166,8 @@ class _Seen:
         camera: the camera.
         size: (height, width).
         keep: sign of the determinants of triangles to draw, or 0.
-        both: True if triangles that face the other way are asked for, too.
-        asked: the blocks of cells that are asked for.
+        both: True if triangles that face the other way are requested, too.
+        asked: the blocks of requested cells.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
         behind: memory for a list of those that face the other way.
@@ -185,7 +185,7 @@ class _Seen:
         listed: np.ndarray,
         behind: np.ndarray,
     ):
-        # With unsigned indices compiled code need not look for negative ones, which count from the end.
+        # With unsigned indices compiled code need not check for negative ones, which count from the end.
         self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
         self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
         self.screen, self.listed, self.behind, self.both = screen, listed, behind if both else behind[:0], both
@@ -202,9 +202,9 @@ class _Seen:
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
     def select(self) -> list[_List]:
-        """Triangles that may cover cells that are asked for; with `both` also a list of triangles facing away."""
+        """Lists of triangles that may cover requested cells: one, or with `both` a second of triangles facing away."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
-        # Threads do not write side by side.
+        # Threads should not write to neighbouring memory.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
         lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
         triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
@@ -221,7 +221,7 @@ class _Seen:
         return fragments
 
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
-        """Fragments (layers, L, C) of some cells, which the blocks are of."""
+        """Fragments (layers, L, C) of some cells; `blocks` are theirs."""
         fragments = _empty((layers, *cells.shape))
         flat, nearest = _flat(fragments), np.empty((layers, cells.size))
         parallel(clear, cells.size, nearest, flat, False, work=nearest.size)
@@ -232,19 +232,19 @@ class _Seen:
 
 
 def _flat(fragments: Fragments) -> tuple[np.ndarray, ...]:
-    """Arrays (K, M), and (K, M, 2), of all cells."""
+    """Fragment arrays with the axes of cells flattened: (K, M), and (K, M, 2)."""
     triangle_ids, barycentrics, depth = fragments
     layers, count = len(depth), depth[0].size
     return triangle_ids.reshape(layers, count), barycentrics.reshape(layers, count, 2), depth.reshape(layers, count)
 
 
 def _empty(shape: tuple[int, ...]) -> Fragments:
-    numbers = np.empty((4, *shape), np.float32)  # The system clears fewer pages of one array than of three.
+    numbers = np.empty((4, *shape), np.float32)  # One array instead of three: the system clears fewer pages.
     return Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
 
 
 def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
-    """A list that `_select` made, sorted by bands of rows; triangles get their names."""
+    """A list of `_select`, sorted by bands of rows, with triangles named by their indices in the proxy."""
     sums = counts.sum(axis=0)
     offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
@@ -255,9 +255,9 @@ def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray,
 
 @loop
 def _project(first, last, used, vertices, m, screen):
-    """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others.
+    """Fill positions (V,) on screen of some blocks of vertices, in steps from the image's middle.
 
-    They are filled in for some blocks of vertices.
+    The lower 16 bits are the column, the upper ones the row.
     """
     points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
     for n in used[first:last]:
@@ -298,13 +298,13 @@ def _select(
     fronts,
     backs,
 ):
-    """List the triangles that may cover a pixel's centre in cells that `bits` of `Blocks` mark; and count them.
+    """List and count the triangles that may cover a pixel's centre in cells marked by `bits` of `Blocks`.
 
-    The search goes through some blocks of triangles; `sides` are bits of the kinds that each may hold: FRONTS, BACKS.
+    The search goes through some blocks of triangles; `sides` are bits FRONTS and BACKS of the triangles in each.
 
-    A list is the rows of triangles (T, LISTED), the first and last row of each chunk (chunks, 2), and the number of a
-    chunk's triangles that touch a band (chunks, bands). Chunks of one call follow on each other. `backs`, if it has
-    room, lists triangles that may face the other way.
+    A list consists of the rows of triangles (T, LISTED), the first and last row of each chunk (chunks, 2), and the
+    number of a chunk's triangles that touch a band (chunks, bands). Chunks of one call follow one another. `backs`, if
+    it has room, lists triangles that may face the other way.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
@@ -319,7 +319,7 @@ def _select(
             block = faces[start : min(len(faces), start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            for side in range(2):  # One loop, since what is called in it is compiled once for each place where it is.
+            for side in range(2):  # A loop, since functions inlined in it are compiled once for each place of call.
                 made = backs if side else fronts
                 if some & (BACKS if side else FRONTS) and len(made[0]) > 0:
                     _look(len(block), xy, height, width, step, -sign if side else sign, box, clips, near)
@@ -329,7 +329,7 @@ def _select(
 
 @compiled(inline="always")
 def _look(count, xy, height, width, step, sign, box, clips, near):
-    """Fill in the box of pixels of each triangle, and marks: it is clipped; it may cover a pixel's centre."""
+    """Fill in each triangle's box of pixels, and marks: it needs clipping; it may cover a pixel's centre."""
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
     middle, center = np.float32(width / 2), np.float32(height / 2)
     for b in range(count):
@@ -341,12 +341,12 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
             x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
         )
         box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
-        # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
+        # Most triangles with one centre in their box do not cover it. Half of a mesh faces away.
         x, y = (i0 + half - middle) / step, (j0 + half - center) / step
         ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
         ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-        # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
-        # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
+        # Rounding changes coordinates by at most half a step. Then edge functions change by at most the sum of the
+        # box's sides and 2.5, and their sum by twice that. The rest is for the centre, rounded to a hundredth.
         bound = more * (x1 - x0 + y1 - y0 + four)
         away = (ea + eb + ec) * sign < -(bound + bound)
         placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
@@ -356,8 +356,8 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 
 @compiled(inline="always")
-def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
-    """List the triangles of a block that are near, from place `found` on. Returns the next place."""
+def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
+    """List the triangles of a block that are marked `near`, from a place on. Returns the next place."""
     vertices, matrix, height, width, step, bits = given
     listed, _, counts = made
     count = 0
@@ -366,7 +366,7 @@ def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
         count += near[b]
     if len(bits) > 0:
         for b in chosen[:count]:
-            if clips[b]:  # Where it is comes below.
+            if clips[b]:  # Its box is computed below.
                 box[0, b], box[1, b], box[2, b], box[3, b] = 0, width - 1, 0, height - 1
         count = touching(chosen[:count], box, 0, height, bits)
     for b in chosen[:count]:
@@ -379,18 +379,18 @@ def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
             i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
             if i0 > i1 or j0 > j1:
                 continue
-        listed[found, 0] = start + b
-        listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
-        listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
-        found += 1
+        listed[place, 0] = start + b
+        listed[place, 1], listed[place, 2], listed[place, 3] = block[b, 0], block[b, 1], block[b, 2]
+        listed[place, 4], listed[place, 5], listed[place, 6], listed[place, 7] = i0, i1, j0, j1
+        place += 1
         for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
             counts[chunk, band] += 1
-    return found
+    return place
 
 
 @compiled
 def _centres(x0, x1, y0, y1, height, width, step):
-    """First and last column and row, in float32, whose pixels have their centres in a box, known to half a step."""
+    """First and last column and row, in float32, of pixels with centres in a box that is known to half a step."""
     slack, half, zero = np.float32(0.75) * step, np.float32(0.5), np.float32(0)
     i0, i1 = max(np.ceil(x0 - half - slack), zero), min(np.floor(x1 - half + slack), np.float32(width - 1))
     j0, j1 = max(np.ceil(y0 - half - slack), zero), min(np.floor(y1 - half + slack), np.float32(height - 1))
@@ -419,9 +419,9 @@ def _clipped_box(corners, width, height):
 
 @loop
 def _sort(first, last, order, listed, spans, places, items):
-    """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on.
+    """Sort the list by bands: write the places of each band's triangles, in order, from `places` (chunks, bands) on.
 
-    In place of where triangles were looked at comes their index in the proxy, unless the order is that of indices.
+    Triangles get their index in the proxy in place of that in `faces`, unless these are the same.
     """
     for chunk in range(first, last):
         if len(order) > 0:

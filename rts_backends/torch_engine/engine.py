@@ -102,7 +102,7 @@ class TorchEngine(Engine):
         return _tensor(array, None if like is None else like.device)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
-        """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""
+        """Call `fn` on NumPy views or copies of `args`; under vmap once for each item, packed rows padded alike."""
         if torch.compiler.is_compiling():
             # torch annotates nothing of what `disable` returns.
             return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)  # pyright: ignore[reportCallIssue]

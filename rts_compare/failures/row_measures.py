@@ -1,4 +1,4 @@
-"""Measures of cells: the error of a derivative image, and how often fits converge."""
+"""Measures of cells: the error of a derivative image, and the share of fits that converge."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rts_compare.other_renderers.renderer_input import renderer_input
 from rts_compare.true_derivatives import area_image, lattice, truth
 
 ERRORS = 0.2, 0.5
-"""Up to where the error of a derivative image is ok, and degraded."""
+"""The largest error of a derivative image that is ok, and degraded."""
 SHARES = 0.9, 0.5
-"""Down to which share of converged fits a method is ok, and degraded."""
+"""The least share of converged fits with which a method is ok, and degraded."""
 CLOSE = 0.5
-"""Pixels that points may be off, root mean square, for a fit to have converged."""
+"""The largest distance of points, pixels root mean square, of a converged fit."""
 SEEDS_OF_MITSUBA = 5
 
 
@@ -29,19 +29,19 @@ SEEDS_OF_MITSUBA = 5
 
 
 def pixel_of(scene: Scene, mode: str) -> float:
-    """How far along a mode what moves fastest moves by a pixel."""
+    """The step along a mode that moves the fastest point by a pixel."""
     return 1.0 / (renderer_input(scene).fastest(mode) or 1.0)
 
 
 class Derivative(NamedTuple):
-    """A row that looks at one derivative image.
+    """A row that measures one derivative image.
 
     Attributes:
         scene: () → the scene, at rest where the derivative is taken.
-        reference: () → the scene whose truth is compared with, where that is another one that looks alike.
-        pixel: as of `pixel_of`, where that cannot know.
+        reference: () → another scene of the same image, whose truth is compared with; None for the scene's own.
+        pixel: the result of `pixel_of`, if that cannot be computed.
         double: whether the library computes in float64.
-        mode: which of the scene's modes is looked at; None for the first.
+        mode: the scene's mode to measure; None for the first.
     """
 
     scene: Callable[[], Scene]
@@ -93,13 +93,13 @@ class Several(NamedTuple):
     """A row of several derivative images, the worst of which counts.
 
     Attributes:
-        derivatives: what there is to look at.
+        derivatives: the images to measure.
     """
 
     derivatives: tuple[Derivative, ...]
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The error in each."""
+        """The error of each derivative."""
         try:
             found = [d.numbers(method, context) for d in self.derivatives]
         except Unable as reason:
@@ -111,12 +111,12 @@ class Several(NamedTuple):
 
 
 class Vanishing(NamedTuple):
-    """A row where the image does not change: what is left, beside the derivative along another mode.
+    """A row in which the image does not change: its false derivative, relative to that along another mode.
 
     Attributes:
-        scene: () → the scene. Its first mode changes nothing; the second says what a derivative of a pixel is, if
-            there is one.
-        limits: up to where what is left is ok, and degraded.
+        scene: () → the scene. Its first mode changes nothing; the second, if any, gives the derivative by a pixel of
+            motion.
+        limits: the largest false derivatives that are ok, and degraded.
     """
 
     scene: Callable[[], Scene]
@@ -143,14 +143,14 @@ class Vanishing(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """A row of fits by Adam, along all modes of a scene, from an image of where it is at rest.
+    """A row of fits by Adam, along all modes of a scene, to an image of the scene at rest.
 
     Attributes:
-        scene: () → the scene, its directions a pixel each or so; the truth is where all amounts are zero.
+        scene: () → the scene, with directions of about a pixel each; at the truth all amounts are zero.
         start: random numbers → amounts (modes,) to start from.
         rate: Adam's at the start; it falls along a cosine to a twentieth.
-        blur: standard deviation, in pixels, of a Gaussian that images are looked at through at the start; it shrinks
-            to zero in the first two thirds of the steps.
+        blur: standard deviation, pixels, of a Gaussian on the images at the start; it shrinks to zero in the first two
+            thirds of the steps.
     """
 
     scene: Callable[[], Scene]
@@ -159,7 +159,7 @@ class Fitted(NamedTuple):
     blur: float = 0.0
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """How often it converges."""
+        """The share of fits that converge."""
         scene = self.scene()
         still = parts_of(scene.at(scene.parameters)), scene.at(scene.parameters)[1]
         with quiet():
@@ -183,7 +183,7 @@ class Fitted(NamedTuple):
         return Outcome("failed" if nan else verdict, text, {**numbers, "nan": nan})
 
     def _fit(self, drawn: Any, first: np.ndarray, target: np.ndarray, steps: int) -> tuple[np.ndarray, int, float]:
-        """Where Adam ends, how many steps had a slope that was not finite, and the largest slope."""
+        """The amounts at the end, the number of steps whose slope was not finite, and the largest slope."""
         import torch
         from scipy.ndimage import gaussian_filter
 
@@ -194,7 +194,7 @@ class Fitted(NamedTuple):
 
             def weigh(image: np.ndarray, sigma: float = sigma) -> np.ndarray:
                 rest = image - target
-                if sigma > 0:  # The filter is its own adjoint where all beyond the image is zero.
+                if sigma > 0:  # With zeros beyond the image the filter is its own adjoint.
                     for _ in range(2):
                         rest = gaussian_filter(rest, (sigma, sigma, 0), mode="constant")
                 return 2 * rest / rest.size
@@ -210,7 +210,7 @@ class Fitted(NamedTuple):
 
 
 def distance(scene: Scene, amounts: np.ndarray) -> float:
-    """How far vertices are from where they are at rest: pixels, root mean square over those of parts that move."""
+    """The distance of vertices from their places at rest: pixels, root mean square over the parts that move."""
     total = []
     zero = np.zeros(len(amounts))
     for a, b in zip(_on_screen(scene, amounts), _on_screen(scene, zero), strict=True):
@@ -222,13 +222,13 @@ def distance(scene: Scene, amounts: np.ndarray) -> float:
 def _on_screen(scene: Scene, amounts: np.ndarray) -> list[np.ndarray]:
     """Pixels (V, 2) of the vertices of each part."""
     parts, camera = scene.at(shifted(scene, amounts))
-    found = []
+    points_of = []
     for part in parts_of((parts, camera)):
         points = np.asarray(part.theta["vertices"], np.float64)
         if part.transform is not None:
             points = points @ part.transform[:3, :3].T + part.transform[:3, 3]
-        found.append(np.asarray(camera.project(points, scene.size))[:, :2])
-    return found
+        points_of.append(np.asarray(camera.project(points, scene.size))[:, :2])
+    return points_of
 
 
 def own(method: Method) -> None:

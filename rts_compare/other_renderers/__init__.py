@@ -1,1 +1,1 @@
-"""DEODR and Mitsuba, which come with the extra `bench`, on scenes of ours."""
+"""Other renderers on the library's scenes: DEODR and Mitsuba, installed with the extra `bench`."""

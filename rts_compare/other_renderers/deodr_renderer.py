@@ -1,8 +1,8 @@
 """Derivatives by DEODR (de La Gorce, Paragios and Fleet 2011): anti-aliased edges drawn over a rasterized image.
 
-It differentiates in reverse mode only; a derivative image is here the difference of its own float64 images over a step
-so small that hardly a pixel changes the triangle it sees, which its reverse mode agrees with to five digits. It sees
-the fronts of triangles only.
+DEODR differentiates in reverse mode only. A derivative image is therefore a difference of its own float64 images, over
+a step so small that hardly a pixel changes its triangle. Its reverse mode agrees to five digits. DEODR draws only the
+fronts of triangles.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rts_compare.derivative_scores import loss_weights
 from rts_compare.other_renderers.renderer_input import Peer, RendererInput, Unsuited
 
 STEP = 1e-6
-"""Length of a difference, pixels."""
+"""Step of a difference, pixels."""
 TURN = 1e-8
-"""Radians by which the camera is turned about its axis: exactly upright or level edges are not drawn."""
+"""Radians by which the camera is turned about its axis: DEODR does not draw exactly upright or level edges."""
 
 
 class Deodr(Peer):
@@ -30,7 +30,7 @@ class Deodr(Peer):
 
     Raises:
         ImportError: DEODR is not installed.
-        Unsuited: it cannot render the scene.
+        Unsuited: DEODR cannot render the scene.
     """
 
     name = "DEODR"
@@ -44,7 +44,7 @@ class Deodr(Peer):
         self.given, self.settings = given, {}
         self.vertices = np.concatenate([p.vertices for p in given.parts])
         self.colors = np.concatenate([p.colors for p in given.parts])
-        # Gradients are refused with perspective-correct interpolation, and where back faces are drawn.
+        # DEODR refuses gradients with perspective-correct interpolation, and with back faces drawn.
         self.scene: Any = Scene3D(sigma=1.0, perspective_correct=False, integer_pixel_centers=False)
         first = np.cumsum([0, *(len(p.vertices) for p in given.parts)])
         faces = np.concatenate([p.faces + f for p, f in zip(given.parts, first, strict=False)])
@@ -65,7 +65,7 @@ class Deodr(Peer):
         self.scene.mesh.set_vertices(vertices)
         self.scene.mesh.set_vertices_colors(colors)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # It takes cross products of vectors in the plane.
+            warnings.simplefilter("ignore", DeprecationWarning)  # DEODR takes cross products of 2D vectors.
             return self.scene.render(self.camera)
 
     def derivative(self, mode: str, seed: int = 0) -> np.ndarray:
@@ -75,7 +75,7 @@ class Deodr(Peer):
         rest = self._render(self.vertices, self.colors)
         ahead = self._render(self.vertices + step * move, self.colors + step * change) - rest
         behind = rest - self._render(self.vertices - step * move, self.colors - step * change)
-        # Where depths tie, rounding decides what is seen: a jump, on one of both sides.
+        # At ties of depth rounding decides which triangle is seen: a jump on one of the two sides.
         return np.where(np.abs(ahead) < np.abs(behind), ahead, behind) / step
 
     def gradient(self, mode: str, weights: np.ndarray | None = None) -> Callable[[], float]:
@@ -86,14 +86,14 @@ class Deodr(Peer):
         def slope() -> float:
             self._render(self.vertices, self.colors)
             self.scene.clear_gradients()
-            self.scene.render_backward(weights.copy())  # It overwrites what it is given.
+            self.scene.render_backward(weights.copy())  # DEODR overwrites its argument.
             mesh = self.scene.mesh
             return float((mesh._vertices_b * move).sum() + (mesh.vertices_colors_b * change).sum())
 
         return slope
 
     def _velocity(self, mode: str) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities of vertices and of colours, (V, 3) each."""
+        """Velocities (V, 3) of all vertices, and of their colours."""
         pairs = list(zip(self.given.parts, self.given.velocity(mode), strict=True))
         moves = [np.zeros_like(p.vertices) if v.vertices is None else v.vertices for p, v in pairs]
         changes = [np.zeros_like(p.colors) if v.colors is None else v.colors for p, v in pairs]

@@ -21,25 +21,25 @@ from rts.plugin_api.arrays import map_leaves
 from rts_compare.moving_scenes import Scene
 
 EDGE = 4.0
-"""Pixels that edges of triangles are to be shorter than, where a surface is cut into triangles."""
+"""The longest edge of triangles that a surface is cut into, pixels."""
 CUTS = (1, 2, 4, 8, 16, 32, 64)
-"""Along each side of a patch, to choose from."""
+"""Cuts along each side of a patch, to choose from."""
 TRIAL = 1e-3
-"""Step in t by which speeds are guessed, before they are measured over a pixel."""
+"""Step in t for a first estimate of speeds, before they are measured over a pixel."""
 COLOR_STEP = 0.1
-"""A change of colour that counts as far as a pixel."""
+"""A change of colour that counts as much as a motion by a pixel."""
 
 
 class Unsuited(Exception):
-    """Why other renderers cannot render a scene; a clause."""
+    """A scene that other renderers cannot render; the message is a clause that says why."""
 
 
 class Colored(NamedTuple):
     """Triangles of one part.
 
     Attributes:
-        faces: (T, 3) integers, counter-clockwise where they are seen.
-        vertices: (V, 3) float64: x right, y up, looked at along −z.
+        faces: (T, 3) integers, counter-clockwise as seen from the front.
+        vertices: (V, 3) float64: x right, y up; the camera looks along −z.
         colors: (V, 3) float64.
     """
 
@@ -52,8 +52,8 @@ class Velocity(NamedTuple):
     """The motion of a part, per unit of t.
 
     Attributes:
-        vertices: (V, 3), or None where they rest.
-        colors: (V, 3), or None where they stay.
+        vertices: (V, 3), or None at rest.
+        colors: (V, 3), or None if constant.
     """
 
     vertices: np.ndarray | None
@@ -62,14 +62,14 @@ class Velocity(NamedTuple):
 
 @dataclass(frozen=True)
 class RendererInput:
-    """A scene as it is given to other renderers.
+    """A scene in the form that other renderers take.
 
     Attributes:
         size: (height, width).
         focal: focal length, pixels; the axis meets the middle of the image.
         planes: depths of the near and the far plane.
-        parts: one a part of the scene.
-        velocities: mode → one a part, or why there are none.
+        parts: one for each part of the scene.
+        velocities: mode → one for each part, or the reason why there are none.
     """
 
     size: tuple[int, int]
@@ -84,10 +84,10 @@ class RendererInput:
         Raises:
             InputError: the mode moves no triangles in a way that has a velocity.
         """
-        found = self.velocities[mode]
-        if isinstance(found, str):
-            raise InputError(found)
-        return found
+        velocity = self.velocities[mode]
+        if isinstance(velocity, str):
+            raise InputError(velocity)
+        return velocity
 
     @property
     def fov(self) -> float:
@@ -95,7 +95,7 @@ class RendererInput:
         return float(np.degrees(2 * np.arctan(self.size[0] / (2 * self.focal))))
 
     def fastest(self, mode: str) -> float:
-        """How fast a mode moves what moves fastest: pixels per unit of t, colours in units of `COLOR_STEP`."""
+        """The speed of the fastest vertex in a mode: pixels per unit of t, colours in units of `COLOR_STEP`."""
         return _fastest(self.parts, self.velocity(mode), self.focal, self.planes[0])
 
 
@@ -104,7 +104,7 @@ class Peer(abc.ABC):
 
     Attributes:
         name: of the renderer.
-        settings: what it was told, by name.
+        settings: its settings by name.
     """
 
     name: str
@@ -121,9 +121,9 @@ class Peer(abc.ABC):
 
     @abc.abstractmethod
     def gradient(self, mode: str, weights: np.ndarray | None = None) -> Callable[[], float]:
-        """A function that renders once, and gives dL/dt of L = Σ weights · image by one pass in reverse mode.
+        """A function that renders once, and returns dL/dt of L = Σ weights · image by one pass in reverse mode.
 
-        That is by the gradient in all vertices and colours that the mode changes.
+        The pass takes the gradient in all vertices and colours that the mode changes.
 
         Args:
             mode: a key of the scene's `directions`.
@@ -173,18 +173,18 @@ def _on_host(scene: Scene, mode: str, t: float, engine: Engine | None) -> tuple[
 
 
 def _snapshot(scene: Scene, engine: Engine | None, focal: float, cuts: list[int], mode: str, t: float) -> list[Colored]:
-    """The parts at t, wound as they are."""
+    """The parts at t, with their own winding."""
     parts, camera = _on_host(scene, mode, t, engine)
     to_camera = _to_camera(camera, focal, scene.size)
-    found = []
+    colored = []
     for index, (part, rate) in enumerate(zip(parts, cuts, strict=True)):
         vertices, faces = _mesh(part, rate)
-        found.append(Colored(faces, _placed(vertices, to_camera, part), _colors(index, part, rate, len(vertices))))
-    return found
+        colored.append(Colored(faces, _placed(vertices, to_camera, part), _colors(index, part, rate, len(vertices))))
+    return colored
 
 
 def _to_camera(camera: Camera, focal: float, size: tuple[int, int]) -> np.ndarray:
-    """(3, 4) from the world to where the image is that of a camera of this focal length, in pixels."""
+    """Transform (3, 4) from the world to the space of a camera of this focal length, pixels, with the same image."""
     projection = np.asarray(camera.for_size(size).projection, np.float64)
     # What is seen at NDC (x, y) with clip w is at depth w, and that far to the right and up.
     scale = np.array([size[1] / (2 * focal), size[0] / (2 * focal), -1.0]) / -projection[3, 2]
@@ -192,7 +192,7 @@ def _to_camera(camera: Camera, focal: float, size: tuple[int, int]) -> np.ndarra
 
 
 def _placed(vertices: np.ndarray, to_camera: np.ndarray, part: Part) -> np.ndarray:
-    """Vertices (V, 3) of a part, local space, as the camera sees them."""
+    """Vertices (V, 3) of a part, from local space to the camera's."""
     matrix = to_camera if part.transform is None else to_camera @ np.asarray(part.transform, np.float64)
     return vertices @ matrix[:, :3].T + matrix[:, 3]
 
@@ -210,7 +210,7 @@ def _mesh(part: Part, rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cuts(index: int, part: Part, to_camera: np.ndarray, focal: float) -> int:
-    """Cuts along each side of a patch with which edges are short on screen."""
+    """The cuts along each side of a patch that make edges short on screen."""
     if not hasattr(part.surface, "tessellate"):
         raise Unsuited(f"part {index} is no mesh, and cannot be made one")
     before = 0
@@ -246,27 +246,27 @@ def _colors(index: int, part: Part, rate: int, count: int) -> np.ndarray:
 
 
 def _of_vertices(index: int, part: Part, rate: int) -> np.ndarray:
-    """Colours of vertices (V, C), as θ has them."""
+    """Colours (V, C) of vertices, as in θ."""
     colors = part.theta.get("colors")
     if isinstance(colors, np.ndarray):
         if _is_mesh(part) and part.surface.sample_widths[0] == 3:
             return np.asarray(colors, np.float64)
         points = part.surface.reads(part.theta)[0]
         if hasattr(part.surface, "control_points") and np.shape(part.theta[points]) == colors.shape:
-            # Colours of control points are blended as the points are.
+            # Colours of control points are blended like the points.
             return _mesh(part.replace(theta={**part.theta, points: colors}), rate)[0]
     raise Unsuited(f"the colours of part {index} are not those of vertices")
 
 
 def _rgb(index: int, part: Part, colors: np.ndarray) -> np.ndarray:
-    """(V, 3) of colours (V, C) as the shader `unlit` takes them."""
+    """RGB colours (V, 3) of colours (V, C) for the shader `unlit`."""
     if colors.shape[1] == 4 and not part.shader.opaque:
         raise Unsuited(f"part {index} is translucent")
     return colors[:, :3] if colors.shape[1] >= 3 else np.repeat(colors[:, :1], 3, axis=1)
 
 
 def _joints(part: Colored) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V',) to keep where several are in one place and of one colour, and (V,) which of them each becomes."""
+    """Indices (V',) of the vertices to keep if several share place and colour, and (V,) the kept one for each."""
     _, first, became = np.unique(
         np.hstack([part.vertices, part.colors]), axis=0, return_index=True, return_inverse=True
     )
@@ -276,7 +276,7 @@ def _joints(part: Colored) -> tuple[np.ndarray, np.ndarray]:
 def _joined(
     at: Callable[[str, float], list[Colored]], joints: list[tuple[np.ndarray, np.ndarray]], mode: str, t: float
 ) -> list[Colored]:
-    """The parts at t, with one vertex a place and colour: else an edge between patches would count as two outlines."""
+    """The parts at t with vertices joined by place and colour: otherwise edges of patches would count as outlines."""
     return [
         Colored(became[part.faces], part.vertices[first], part.colors[first])
         if len(part.vertices) == len(became)
@@ -286,9 +286,9 @@ def _joined(
 
 
 def _check_joined(index: int, part: Colored) -> None:
-    """Refuse a part that faces both ways, and whose triangles meet without sharing vertices.
+    """Refuse a part that faces both ways, and whose triangles meet without shared vertices.
 
-    There an edge of a front and a back face would count as two outlines.
+    An edge between its front and back faces would count as two outlines.
     """
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -301,7 +301,7 @@ def _check_joined(index: int, part: Colored) -> None:
 
 
 def _turned(part: Colored) -> Colored:
-    """A part that is drawn from both sides, wound so that it is seen by those who draw fronts only."""
+    """A part that is drawn from both sides, with back faces rewound for renderers that draw only fronts."""
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c))  # Negative for a triangle that faces the camera.
     edges = np.concatenate([part.faces[:, [0, 1]], part.faces[:, [1, 2]], part.faces[:, [2, 0]]])
@@ -316,7 +316,7 @@ def _turned(part: Colored) -> Colored:
 def _velocities(
     at: Callable[[float], list[Colored]], rest: list[Colored], focal: float, near: float
 ) -> tuple[Velocity, ...] | str:
-    """Velocities of all parts in one mode, or why there are none."""
+    """Velocities of all parts in one mode, or the reason why there are none."""
     try:
         guess = _differences(at, rest, TRIAL)
         speed = _fastest(rest, guess, focal, near)
@@ -326,12 +326,12 @@ def _velocities(
 
 
 def _differences(at: Callable[[float], list[Colored]], rest: list[Colored], step: float) -> tuple[Velocity, ...]:
-    found = []
+    velocities = []
     for index, (a, b, c) in enumerate(zip(at(step), at(-step), rest, strict=True)):
         if not (np.array_equal(a.faces, c.faces) and np.array_equal(b.faces, c.faces)):
             raise Unsuited(f"the triangles of part {index} are others when it moves")
-        found.append(Velocity(_slope(a.vertices, b.vertices, step), _slope(a.colors, b.colors, step)))
-    return tuple(found)
+        velocities.append(Velocity(_slope(a.vertices, b.vertices, step), _slope(a.colors, b.colors, step)))
+    return tuple(velocities)
 
 
 def _slope(ahead: np.ndarray, behind: np.ndarray, step: float) -> np.ndarray | None:
@@ -339,7 +339,7 @@ def _slope(ahead: np.ndarray, behind: np.ndarray, step: float) -> np.ndarray | N
 
 
 def _fastest(parts: Sequence[Colored], velocities: Sequence[Velocity], focal: float, near: float) -> float:
-    """See `RendererInput.fastest`; what lies before the near plane does not count."""
+    """See `RendererInput.fastest`; vertices before the near plane do not count."""
     speed = 0.0
     for part, velocity in zip(parts, velocities, strict=True):
         if velocity.colors is not None:

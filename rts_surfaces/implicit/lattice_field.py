@@ -1,4 +1,4 @@
-"""The field that values on a lattice describe: interpolated linearly along each axis."""
+"""The field of values on a lattice, interpolated linearly along each axis."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LatticeField(ScalarField):
         shape: (X, Y, Z) that the values must have, or None for any.
 
     Attributes:
-        level_of_values: isovalue and sign of the values that `look` gives.
+        level_of_values: isovalue and sign of the values that `look` returns.
     """
 
     name = "theta['values']"
@@ -56,7 +56,7 @@ class LatticeField(ScalarField):
         return Lattice(self.bounds, shape_of(theta["values"]))
 
     def resampled(self, theta: Mapping[str, Tree]) -> Iterator[Resampled]:
-        """Every fourth value along each axis, and every second, where they begin and end with the lattice."""
+        """Every fourth value along each axis, and every second, if these include the lattice's ends."""
         for stride in (4, 2):
             shape = tuple((n - 1) // stride + 1 for n in shape_of(theta["values"]))
             if min(shape) >= 2 and all((n - 1) % stride == 0 for n in shape_of(theta["values"])):
@@ -68,15 +68,15 @@ class LatticeField(ScalarField):
         return Looked({"values": theta["values"]}, 0)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """None: samples name the values themselves."""
+        """No tables: samples refer to the values themselves."""
         return {}
 
     def tabled(self, samples: Samples) -> Samples:
-        """The samples."""
+        """The samples unchanged."""
         return samples
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """All values (M,), and which of them (N, 6) belong to each sample."""
+        """All values (M,), and the indices (N, 6) of those that belong to each sample."""
         values = self.suited(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 

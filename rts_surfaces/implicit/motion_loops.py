@@ -1,4 +1,4 @@
-"""Samples moved with the field, and the derivatives, compiled. See `rts_surfaces.implicit.motion`."""
+"""Motion of samples with the field, and its derivatives, compiled. See `rts_surfaces.implicit.motion`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rts.plugin_api.threads import parallel
 def along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, out: np.ndarray, *, isovalue: float, sign: float
 ) -> None:
-    """Fill the places (N, 3) of samples that move along the gradient."""
+    """Fill positions (N, 3) of samples that move along the gradient."""
     real = values.dtype.type
     parallel(_move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
 
@@ -32,7 +32,7 @@ def pull_along(
 
 
 def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
-    """Fill the places (N, 3) of samples whose corners slide along edges."""
+    """Fill positions (N, 3) of samples whose corners slide along edges."""
     *given, out = rest
     count, level = len(out), values.dtype.type(isovalue)
     parallel(_cross, count, values, *given, level, *lattice, out, work=60 * count)

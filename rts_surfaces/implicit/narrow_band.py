@@ -16,16 +16,16 @@ from rts_surfaces.implicit import narrow_band_loops as loops
 from rts_surfaces.implicit.lattice import Lattice
 
 Level = Callable[[np.ndarray], np.ndarray]
-"""The level at places (M, 3) float64: (M,) float32 or float64, negative inside the surface, not outside and on it."""
+"""A function of places (M, 3) float64 to levels (M,) float32 or float64: negative inside the surface, else not."""
 
 WORK = 5
-"""Nanoseconds that a place takes."""
+"""Nanoseconds for the evaluation at a place."""
 ROUNDING = 4
-"""Rounding error of a level, in last digits of its scale: the Lipschitz bound times coordinates."""
+"""Rounding error of a level, in units of the last digit of its scale: the Lipschitz bound times coordinates."""
 
 
 class Band(NamedTuple):
-    """Cells of a lattice, and their corners.
+    """Cells of a lattice that a surface passes through, and their corners.
 
     Attributes:
         numbers: (M,) int64, the points of the lattice that are corners of the cells, each once.
@@ -45,24 +45,23 @@ class Band(NamedTuple):
 
 @dataclass(frozen=True)
 class NarrowBand:
-    """Finds the cells of a lattice that a surface passes through.
+    """A search for the cells of a lattice that a surface passes through.
 
-    With a Lipschitz bound these are all cells whose corners differ in sign. Blocks of cells whose level at the centre
-    is further from zero than it can change within them are dropped, the others halved.
+    With a Lipschitz bound these are all cells whose corners differ in sign. A block of cells is dropped if the level at
+    its centre is further from zero than it can change within the block; other blocks are halved.
 
-    Without one, coarse cells whose corners differ in sign are halved, with those around them; after that, only those
-    of the halves whose corners differ in sign. At every fineness the surface is then followed across the sides of cells
-    that it crosses. So each coarse cell whose corners differ in sign has cells in the band, and none of them ends in a
-    hole: the neighbour is in the band, too, wherever four corners that both have differ in sign. A part of the
-    surface between coarse corners of one sign, apart from the rest, is found only where it shows at the corners of half
-    as coarse cells, within the margin.
+    Without one, the search halves coarse cells whose corners differ in sign, with a margin around them. Of the halves,
+    only those whose corners differ in sign are halved again. At every fineness the surface is then followed across the
+    sides of cells that it crosses. So each coarse cell whose corners differ in sign has cells in the band, and the band
+    has no holes: if the four corners shared with a neighbour differ in sign, the neighbour is in it, too. A separate
+    part of the surface between coarse corners of one sign is found only in the margin, and only if it shows at corners
+    of halved cells.
 
     Args:
-        lipschitz: how fast the level changes at most, per unit of length; None where this is not known.
-        coarse: cells along each side of the blocks to begin with, a power of two; None for 16 with a Lipschitz bound
-            and 8 without one.
-        margin: width, in coarse cells, of the border around these cells that is halved with them. With a Lipschitz
-            bound it does not count.
+        lipschitz: the fastest change of the level, per unit of length; None if unknown.
+        coarse: cells along each side of the first blocks, a power of two; None for 16 with a Lipschitz bound and 8
+            without one.
+        margin: width, in coarse cells, of this margin. With a Lipschitz bound it does not count.
         chunk: the largest number of points at which the level is evaluated together.
 
     Raises:
@@ -97,8 +96,8 @@ class NarrowBand:
                 corners is inside and on the boundary.
 
         Returns:
-            The band, which is empty if nothing is found. Where the level turns out to be NaN at a point of the lattice,
-            the search ends, and the band is one cell that has this point as a corner.
+            The band; it is empty if there are no such cells. If the level is NaN at a point of the lattice, the search
+            ends, and the band is one cell that has this point as a corner.
         """
         evaluate = _Evaluate(level, lattice, int(self.chunk))
         try:
@@ -128,16 +127,16 @@ class _Evaluate:
 
     def __init__(self, level: Level, lattice: Lattice, chunk: int):
         self.level, self.chunk, self.count, self.refuses = level, chunk, 0, True
-        self.dtype = np.dtype(np.float64)  # Until it is known.
+        self.dtype = np.dtype(np.float64)  # Until the first evaluation.
         self.shape = lattice.shape
         self.low, self.step = tuple(lattice.low.tolist()), tuple(lattice.step.tolist())
 
     def counts(self, side: int) -> tuple[int, ...]:
-        """The number of blocks of such a side along each axis."""
+        """The number of blocks with this side along each axis."""
         return tuple(-(-(n - 1) // side) for n in self.shape)
 
     def all_blocks(self, side: int) -> np.ndarray:
-        """All blocks of such a side, (B, 3) int32."""
+        """All blocks (B, 3) int32 with this side."""
         return np.ascontiguousarray(np.indices(self.counts(side), np.int32).reshape(3, -1).T)
 
     def at_points(self, numbers: np.ndarray) -> np.ndarray:
@@ -172,7 +171,7 @@ class _Evaluate:
 
 
 class _Grid:
-    """Corners of blocks of one side, and the levels at corners where they are known.
+    """Corners of blocks with one side, and the levels at known corners.
 
     Attributes:
         numbers: (M,) int64, their numbers in the lattice.
@@ -194,7 +193,7 @@ class _Grid:
         return self._values[: self._count]
 
     def give(self, numbers: np.ndarray, values: np.ndarray) -> None:
-        """Tell the levels at corners by their numbers in the lattice, all of them new; negative numbers are none."""
+        """Add levels at new corners, by their numbers in the lattice; negative numbers are skipped."""
         numbers, values = numbers[numbers >= 0], values[numbers >= 0]
         first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
         self.bricks, self._used, self._numbers, self._count = loops.given_rows(
@@ -203,7 +202,7 @@ class _Grid:
         self._keep(first, values)
 
     def corners(self, blocks: np.ndarray) -> np.ndarray:
-        """The rows (B, 8) of the corners of blocks; where the level is not known there, it is evaluated."""
+        """The rows (B, 8) of the corners of blocks; unknown levels are evaluated."""
         first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
         rows, self.bricks, self._used, self._numbers, self._count = loops.numbered(
             blocks, self.side, self._evaluate.shape, self.counts, *state
@@ -272,7 +271,7 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
 
 
 def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the blocks whose corners differ in sign, and add blocks into which the surface goes on."""
+    """Choose the blocks whose corners differ in sign, and add blocks into which the surface continues."""
     directory, bricks = _bricks(grid.counts, np.uint8)
     bricks, used = loops.marked(blocks, grid.counts, directory, bricks, 0)
     rows = grid.corners(blocks)

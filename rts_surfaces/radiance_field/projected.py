@@ -1,8 +1,7 @@
-"""Surfaces in NDC, brought to the world: by these a camera draws a forward-facing radiance field.
+"""Surfaces in NDC, mapped to the world: so a camera draws a forward-facing radiance field.
 
-Between NDC and the world planes and straight lines stay planes and lines, so triangles stay triangles; but the middle
-of a side does not stay in its middle. The barycentric λ_k in the world, of a corner at depth d_k, is λ_k d_k over the
-sum of these in NDC.
+The map between NDC and the world keeps planes and straight lines, so triangles stay triangles; but it does not keep the
+middle of a side. A corner at depth d_k has barycentric λ_k in the world. In NDC it is λ_k d_k, over the sum of these.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from rts.plugin_api.records import ArraySpec, Proxy, Rays, Samples
 from rts_surfaces.radiance_field.ndc import Ndc
 
 DEEPEST = 1e4
-"""Depth, over that of the near plane, beyond which triangles are left out: rounding moves them too far in the world."""
+"""Depth, over the near plane's, beyond which triangles are left out: rounding moves them too far in the world."""
 
 
 class Projected(TriangleSurface):
@@ -29,8 +28,8 @@ class Projected(TriangleSurface):
     Its G-buffer has position and normal, if that surface has them, and further entries as they are.
 
     Args:
-        surface: a surface in NDC whose triangles do not depend on the camera, and whose samples have two parameters
-            before its `refine`, the barycentrics; `refine` may not move them. Such as an isosurface.
+        surface: a surface in NDC, such as an isosurface. Its triangles must not depend on the camera. Before `refine`
+            its samples have two parameters, the barycentrics; `refine` must not move samples.
         ndc: the map between the world and NDC.
 
     Raises:

@@ -1,6 +1,6 @@
 """Checks of cages of subdivision surfaces: a cage on which OpenSubdiv would crash never reaches it.
 
-Half edge h is the side of a face from its corner h to the next one; H is how many there are.
+Half edge h is the side of a face from its corner h to the next one; H is the number of half edges.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from rts.plugin_api.checks import check_numbers, quoted
 
 REPAIR = "repair the cage"
 INFINITE = 10
-"""The sharpness from which on OpenSubdiv takes a crease or corner for infinitely sharp."""
+"""The least sharpness of a crease or corner that OpenSubdiv treats as infinitely sharp."""
 
 MOST, MOST_AROUND = 256, 2000
-"""Corners of a face and faces at a vertex; and corners of the faces that touch a face. With ten times as many
-OpenSubdiv takes minutes, or ends the process."""
+"""Limits: on corners of a face and faces at a vertex; and on corners of the faces that touch a face. With ten times as
+many, OpenSubdiv takes minutes, or ends the process."""
 
 
 class Cage(NamedTuple):
-    """The topology of a cage, sound. Host arrays, read-only.
+    """The checked topology of a cage, in read-only host arrays.
 
     Attributes:
         scheme: "catmark" or "loop".
-        sizes: (F,) int32, how many corners each face has.
+        sizes: (F,) int32, the number of corners of each face.
         first: (F + 1,) int32, the first half edge of each face.
         indices: (H,) int32, the vertices at the corners of all faces.
         twins: (H,) int32, the half edge that runs the other way, or −1 at a boundary.
@@ -38,7 +38,7 @@ class Cage(NamedTuple):
         crease_sharpness: (C,) float32.
         corners: (D,) int32, sharp vertices.
         corner_sharpness: (D,) float32.
-        holes: (E,) int32, faces that shape the surface and are no part of it.
+        holes: (E,) int32, faces that shape the surface but are not part of it.
     """
 
     scheme: str
@@ -53,13 +53,13 @@ class Cage(NamedTuple):
     holes: np.ndarray
 
     def next(self) -> np.ndarray:
-        """(H,) int64, the half edge that follows each in its face."""
+        """The half edge (H,) int64 that follows each in its face."""
         after = np.arange(1, len(self.indices) + 1)
         after[self.first[1:] - 1] = self.first[:-1]
         return after
 
     def faces(self) -> np.ndarray:
-        """(H,) int64, the face of each half edge."""
+        """The face (H,) int64 of each half edge."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
 
@@ -107,7 +107,7 @@ def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
     """Lengths (F,) and numbers (H,) of lists of indices, both int32.
 
     Raises:
-        InputError: they are no lists of integers from 0 on, or there are none.
+        InputError: no lists of integers from 0 on, or no lists at all.
     """
     wrong = InputError(f"{name} is {quoted(lists)}; expected lists of integers, one for each face, or an array (F, n)")
     if isinstance(lists, (list, tuple)):
@@ -146,7 +146,7 @@ def _known(name: str, table: Any, wrong: InputError) -> np.ndarray:
 
 
 def _check_faces(cage: Cage) -> None:
-    """Refuse faces that are no polygons of the scheme."""
+    """Refuse faces that are not polygons of the scheme."""
     least, most = cage.sizes.min(), cage.sizes.max()
     if least < 3:
         f = int(cage.sizes.argmin())
@@ -167,19 +167,19 @@ def _ends(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
-    """A number for each edge between two vertices, whichever way it runs."""
+    """A number for each edge between two vertices, the same in both directions."""
     return np.minimum(a, b).astype(np.int64) * count + np.maximum(a, b)
 
 
 def _sorted_edges(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
-    """Half edges in the order of their edges (H,), and the keys of these, sorted (H,)."""
+    """Half edges (H,) in the order of their edges, and the sorted keys (H,) of these."""
     keys = _key(*_ends(cage), int(cage.indices.max()) + 1)
     order = np.argsort(keys, kind="stable")
     return order, keys[order]
 
 
 def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """The half edge that runs the other way, or −1; a cage that is no manifold is refused."""
+    """The half edge in the other direction, or −1; a cage that is not a manifold is refused."""
     same = keys[1:] == keys[:-1]
     thrice = np.flatnonzero(same[1:] & same[:-1])
     (a, b), owner = _ends(cage), cage.faces()
@@ -224,10 +224,10 @@ def _check_pairs(cage: Cage) -> None:
 
 
 def _check_fans(cage: Cage) -> None:
-    """Refuse vertices where faces meet that are not neighbours through edges."""
+    """Refuse vertices whose faces are not all connected through edges."""
     count = len(cage.indices)
     h = np.flatnonzero(cage.twins >= 0)
-    # Around a vertex, from the half edge that leaves it to the one that leaves it in the face beside.
+    # Go around a vertex: from the half edge that leaves it to the one that leaves it in the next face.
     beside = cage.next()[cage.twins[h]]
     graph = coo_array((np.ones(len(h), bool), (h, beside)), shape=(count, count))
     _, fan = connected_components(graph, directed=False)
@@ -242,7 +242,7 @@ def _check_fans(cage: Cage) -> None:
 
 
 def _check_sizes(cage: Cage) -> None:
-    """Refuse faces and vertices with so many neighbours that OpenSubdiv does not cope."""
+    """Refuse faces and vertices with too many neighbours for OpenSubdiv."""
     valence = np.bincount(cage.indices)
     if cage.sizes.max() > MOST:
         f = int(cage.sizes.argmax())
@@ -300,7 +300,7 @@ def _checked_holes(holes: Any, faces: int) -> np.ndarray:
 
 
 def _check_tags(cage: Cage, keys: np.ndarray, edges: np.ndarray, corners: np.ndarray) -> None:
-    """Refuse sharpness of edges and vertices that there are not."""
+    """Refuse sharpness of edges and vertices that do not exist."""
     count = int(cage.indices.max()) + 1
     wanted = _key(edges[:, 0], edges[:, 1], count)
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

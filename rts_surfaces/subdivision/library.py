@@ -1,7 +1,7 @@
-"""The C++ part of subdivision surfaces: compiled when it is first needed, and kept in the user's cache.
+"""The C++ part of subdivision surfaces: compiled on first use, and kept in the user's cache.
 
-So the package stays pure Python, and what it is compiled with fits the OpenSubdiv that is installed. What is kept goes
-by the sources, the version of the headers and the compiler.
+So the package stays pure Python, and the library always fits the installed OpenSubdiv. Its key in the cache consists of
+the sources, the version of the headers and the compiler.
 """
 
 from __future__ import annotations
@@ -96,10 +96,10 @@ def find() -> Tools:
 
 @functools.cache
 def load() -> ctypes.CDLL:
-    """The library with its signatures, compiled if it has to be.
+    """Load the library with its signatures; compile it if necessary.
 
     Raises:
-        PluginError: something that it needs is missing, or does not work.
+        PluginError: a tool is missing, or does not work.
     """
     with _first_use:
         return _opened(find())
@@ -109,7 +109,7 @@ def _opened(tools: Tools) -> ctypes.CDLL:
     path = _compiled(tools, cache_folder())
     try:
         library = ctypes.CDLL(str(path))
-    except OSError:  # Damaged, or made for an OpenSubdiv that is gone.
+    except OSError:  # The file is damaged, or was made for an OpenSubdiv that is gone.
         try:
             path.unlink(missing_ok=True)
             path = _compiled(tools, cache_folder())
@@ -129,7 +129,7 @@ def _opened(tools: Tools) -> ctypes.CDLL:
 
 
 def _compiled(tools: Tools, folder: Path) -> Path:
-    """The library for these tools: as kept in a folder, or made now."""
+    """The library for these tools: kept in a folder, or compiled now."""
     name = f"opensubdiv-{_key(tools)}.so"
     kept = folder / name
     if kept.is_file():
@@ -137,13 +137,13 @@ def _compiled(tools: Tools, folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
-    except OSError:  # A cache that cannot be written to: made anew in each process.
+    except OSError:  # The cache cannot be written to: each process compiles its own.
         folder = Path(_own_folder().name)
         handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
     os.close(handle)
     try:
         _compile(tools, Path(draft))
-        # In one step: another process that makes it at this moment finds it whole, or not at all.
+        # In one step: another process that compiles at this moment finds it whole, or not at all.
         os.replace(draft, folder / name)
     except BaseException:
         Path(draft).unlink(missing_ok=True)
@@ -153,7 +153,7 @@ def _compiled(tools: Tools, folder: Path) -> Path:
 
 @functools.cache
 def _own_folder() -> tempfile.TemporaryDirectory:
-    """A folder of this process alone, which is removed at its end."""
+    """A folder of this process alone, removed when it ends."""
     return tempfile.TemporaryDirectory(prefix="rts-")
 
 
@@ -172,7 +172,7 @@ def _compile(tools: Tools, out: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         said = done.stderr.splitlines()
-        # The first error tells more than the last lines do.
+        # The first error says more than the last lines.
         first = next((line for line in said if "error" in line or "cannot find" in line), said[-1] if said else "")
         raise PluginError(
             f"{tools.compiler[0]} fails to compile the library of subdivision surfaces ({_line(first)}); {HELP}"

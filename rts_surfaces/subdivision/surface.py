@@ -81,7 +81,7 @@ class Subdivision(Parametric):
             for "uv" lists of integers into θ["uv"], as `faces` are: a face-varying map with seams.
         uv_rule: where a face-varying uv is linear rather than smooth: "none", "corners_only", "corners_plus1",
             "corners_plus2", "boundaries" or "all", as in OpenSubdiv and USD.
-        tolerance: pixels that triangles may be off the surface near outlines.
+        tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
         InputError: the cage has no limit surface that can be computed, or an option is none of these.

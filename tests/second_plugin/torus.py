@@ -56,14 +56,14 @@ class Torus(rts.RaySurface):
             return distance(radii, origins + t[:, None] * unit)
 
         def body(state):
-            t, d, count, found = state
+            t, d, count, roots = state
             step = xp.where(t < far, xp.abs(d) + EPSILON, 0.0)  # Who is past it stays there.
             ahead = at(t + step)
             crossed = (d < 0) != (ahead < 0)
             change = xp.where(crossed, d - ahead, 1.0)
             root = t + step * d / change
-            found = xp.where(crossed[None] & (layer == count[None]), root[None], found)
-            return t + step, ahead, count + xp.astype(crossed, count.dtype), found
+            roots = xp.where(crossed[None] & (layer == count[None]), root[None], roots)
+            return t + step, ahead, count + xp.astype(crossed, count.dtype), roots
 
         def going(state):
             t, _, count, _ = state
@@ -71,13 +71,13 @@ class Torus(rts.RaySurface):
 
         start = xp.zeros_like(length)
         count = xp.zeros_like(start, dtype=layer.dtype)
-        found = xp.zeros_like(start[None] + xp.astype(layer, start.dtype))
-        _, _, count, found = engine.repeat(body, going, (start, at(start), count, found), 1000)
+        roots = xp.zeros_like(start[None] + xp.astype(layer, start.dtype))
+        _, _, count, roots = engine.repeat(body, going, (start, at(start), count, roots), 1000)
         hit = layer < count[None]
-        points = origins + found[..., None] * unit
+        points = origins + roots[..., None] * unit
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         angles = xp.stack([xp.atan2(z, x), xp.atan2(y, norm(xp, x, z) - radii[0])], axis=-1)
-        return RayHits(hit=hit, distance=found / length, params=angles)
+        return RayHits(hit=hit, distance=roots / length, params=angles)
 
     @staticmethod
     def example():

@@ -1,1 +1,1 @@
-"""Why derivatives disagree with the truth, or vanish: experiments on a scene, and what they tell."""
+"""Reasons why derivatives disagree with the truth, or vanish, from experiments on a scene."""

@@ -1,4 +1,4 @@
-"""A derivative of the nearest configuration that is known well: a sphere or a box that moves alike."""
+"""Baseline for a derivative's error: a similar sphere or box, moved alike, whose derivative is well known."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 SUBDIVISIONS = 4
-"""How often the sphere is subdivided."""
+"""Subdivisions of the sphere."""
 FEWEST = 8
-"""Pixels of an object of which a sphere or a box can be made."""
+"""The least pixels of an object that a sphere or a box is fitted to."""
 SAMPLES = 8
-"""The square root of the number of samples a pixel of its truth."""
+"""Samples a pixel along each axis, for the baseline's truth."""
 COLOR = (0.9, 0.6, 0.3)
 
 
 class Baseline(NamedTuple):
-    """What the nearest configuration shows.
+    """Derivatives of the fitted sphere or box.
 
     Attributes:
         name: "a sphere" or "a box".
@@ -48,13 +48,13 @@ class Baseline(NamedTuple):
 def nearest(
     subject: Subject, number: Number, parts: Sequence[int] | None, options: Mapping[str, Any]
 ) -> Baseline | None:
-    """The sphere or the box whose outline is most like that of what moves; None where nothing is seen to move.
+    """The sphere or the box whose outline is most like that of the moving parts; None if no motion is seen.
 
     Args:
         subject: the scene.
-        number: what moves it.
-        parts: which parts of it move; None for all.
-        options: of `rts.render`, other than those of the subject.
+        number: the scalar parameter that moves it.
+        parts: indices of the parts that move; None for all.
+        options: of `rts.render`, in place of those of the subject.
     """
     only = variants.alone(range(len(subject.parts)) if parts is None else parts)
     probe = variants.all_of(only, variants.placed)
@@ -80,10 +80,10 @@ def nearest(
         candidates.append(((mask & seen).sum() / max((mask | seen).sum(), 1), name, moved))
     _, name, moved = max(candidates, key=lambda c: c[0])
     direction = map_leaves(namespace(*leaves(moved.parameters)).ones_like, moved.parameters)
-    found = measured(moved, name, direction, None, SAMPLES)
-    if not found.forward:
+    result = measured(moved, name, direction, None, SAMPLES)
+    if not result.forward:
         return None
-    return Baseline(name, found.pushed, found.true, found.slope.autodiff, found.slope.difference)
+    return Baseline(name, result.pushed, result.true, result.slope.autodiff, result.slope.difference)
 
 
 def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -92,7 +92,7 @@ def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.n
     local = position @ view[:3, :3].T + view[:3, 3]
     low, high = np.percentile(local, 1, axis=0), np.percentile(local, 99, axis=0)
     half, middle = (high - low) / 2, (high + low) / 2
-    # Of something round only the half before its outline is seen.
+    # Of a round object only the half before its outline is seen.
     depth = max(high[2] - low[2], 1e-3 * half[:2].max())
     sphere, triangles = icosphere(SUBDIVISIONS)
     back = np.linalg.inv(view)
@@ -109,7 +109,7 @@ def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.n
 def _scene(
     subject: Subject, number: Number, vertices: np.ndarray, faces: np.ndarray, motion: np.ndarray, parameters: Tree
 ) -> tuple[Part, Camera]:
-    """The shape, and the camera of the scene, moved as the number moves them."""
+    """The fitted shape and the scene's camera, both moved as the number moves them."""
     by, engine = parameters["by"], subject.engine
     steps = iter(leaves(number.direction))
     camera = subject.shown(map_leaves(lambda p: p + by * next(steps), subject.parameters))[1]

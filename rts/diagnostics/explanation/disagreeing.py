@@ -1,4 +1,4 @@
-"""Why the derivative of an image disagrees with the truth: experiments that make it agree."""
+"""Reasons why the derivative of an image disagrees with the truth: experiments that make it agree."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from rts.diagnostics.smoothing import low_pass
 HALVED = 0.5
 """An experiment names a reason if it leaves less than this share of the error."""
 NOISY, BETTER = 1.5, 0.8
-"""So far above its noise the truth is believed; one that leaves no more than this, and less than that share of the
-error, names a reason, too."""
+"""An error below this many times the truth's noise is as good as none; an experiment that leaves no more, and less than
+this share of the error before, names a reason, too."""
 LEFT = 0.3
-"""What remains of the error when the rest is explained, and is no longer looked into."""
+"""The share of the error below which no more reasons are sought."""
 LARGE_SHARE = 0.3
-"""Pixels of a kind name a reason if they hold so much of the disagreement."""
+"""The share of the disagreement that pixels of a kind must hold to name a reason."""
 STRONG = 0.1
-"""A pixel disagrees if it is off by this share of the pixel that is most."""
+"""The share of the largest error of a pixel from which a pixel counts as disagreeing."""
 ALIKE = 0.5
-"""The baseline is off, too, if by this share of what the scene is off by."""
+"""The share of the scene's error from which the baseline counts as off, too."""
 SHORTER, DENSE = 0.25, 8
-"""The step of differences of fine colours, as a share of that of others; the square root of their samples a pixel."""
+"""For differences of fine colours: the step as a share of the usual one, and samples a pixel along each axis."""
 AGAIN = 4
 """Samples a pixel, along each axis, that experiments take instead of one."""
 
 
 class _Error(NamedTuple):
-    """By how much a derivative image is off the truth.
+    """The difference between a derivative image and the truth.
 
     Attributes:
         image: (H, W, 4), through the low-pass of `scores`.
-        norm: of it.
-        sharp: (H, W), its energy without the low-pass.
+        norm: norm of `image`.
+        sharp: (H, W), energy of the difference without the low-pass.
     """
 
     image: np.ndarray
@@ -55,30 +55,30 @@ class _Error(NamedTuple):
         return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
 
     def within(self, mask: np.ndarray) -> _Error:
-        """That of some pixels (H, W) bool."""
+        """The error of the pixels of a mask (H, W) bool."""
         image = self.image * mask[..., None]
         return _Error(image, float(np.linalg.norm(image)), self.sharp * mask)
 
     @property
     def energy(self) -> np.ndarray:
-        """(H, W)."""
+        """Energy (H, W) of each pixel."""
         return (self.image**2).sum(axis=-1)
 
 
 class _Case:
-    """A number whose derivatives disagree, and how far it has been explained.
+    """A number whose derivatives disagree, and the explanation so far.
 
     Attributes:
-        subject: what is looked at.
+        subject: the scene under test.
         number: the number.
-        options: of `rts.render`, those of the experiments that helped.
-        connected: whether arrays that no derivative leads to are taken to have one.
-        pushed: the derivative with these.
-        error: of this.
+        options: of `rts.render`, from the experiments that helped.
+        connected: whether arrays that no derivative reaches are differentiated, too.
+        pushed: the derivative image with `options` and `connected`.
+        error: its error.
         left: (H, W) bool, the pixels that are not explained.
-        noise: of the truth, as `error.norm`.
-        whole: the error at first.
-        findings: what was found.
+        noise: of the truth, in the unit of `error.norm`.
+        whole: the error before any experiment.
+        findings: the findings so far.
     """
 
     def __init__(self, subject: Subject, number: Number):
@@ -93,30 +93,30 @@ class _Case:
 
     @property
     def open(self) -> bool:
-        """Whether something is left to explain."""
+        """True if much of the error is unexplained."""
         return self.error.norm > max(NOISY * self.noise, LEFT * self.whole.norm)
 
     def strong(self, error: _Error) -> np.ndarray:
-        """(H, W) bool, the pixels that disagree most."""
+        """Mask (H, W) bool of the pixels that disagree most."""
         size = np.abs(self.number.pushed - self.number.true).max(axis=-1)
         energy = error.energy
         return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
 
     def push(self, change: Change | None = None, **options: Any) -> np.ndarray:
-        """The derivative of the image, as it is now, with a further change and options."""
+        """The derivative image with the options that helped, a change of the scene and further options."""
         options = {**self.options, **options}
-        found = self.subject.push(self.number.direction, change, connect=self.connected, **options)
-        return found * self.number.slope.step
+        derivative = self.subject.push(self.number.direction, change, connect=self.connected, **options)
+        return derivative * self.number.slope.step
 
     def try_connected(self) -> _Error | None:
-        """As `try_out`, with derivatives where there are none."""
+        """`try_out` with derivatives for the arrays that none reaches."""
         self.connected = True
         before = self.try_out()
         self.connected = before is not None
         return before
 
     def try_out(self, **options: Any) -> _Error | None:
-        """The error before, if options make it much smaller, which are kept then; else None."""
+        """Try options; if they make the error much smaller, keep them and return the error before, otherwise None."""
         changed = {**self.options, **options}
         pushed = self.push(**options)
         error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
@@ -127,27 +127,27 @@ class _Case:
         return before
 
     def gained(self, before: _Error) -> float:
-        """Which share of the whole went with the last experiment."""
+        """The share of the whole error that the last experiment removed."""
         return (before.norm**2 - self.error.norm**2) / self.whole.norm**2
 
 
 def _constants(case: _Case, touched: Touched) -> None:
-    """Arrays that no derivative leads to, if it would agree with one."""
-    found = why_constant(case.subject, touched)
-    if not found:
+    """Name arrays that no derivative reaches, if the number would agree with one."""
+    constants = why_constant(case.subject, touched)
+    if not constants:
         return
     if len(touched.all) == len(touched.constant) + len(touched.cut) and not case.number.pushed.any():
         mask = case.strong(case.whole)
-        case.findings += [f._replace(mask=mask, share=1.0) for f in found]
+        case.findings += [f._replace(mask=mask, share=1.0) for f in constants]
         return
     before = case.try_connected()
     if before is not None:
         mask, share = case.strong(before), case.gained(before)
-        case.findings += [f._replace(mask=mask, share=share) for f in found]
+        case.findings += [f._replace(mask=mask, share=share) for f in constants]
 
 
 def _outlines(case: _Case, touched: Touched) -> None:
-    """A splatter that gives outlines no derivative, or hides what a better one shows."""
+    """Name the splatter, if it gives outlines no derivative, or if a better one removes the error."""
     splatter = case.subject.options.get("splatter", "auto")
     if case.subject.splats_as("visible"):
         return
@@ -160,7 +160,7 @@ def _outlines(case: _Case, touched: Touched) -> None:
 
 
 def _transparent(case: _Case, touched: Touched) -> None:
-    """Shaders that are not opaque, beneath a splatter that lets nothing shine through."""
+    """Name shaders that are not opaque under a splatter that takes them to be."""
     if case.subject.opaque or case.subject.splats_as("multi"):
         return
     before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
@@ -191,7 +191,7 @@ def _layers(case: _Case, touched: Touched) -> None:
 
 
 def _bounded(case: _Case, touched: Touched) -> None:
-    """Surfaces that bound derivatives where they are near-singular."""
+    """Name surfaces that bound near-singular derivatives."""
     if all(part.surface.unbounded() is None for part in case.subject.parts):
         return
     change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
@@ -207,7 +207,7 @@ def _bounded(case: _Case, touched: Touched) -> None:
 
 
 def _crossing(case: _Case, touched: Touched) -> None:
-    """Lines where parts pass through one another."""
+    """Name lines where parts pass through one another."""
     subject = case.subject
     if len(subject.parts) < 2:
         return
@@ -230,7 +230,7 @@ def _crossing(case: _Case, touched: Touched) -> None:
 
 
 def _colors(case: _Case, touched: Touched) -> None:
-    """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
+    """Name colours finer than pixels: the error lies inside of surfaces, and more samples remove it."""
     subject, number = case.subject, case.number
     taken = subject.supersample
     inside = ~subject.fineness.outlines
@@ -249,7 +249,7 @@ def _colors(case: _Case, touched: Touched) -> None:
 
 
 def _samples(case: _Case, touched: Touched) -> None:
-    """Too few samples, for what is thin or for outlines."""
+    """Name too few samples, for thin shapes or for outlines."""
     taken = case.subject.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
@@ -277,7 +277,7 @@ def _each(count: int) -> str:
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
-    """Name a reason if pixels around the mask hold much of what is left."""
+    """Name a reason if pixels around the mask hold much of the remaining error."""
     from scipy.ndimage import binary_dilation
 
     if not mask.any():
@@ -294,16 +294,16 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
 
 
 def _bias(case: _Case, touched: Touched) -> None:
-    """What the nearest built-in configuration shows, too; or nothing that is known."""
+    """Name a bias of the library that a sphere or a box shows, too; otherwise the cause is unknown."""
     if case.findings and case.error.norm < HALVED * case.whole.norm:
         return
     off = _off(case.pushed, case.number.true)
     mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
-    found = nearest(case.subject, case.number, touched.parts, case.options)
-    if found is not None:
-        theirs = _off(found.pushed, found.true)
-        ratio = f"{found.slope / found.difference:.2f}" if found.difference else "–"
-        told = f"{found.name} of this size, in this place, moved alike"
+    baseline = nearest(case.subject, case.number, touched.parts, case.options)
+    if baseline is not None:
+        theirs = _off(baseline.pushed, baseline.true)
+        ratio = f"{baseline.slope / baseline.difference:.2f}" if baseline.difference else "–"
+        told = f"{baseline.name} of this size, in this place, moved alike"
         if theirs >= ALIKE * off:
             because = (
                 f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
@@ -333,16 +333,16 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _samples,
     _bias,
 )
-"""From the cheap and certain to the dear; each adds what it finds to the case."""
+"""Experiments, from the cheap and certain to the dear; each adds findings to the case."""
 
 
 def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
-    """Why the derivatives of a number disagree.
+    """Reasons why the derivatives of a number disagree.
 
     Args:
-        subject: what is looked at.
+        subject: the scene under test.
         number: the number.
-        touched: what of the scene it changes.
+        touched: the arrays of the scene that it changes.
         going: whether there is time for another experiment.
     """
     case = _Case(subject, number)

@@ -1,4 +1,4 @@
-"""Why a derivative disagrees with the truth, or vanishes: reasons in words, and what marks them in a picture."""
+"""Reasons why a derivative disagrees with the truth, or vanishes, in words and as marks in a picture."""
 
 from __future__ import annotations
 
@@ -32,36 +32,36 @@ KINDS = {
 }
 """The kinds of reasons, each with the colour, 8-bit sRGB, of the pixels that it marks.
 
-- constant: it reaches the scene as NumPy, or cut off from derivatives.
-- unused: nothing in the scene changes with it.
-- outside: what it moves is outside of the view, or behind the near plane.
-- hidden: what it moves is behind something.
-- culled: what it moves is seen from behind, and cull="back".
+- constant: the number reaches the scene as NumPy, or cut off from derivatives.
+- unused: nothing in the scene changes with the number.
+- outside: the parts that it moves are outside of the view, or behind the near plane.
+- hidden: the parts that it moves are behind others.
+- culled: the parts that it moves are seen from behind, with cull="back".
 - outlines: the splatter gives outlines no derivative.
 - transparent: shaders are not opaque, and the splatter takes them to be.
-- layers: deeper than K layers.
-- thin: thinner than a sample.
+- layers: surfaces lie deeper than K layers.
+- thin: shapes are thinner than a sample.
 - colors: colours finer than pixels.
 - samples: too few samples a pixel, for other reasons.
 - bounded: near-singular crossings, whose derivatives the surface bounds.
 - crossing: parts pass through one another.
-- bias: a bias of the library, which a sphere or a box shows, too.
+- bias: a bias of the library that a sphere or a box shows, too.
 - reach: the loss is flat here, beyond the reach of a pixel.
 - infinite: the derivative is NaN, or infinite.
-- undetermined: the image does not determine it, or a combination.
+- undetermined: the image does not determine the number, or a combination of several.
 - unknown: no experiment tells.
 """
 
 DIM = 0.35
-"""How bright the scene is beneath the marks."""
+"""Brightness of the scene under the marks."""
 
 
 class Finding(NamedTuple):
-    """What an experiment found of one number.
+    """The result of an experiment on one number.
 
     Attributes:
         kind: a key of `KINDS`.
-        because: what is so; goes on after "name: ".
+        because: the cause; a sentence that goes on after "name: ".
         advice: what to do, a sentence; may be empty.
         mask: (H, W) bool, the pixels; None for none.
         share: of the disagreement; None where there is none.
@@ -75,13 +75,13 @@ class Finding(NamedTuple):
 
 
 class Reason(NamedTuple):
-    """Why derivatives disagree with the truth, or vanish.
+    """A reason why derivatives disagree with the truth, or vanish.
 
     Attributes:
         kind: a key of `rts.diagnostics.explanation.reasons.KINDS`.
         parameters: the names of the numbers.
-        text: what is so, how much of it, and what to do: a plain sentence or two.
-        pixels: (H, W) bool, where it shows.
+        text: the cause, its share and the remedy, in a plain sentence or two.
+        pixels: (H, W) bool, the pixels that show it.
     """
 
     kind: str
@@ -91,27 +91,27 @@ class Reason(NamedTuple):
 
     @property
     def color(self) -> str:
-        """The colour of its pixels in the picture, in words; "none" where it marks none."""
+        """The colour of its pixels in the picture, in words; "none" if it marks none."""
         return KINDS[self.kind][0]
 
 
 def merged(findings: Sequence[tuple[str, Finding]], size: tuple[int, int]) -> list[Reason]:
-    """One reason for all numbers of which the same was found, those of the largest share first.
+    """Reasons merged over the numbers with equal findings, the largest share first.
 
     Args:
         findings: each with the name of its number.
         size: (height, width).
     """
     groups: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
-    for name, found in findings:
-        groups.setdefault((found.kind, found.because, found.advice), []).append((name, found))
+    for name, finding in findings:
+        groups.setdefault((finding.kind, finding.because, finding.advice), []).append((name, finding))
     reasons = []
     for (kind, because, advice), members in groups.items():
         pixels = np.zeros(size, bool)
-        for _, found in members:
-            if found.mask is not None:
-                pixels |= found.mask
-        shares = [found.share for _, found in members if found.share is not None]
+        for _, finding in members:
+            if finding.mask is not None:
+                pixels |= finding.mask
+        shares = [finding.share for _, finding in members if finding.share is not None]
         names = [name for name, _ in members]
         figures = [f"{pixels.sum()} pixels"] if pixels.any() else []
         if shares:
@@ -140,7 +140,7 @@ def marked(image: np.ndarray, reasons: Sequence[Reason]) -> np.ndarray:
 
 
 def legend(reasons: Sequence[Reason]) -> str:
-    """Which colour stands for what in the picture; empty where nothing is marked."""
+    """The legend of the picture, such as "red = outlines"; empty if no pixel is marked."""
     told: dict[str, int] = {}
     for reason in reasons:
         if reason.pixels.any() and reason.color != "none":

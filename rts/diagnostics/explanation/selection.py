@@ -1,4 +1,4 @@
-"""Which numbers have something to explain, and the experiments that do."""
+"""Selection of the numbers to explain, and of the experiments for each."""
 
 from __future__ import annotations
 
@@ -29,31 +29,32 @@ def explained(
     turn: Callable[[int], Callable[[], bool]],
     phase: Phase,
 ) -> tuple[list[Reason], int]:
-    """Why slopes differ or vanish.
+    """Reasons why slopes differ or vanish.
 
     Args:
-        subject: what is looked at.
-        numbers: of it.
-        agrees: whether a slope's derivatives do.
-        own_loss: whether the loss is the user's, and may be flat where images change.
-        turn: count → whether there is time for another experiment, of the next of so many that share what is left.
+        subject: the scene under test.
+        numbers: its numbers.
+        agrees: whether the derivatives of a slope agree.
+        own_loss: whether the loss is the user's, which may be flat where images change.
+        turn: count → a function that is true while time is left for one of `count` numbers, which share the rest
+            of the budget.
         phase: of a progress bar.
 
     Returns:
-        The reasons, and the number of numbers that there was no time for.
+        The reasons, and how many numbers were left for want of time.
     """
-    found: dict[int, list[Finding]] = {}
+    findings_of: dict[int, list[Finding]] = {}
     done, left = phase("reasons", len(numbers) + 1), list(range(len(numbers)))
-    for first in (True, False):  # Who was cut short by the others' turns gets what time they leave.
+    for first in (True, False):  # Numbers that ran out of their share get the time that others leave.
         waiting, left = left, []
         for i, k in enumerate(waiting):
             watch = _Watch(turn(len(waiting) - i if first else 1))
             if watch():
-                found[k] = _why(subject, numbers[k], agrees, own_loss, watch)
+                findings_of[k] = _why(subject, numbers[k], agrees, own_loss, watch)
             left += [k] if watch.refused else []
             if first:
                 done()
-    findings = [(numbers[k].slope.name, f) for k in sorted(found) for f in found[k]]
+    findings = [(numbers[k].slope.name, f) for k in sorted(findings_of) for f in findings_of[k]]
     if turn(1)():
         findings += undetermined(subject, numbers)
     done()
@@ -61,7 +62,7 @@ def explained(
 
 
 class _Watch:
-    """Whether there is time, and whether that was refused."""
+    """True while there is time; `refused` records that it ran out."""
 
     def __init__(self, going: Callable[[], bool]):
         self.going, self.refused = going, False

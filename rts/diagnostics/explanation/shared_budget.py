@@ -1,4 +1,4 @@
-"""Numbers of parameters looked at within a budget of time, each in its turn."""
+"""Derivatives of numbers of the parameters within a budget of time, each in turn."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves
 
 FOR_SLOPES = 0.6
-"""The share of the budget that differences are planned for, so that reasons can be found in the rest."""
+"""The share of the budget planned for differences; the rest is for reasons."""
 TRIAL = 4
-"""The square root of the samples a pixel of an image that tells how long others will take."""
+"""Samples a pixel along each axis, for a trial image that is timed."""
 FEW_SAMPLES = 2
-"""The square root of the samples a pixel of differences, where there is not time for better ones of all numbers."""
+"""Samples a pixel along each axis for differences, if time does not suffice for more of all numbers."""
 
 
 class Clock:
-    """A budget of seconds, and what is left of it."""
+    """A budget of seconds."""
 
     def __init__(self, budget: float):
         if not (is_real(budget) and 0 < budget):
@@ -35,26 +35,26 @@ class Clock:
 
     @property
     def spent(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since the clock was made."""
         return perf_counter() - self.start
 
     def going(self, share: float = 1.0) -> bool:
-        """Whether that share of the budget is not spent yet."""
+        """True until this share of the budget is spent."""
         return self.spent < share * self.budget
 
     def turn(self, count: int) -> Callable[[], bool]:
-        """Whether there is time left for the next of so many that share what is left of the budget."""
+        """A function that is true during the next of `count` equal turns in the rest of the budget."""
         end = self.spent + (self.budget - self.spent) / count
         return lambda: self.going() and self.spent < end
 
 
 class Looked(NamedTuple):
-    """What was looked at within the budget.
+    """Numbers measured within the budget.
 
     Attributes:
-        numbers: some of each array.
-        planned: how many there were to look at.
-        rough: how many of them have fewer samples than were asked for.
+        numbers: some of each array, measured.
+        planned: how many were to be measured.
+        rough: how many of them have fewer samples than asked for.
     """
 
     numbers: list[Number]
@@ -63,9 +63,9 @@ class Looked(NamedTuple):
 
 
 def looked_at(subject: Subject, entries: int, samples: int, clock: Clock, phase: Phase) -> Looked:
-    """Some numbers of each array, the first of all arrays first.
+    """Measure some numbers of each array, first those chosen first in each.
 
-    Where time does not suffice for all, each is looked at with few samples before any is with more.
+    If time does not suffice for all, each is measured with few samples before any is with more.
     """
     engine, parameters = subject.engine, subject.parameters
     gradient = engine.value_and_grad(lambda p: subject.loss(subject.image(p)))(parameters)[1]
@@ -81,36 +81,36 @@ def looked_at(subject: Subject, entries: int, samples: int, clock: Clock, phase:
     pace = _pace(subject, first, clock) if samples > TRIAL else 0.0
     most = _affordable(pace * len(planned), samples, clock)
     few = samples if most == samples else min(FEW_SAMPLES, samples)
-    found, done, rough = {}, phase("derivatives", len(planned)), set()
+    numbers, done, rough = {}, phase("derivatives", len(planned)), set()
     for rank, number, index, label, slope in planned:
-        if found and not clock.going():
+        if numbers and not clock.going():
             break
-        found[number, rank] = measured(subject, label, unit(engine, parameters, number, index), slope, few)
+        numbers[number, rank] = measured(subject, label, unit(engine, parameters, number, index), slope, few)
         rough |= {(number, rank)} if few < samples else set()
         done()
-    more = _affordable(pace * len(found), samples, clock)
-    for key in list(found) if few < more and len(found) == len(planned) else ():
+    more = _affordable(pace * len(numbers), samples, clock)
+    for key in list(numbers) if few < more and len(numbers) == len(planned) else ():
         if not clock.going(FOR_SLOPES):
             break
-        found[key] = differenced(subject, found[key], more)
+        numbers[key] = differenced(subject, numbers[key], more)
         rough -= {key} if more == samples else set()
-    return Looked([found[key] for key in sorted(found)], len(planned), len(rough))
+    return Looked([numbers[key] for key in sorted(numbers)], len(planned), len(rough))
 
 
 def _pace(subject: Subject, direction: Tree, clock: Clock) -> float:
-    """Seconds that one sample of every pixel takes, of an image without splatting."""
+    """Seconds of an image without splatting, for each sample a pixel."""
     start = clock.spent
     subject.engine.to_numpy(subject.hard(direction, 0.0, TRIAL))
     return (clock.spent - start) / TRIAL**2
 
 
 def _affordable(pace: float, samples: int, clock: Clock) -> int:
-    """The largest square root of samples a pixel, at most `samples`, that there is time for; at least 1.
+    """The most samples a pixel along each axis that there is time for: 1 to `samples`.
 
     Args:
-        pace: seconds that one sample of every pixel takes, times the numbers to look at.
-        samples: the largest.
-        clock: what is left of the budget.
+        pace: seconds for each sample a pixel, times the numbers to measure.
+        samples: the most.
+        clock: the budget.
     """
     left = FOR_SLOPES * clock.budget - clock.spent
     return max((n for n in range(1, samples + 1) if pace * (4 * n**2 + 2 * (n + 1) ** 2) <= left), default=1)

@@ -1,4 +1,4 @@
-"""Derivatives of a scene's image and loss in single numbers of its parameters, found in two ways."""
+"""Derivatives of a scene's image and loss in single numbers of its parameters, by autodiff and by differences."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 STEP_UNSEEN = 1e-2
-"""How far the finite differences change a number that nothing seems to depend on."""
+"""The step of finite differences for a number that nothing seems to depend on."""
 
 
 class Slope(NamedTuple):
-    """The derivative of a loss in one number of the parameters, found in two ways.
+    """The derivative of a loss in one number of the parameters, by autodiff and by a finite difference.
 
     Attributes:
         name: where the number is, such as "pose[2]".
         autodiff: the derivative through the splatter.
         difference: the central finite difference of area-sampled hard renders.
-        error: how far the difference may be off: what two sampling grids and two steps disagree on, and rounding.
+        error: bound on the error of `difference`: the disagreement of two sampling grids and two steps, and rounding.
         step: the step of the difference, in units of the number.
     """
 
@@ -37,16 +37,16 @@ class Slope(NamedTuple):
 
 
 class Number(NamedTuple):
-    """One number of the parameters, and what it does to the image.
+    """One number of the parameters, and its effect on the image.
 
     Attributes:
-        slope: what it does to the loss.
+        slope: its effect on the loss.
         direction: of the parameters' structure, 1 at the number.
         pushed: (H, W, 4) float32, the derivative of the image through the splatter, for a step of the slope's length;
-            NaN where forward mode does not go through it.
+            NaN if forward mode fails there.
         true: (H, W, 4) float32, the finite difference over that step.
-        noise: half of what two sampling grids disagree on; the norm of its low-pass.
-        forward: whether forward mode goes through the splatter.
+        noise: half the norm of the low-passed disagreement of two sampling grids.
+        forward: whether forward mode works through the splatter.
     """
 
     slope: Slope
@@ -58,14 +58,14 @@ class Number(NamedTuple):
 
 
 def measured(subject: Subject, name: str, direction: Tree, slope: float | None, samples: int) -> Number:
-    """What one number does, found in two ways.
+    """The effect of one number, by autodiff and by finite differences.
 
     Args:
-        subject: what is looked at.
+        subject: the scene under test.
         name: of the number.
-        direction: in which it changes.
-        slope: the derivative of the loss by reverse mode; None for that by forward mode.
-        samples: the square root of the number of samples a pixel.
+        direction: of the parameters' structure, in which the number changes.
+        slope: the derivative of the loss by reverse mode; None to take it by forward mode.
+        samples: samples a pixel along each axis.
     """
     step = subject.step(direction) or _step_of_hidden(subject, direction) or STEP_UNSEEN
     try:
@@ -81,7 +81,7 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
 
 
 def differenced(subject: Subject, number: Number, samples: int) -> Number:
-    """The number, with a finite difference by so many samples a pixel, squared."""
+    """The number with a finite difference by `samples`² samples a pixel."""
     step, direction = number.slope.step, number.direction
     to_numpy = subject.engine.to_numpy
 
@@ -101,7 +101,7 @@ def differenced(subject: Subject, number: Number, samples: int) -> Number:
 
 
 def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
-    """A step that moves by a pixel what is behind something, or what no derivative leads to."""
+    """A step that moves hidden parts by a pixel, or arrays that no derivative reaches."""
     touched = subject.touched(direction, STEP_UNSEEN)
     connect = bool(touched.constant or touched.cut)
     kept = touched.parts
@@ -129,8 +129,8 @@ def unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
     count = iter(range(sum(1 for _ in leaves(parameters))))
 
     def leaf(p: Array) -> Array:
-        found = np.zeros(math.prod(p.shape))
-        found[index if next(count) == number else slice(0)] = 1
-        return namespace(p).astype(engine.constant(found.reshape(p.shape), p), p.dtype, copy=False)
+        direction = np.zeros(math.prod(p.shape))
+        direction[index if next(count) == number else slice(0)] = 1
+        return namespace(p).astype(engine.constant(direction.reshape(p.shape), p), p.dtype, copy=False)
 
     return map_leaves(leaf, parameters)

@@ -1,4 +1,4 @@
-"""A scene, how it is rendered, and which of its arrays change with its parameters."""
+"""A scene under test: its options, its loss, and the arrays that change with its parameters."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from rts.scene.parts import Part
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part] | Prepared, Camera]]
 Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]
-"""Another scene, made of one."""
+"""A function from a scene to a changed one."""
 
 DEPENDS = 1.0
-"""How far parameters are changed to see whether the scene depends on them at all."""
+"""The change of parameters that shows whether the scene depends on them at all."""
 SHORT = 1e-3
-"""How far they are changed to see how fast arrays of the scene change."""
+"""The change of parameters for the rates of the scene's arrays, by differences."""
 DEEP = 8
 """Layers of the finite differences where shaders are not opaque."""
 HELD = 4
-"""How deep functions and objects are searched for arrays that they hold."""
+"""The depth to which functions and objects are searched for arrays."""
 
 
 class Place(NamedTuple):
-    """An array of a scene: of which part, None for the camera, and its name there."""
+    """The place of an array in a scene: the part's index, None for the camera, and the name there."""
 
     part: int | None
     name: str
@@ -51,12 +51,12 @@ class Place(NamedTuple):
 
 
 class Touched(NamedTuple):
-    """Which arrays of a scene change with a number.
+    """Arrays of a scene that change with a number.
 
     Attributes:
-        all: those that change.
-        constant: those of them that are NumPy.
-        cut: those of them that are arrays of the engine, though no derivative leads to them.
+        all: all of them.
+        constant: the NumPy arrays among them.
+        cut: the engine's arrays among them that no derivative reaches.
     """
 
     all: list[Place]
@@ -65,19 +65,19 @@ class Touched(NamedTuple):
 
     @property
     def parts(self) -> list[int] | None:
-        """The parts that change; None for all, since the camera does."""
-        found = {place.part for place in self.all}
-        return None if None in found else sorted(p for p in found if p is not None)
+        """Indices of the parts that change; None for all, if the camera changes."""
+        indices = {place.part for place in self.all}
+        return None if None in indices else sorted(p for p in indices if p is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is looked at: a scene, how it is rendered, and its loss.
+    """A scene under test: how it is rendered, and its loss.
 
     Attributes:
         engine: of the parameters.
         scene: parameters → (parts, camera).
-        parameters: without marks of their own.
+        parameters: values that are not traced.
         size: (height, width).
         options: of `rts.render`.
         loss: image → scalar.
@@ -91,15 +91,15 @@ class Subject:
     loss: Callable[[Array], Array]
 
     def shown(self, parameters: Tree) -> tuple[Any, Camera]:
-        """What the scene gives."""
-        found = self.scene(parameters)
-        if not isinstance(found, tuple) or len(found) != 2:
-            raise InputError(f"scene gave {kind_of(found)}; expected (parts, camera)")
-        return found
+        """Parts and camera of the scene at some parameters."""
+        scene = self.scene(parameters)
+        if not isinstance(scene, tuple) or len(scene) != 2:
+            raise InputError(f"scene gave {kind_of(scene)}; expected (parts, camera)")
+        return scene
 
-    def drawn(self, found: tuple[Any, Camera], change: Change | None = None, size: Any = None, **options: Any) -> Array:
+    def drawn(self, scene: tuple[Any, Camera], change: Change | None = None, size: Any = None, **options: Any) -> Array:
         """The image of parts and a camera; a NumPy one becomes a constant of the engine."""
-        parts, camera = found if change is None else change(listed_parts(found[0]), found[1])
+        parts, camera = scene if change is None else change(listed_parts(scene[0]), scene[1])
         image = render(parts, camera, size or self.size, **{**self.options, **options})
         check_colors(image.shape[-1] - 1)
         return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
@@ -114,8 +114,8 @@ class Subject:
         Raises:
             InputError: nothing depends on them.
         """
-        found = self.shown(self.parameters)
-        image = render(*found, self.size, **self.options)
+        scene = self.shown(self.parameters)
+        image = render(*scene, self.size, **self.options)
         if self.engine.owns(image):
             return
         ones = map_leaves(self.engine.namespace.ones_like, self.parameters)
@@ -123,12 +123,12 @@ class Subject:
             raise InputError(f"the image is {kind_of(image)}: nothing in the scene depends on the parameters")
 
     def moved(self, direction: Tree, by: float) -> Tree:
-        """The parameters, moved."""
+        """The parameters, moved along a direction."""
         steps = iter(leaves(direction))
         return map_leaves(lambda p: p + by * next(steps), self.parameters)
 
     def hard(self, direction: Tree, by: float, samples: int, change: Change | None = None) -> Array:
-        """The image without splatting, of `samples`² samples a pixel, of the moved parameters."""
+        """The image at moved parameters, without splatting, with `samples`² samples a pixel."""
         layers = self.options.get("layers", 2)
         if not self.opaque:
             layers = max(DEEP, 0 if isinstance(layers, str) else layers)
@@ -143,7 +143,7 @@ class Subject:
         Args:
             direction: of the parameters.
             change: of the scene.
-            connect: whether arrays that no derivative leads to move, too.
+            connect: whether arrays that no derivative reaches move, too.
             **options: of `rts.render`.
         """
         one, unit, at = self._line(direction, connect)
@@ -153,13 +153,13 @@ class Subject:
     def step(
         self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **given: Any
     ) -> float | None:
-        """What `pixel_step` gives of a changed scene.
+        """The result of `pixel_step` for a changed scene.
 
         Args:
             direction: of the parameters.
             change: of the scene.
-            connect: whether arrays that no derivative leads to move, too.
-            deep: whether to look at hidden layers, too.
+            connect: whether arrays that no derivative reaches move, too.
+            deep: whether hidden layers count, too.
             **given: options of `rts.render`.
         """
         one, unit, at = self._line(direction, connect)
@@ -170,10 +170,10 @@ class Subject:
         return pixel_step(self.engine, image, one * 0, unit, deep=deep)
 
     def _line(self, direction: Tree, connect: bool = False) -> tuple[Array, Array, Callable[[Array], tuple]]:
-        """One and a unit, and t → the scene of the parameters moved by t along a direction.
+        """A 1, a unit tangent, and t → the scene of the parameters moved by t along a direction.
 
-        The scene function is differentiated if it can be. One that looks at values, as NumPy does, cannot be by some
-        engines' forward mode: then its arrays move by differences, and those that no derivative leads to rest.
+        The scene function is differentiated if possible. Some engines' forward mode fails in functions that read
+        values, as NumPy does. Then the scene's arrays move by differences, but those that no derivative reaches rest.
         """
         xp = self.engine.namespace
         one = self.engine.constant(np.ones(()), next(leaves(self.parameters)))
@@ -188,7 +188,7 @@ class Subject:
 
     @cached_property
     def _forward(self) -> bool:
-        """Whether forward mode goes through the scene function."""
+        """True if forward mode works through the scene function."""
 
         def total(p: Tree) -> Array:
             self.shown(p)
@@ -228,21 +228,21 @@ class Subject:
 
     # ------------------------------------------------------------------------------------------ arrays of the scene
 
-    def _arrays(self, found: tuple[Any, Camera]) -> tuple[list[Place], list[Array]]:
+    def _arrays(self, scene: tuple[Any, Camera]) -> tuple[list[Place], list[Array]]:
         places, arrays = [], []
-        for index, part in enumerate([*listed_parts(found[0]), found[1]]):
+        for index, part in enumerate([*listed_parts(scene[0]), scene[1]]):
             for name, x in named_leaves(part):
                 places.append(Place(None if isinstance(part, Camera) else index, name))
                 arrays.append(x)
         return places, arrays
 
-    def _placed(self, found: tuple[Any, Camera]) -> dict[Place, Array]:
-        return dict(zip(*self._arrays(found), strict=True))
+    def _placed(self, scene: tuple[Any, Camera]) -> dict[Place, Array]:
+        return dict(zip(*self._arrays(scene), strict=True))
 
     @cached_property
     def _gradients(self) -> dict[Place, list[np.ndarray | None]]:
-        """For each array that some derivative leads to, the gradient of a random sum of it; None where that is 0."""
-        engine, found = self.engine, {}
+        """The gradient of a random sum of each array that a derivative reaches; None for leaves where it is 0."""
+        engine, gradients = self.engine, {}
         places, arrays = self._arrays(self.shown(self.parameters))
         for k, (place, x) in enumerate(zip(places, arrays, strict=True)):
             if not engine.owns(x) or not is_floating(x):
@@ -255,8 +255,8 @@ class Subject:
 
             gradient = [engine.to_numpy(g) for g in leaves(engine.value_and_grad(total)(self.parameters)[1])]
             if any(g.any() for g in gradient):
-                found[place] = [g if g.any() else None for g in gradient]
-        return found
+                gradients[place] = [g if g.any() else None for g in gradient]
+        return gradients
 
     def touched(self, direction: Tree, step: float) -> Touched:
         """The arrays of the scene that change with a step along a direction."""
@@ -266,7 +266,7 @@ class Subject:
         along = [self.engine.to_numpy(d) for d in leaves(direction)]
         for place in dict.fromkeys([*before, *after]):
             if place.part is not None and place.part >= len(self.parts):
-                continue  # Of the scene as it is, this is no part.
+                continue  # The scene at the current parameters has no such part.
             ends = [x.get(place) for x in (before, after)]
             if all(x is not None for x in ends) and self._alike(*ends):
                 continue
@@ -295,32 +295,32 @@ class Subject:
 
     @cached_property
     def parts(self) -> list[CheckedPart]:
-        """The parts of the scene as it is, checked."""
+        """The checked parts of the scene at the current parameters."""
         parts, camera = self.shown(self.parameters)
         return check_scene(listed_parts(parts), camera)[0]
 
     def sampled(self, **options: Any) -> Sampled:
-        """The samples of the scene as it is, as `rts.sample` gives them."""
+        """Samples of the scene at the current parameters, by `rts.sample`."""
         given = {name: self.options[name] for name in ("sampler", "engine") if name in self.options}
         return sample(*self.shown(self.parameters), self.size, **given, **options)
 
     @cached_property
     def supersample(self) -> int:
-        """Samples along each axis of a pixel, where there are most."""
+        """Samples along each axis of a pixel; with `rts.Adaptive`, of an active one."""
         return finest(self.options.get("supersample", 1))
 
     @cached_property
     def fineness(self) -> Fineness:
-        """What is thinner than a sample, and what are outlines."""
+        """Masks of shapes thinner than a sample, and of outlines."""
         return fineness(self.sampled, self.size, self.supersample)
 
     def splats_as(self, name: str) -> bool:
-        """Whether the scene's splatter is of the kind that has this name."""
+        """True if the scene's splatter is of the kind with this name."""
         return type(check_splatter(self.options.get("splatter", "auto"))) is type(check_splatter(name))
 
     @cached_property
     def opaque(self) -> bool:
-        """Whether all shaders promise to be."""
+        """True if all shaders promise to be opaque."""
         return all(part.shader.opaque for part in self.parts)
 
     @cached_property
@@ -335,7 +335,7 @@ class Subject:
 
 
 def listed_parts(parts: Any) -> list[Part]:
-    """The parts in a list, without what was built for them."""
+    """The parts in a list; those of `rts.prepare` without their prepared data."""
     if isinstance(parts, Prepared):
         parts = parts.parts
     return list(parts) if isinstance(parts, (list, tuple)) else [parts]
@@ -353,12 +353,12 @@ def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Ite
         else:
             inside = [getattr(thing, name, None) for name in ("__defaults__", "__self__", "__dict__", "func", "args")]
             for cell in getattr(thing, "__closure__", None) or ():
-                with contextlib.suppress(ValueError):  # What is not assigned yet.
+                with contextlib.suppress(ValueError):  # A variable that is not assigned yet.
                     inside.append(cell.cell_contents)
         for x in inside:
             yield from _held(x, is_array, depth - 1)
 
 
 def is_floating(x: Array) -> bool:
-    """Whether an array, or a number, is of floating numbers."""
+    """True if an array or a number is of floating point."""
     return np.asarray(x).dtype.kind == "f" if is_constant(x) else namespace(x).isdtype(x.dtype, "real floating")

@@ -1,4 +1,4 @@
-"""Which pixels of a scene hold what is thinner than a sample, and which hold outlines."""
+"""Masks of pixels with shapes thinner than a sample, and of pixels with outlines."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from rts.arrays.engines import engine_of
 from rts.contracts.records import Sampled
 
 FINE, CELLS = 8, 2**22
-"""Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""
+"""Cells along each side of a sample, fine enough to show thinner shapes; and the most cells in all."""
 JUMP, FLAT = 0.05, 1e-3
-"""Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
+"""A jump of depth: the least change from cell to cell, as a share of the span of all depths, and of the depth."""
 CORNER = 0.1
-"""The share of a pixel that the disk may leave of corners, without anything being thin there."""
+"""The share of a pixel that disks may leave uncovered at corners without a thin shape."""
 
 
 class Fineness(NamedTuple):
     """Two masks (H, W) bool.
 
     Attributes:
-        thin: the pixels around what is thinner than a sample.
-        outlines: those around outlines.
+        thin: the pixels around shapes thinner than a sample.
+        outlines: the pixels around outlines.
     """
 
     thin: np.ndarray
@@ -31,7 +31,7 @@ class Fineness(NamedTuple):
 
 
 def fineness(sampled: Callable[..., Sampled], size: tuple[int, int], taken: int) -> Fineness:
-    """What is fine in a scene.
+    """Thin shapes and outlines of a scene.
 
     Args:
         sampled: options of `rts.sample` → samples of the scene.
@@ -43,9 +43,9 @@ def fineness(sampled: Callable[..., Sampled], size: tuple[int, int], taken: int)
     height, width = size
     across = min(FINE, max(2, int((CELLS / (height * width)) ** 0.5 / taken)))  # Cells a sample.
     fine = across * taken
-    found = sampled(layers=1, supersample=fine)
-    apron = found.apron
-    part, depth = (on_host(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
+    samples = sampled(layers=1, supersample=fine)
+    apron = samples.apron
+    part, depth = (on_host(x)[0, apron:-apron, apron:-apron] for x in (samples.part, samples.depth))
     jump = max(JUMP * np.ptp(depth[part >= 0]), FLAT * depth.max()) if (part >= 0).any() else 0.0
     jumps = np.zeros(part.shape, bool)
     for axis in (0, 1):
@@ -61,7 +61,7 @@ def fineness(sampled: Callable[..., Sampled], size: tuple[int, int], taken: int)
 
 
 def _thinner(part: np.ndarray, across: int) -> np.ndarray:
-    """The cells of parts, or of the space between them, that no disk of so many cells across covers."""
+    """The cells of parts, or of gaps between them, that no disk fits over which is `across` cells wide."""
     from scipy.ndimage import binary_opening, find_objects
 
     disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5

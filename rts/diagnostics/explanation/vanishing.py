@@ -1,4 +1,4 @@
-"""Why a number changes nothing: experiments that make it change something."""
+"""Reasons why a number changes nothing: experiments that make it change the image."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from rts.fitting.dependence import directions_in_words
 from rts.sampling.empty_images import out_of_view
 
 QUIET = 1e-4
-"""The largest change of a pixel by a step that counts as none."""
+"""The change of a pixel by a step up to which it counts as none."""
 DISTANCES = (4.0, 16.0, 64.0, -4.0, -16.0)
-"""How far a camera is moved back, in distances of its near plane."""
+"""Distances by which a camera is moved back, in units of its near plane's."""
 FLAT, FAR = 1e-3, 0.05
-"""A loss is flat where moves of up to two pixels change it by no more than the one, as a share of what a far move does;
-which has to be more than the other, as a share of the loss."""
+"""A loss is flat if moves of up to two pixels change it by at most FLAT of a far move's change. That change must be
+more than FAR of the loss."""
 STEEP = 0.1
-"""A loss that is flat by less than this, beside a parabola, is at its minimum."""
+"""The change near by that still counts as flat, as a share of a parabola's; with more the loss is at its minimum."""
 OPEN = 1e-3
-"""The singular value of a combination that is not determined, as a share of those of its numbers."""
+"""The singular value up to which a combination is undetermined, as a share of those of its numbers."""
 OPEN_TRUE = 0.1
-"""How much such a combination may change the image when it is tried, as a share of what one of its numbers does."""
+"""The change of the image by an undetermined combination, at most, as a share of the change by one of its numbers."""
 
 
 def is_quiet(derivative: np.ndarray) -> bool:
-    """Whether the change of an image by a step is none."""
+    """True if a step leaves the image unchanged."""
     return bool(np.abs(derivative).max(initial=0.0) < QUIET)
 
 
 def why_not_finite(number: Number) -> list[Finding]:
-    """Why a number has no derivative, or no truth."""
+    """Reasons why a number's derivative, or its truth, is NaN or infinite."""
     if not np.isfinite(number.true).all():
         mask = ~np.all(np.isfinite(number.true), axis=-1)
         return [Finding("infinite", "the image itself is not finite when it moves", "Look for NaN in the scene.", mask)]
@@ -53,7 +53,7 @@ def why_not_finite(number: Number) -> list[Finding]:
 
 
 def why_nothing(subject: Subject, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
-    """Why neither derivative sees a number; nothing if there is no time to find out."""
+    """Reasons why both derivatives of a number vanish; none if time runs out."""
     if not touched.all:
         return [Finding("unused", "nothing in the scene changes with it", "Use it, or leave it out.")]
     constants = why_constant(subject, touched)
@@ -64,9 +64,9 @@ def why_nothing(subject: Subject, number: Number, touched: Touched, going: Calla
     for experiment in (_culled, _hidden, _hidden_by_itself, _outside):
         if not going():
             return []
-        found = experiment(subject, trial, indices, what)
-        if found is not None:
-            return [found]
+        finding = experiment(subject, trial, indices, what)
+        if finding is not None:
+            return [finding]
     return [
         Finding(
             "undetermined",
@@ -109,8 +109,8 @@ def _hidden_by_itself(subject: Subject, trial: _Trial, indices: list[int], what:
 
 
 def _outside(subject: Subject, trial: _Trial, indices: list[int], what: str) -> Finding | None:
-    found = subject.shown(subject.parameters)
-    parts, camera = check_scene(listed_parts(found[0]), found[1])
+    scene = subject.shown(subject.parameters)
+    parts, camera = check_scene(listed_parts(scene[0]), scene[1])
     causes = {out_of_view(parts[i], camera.for_size(subject.size)) for i in indices}
     if len(causes) == 1 and (cause := causes.pop()):
         because = f"{what if len(indices) == 1 else f'each of {what}'} {cause}"
@@ -122,8 +122,8 @@ def _outside(subject: Subject, trial: _Trial, indices: list[int], what: str) -> 
 
 
 def why_constant(subject: Subject, touched: Touched) -> list[Finding]:
-    """Arrays that a number changes, to which no derivative leads."""
-    engine, found = subject.engine.name, []
+    """Findings on arrays that a number changes, but that no derivative reaches."""
+    engine, findings = subject.engine.name, []
     for places, why, advice in (
         (touched.constant, "NumPy, and therefore constant", f"Make it of {engine} arrays throughout."),
         (
@@ -135,22 +135,22 @@ def why_constant(subject: Subject, touched: Touched) -> list[Finding]:
         if places:
             told = " and ".join(map(str, places[:2])) + (" and others" if places[2:] else "")
             verbs = ("changes", "is") if len(places) == 1 else ("change", "are")
-            found.append(Finding("constant", f"{told} {verbs[0]} with it, but {verbs[1]} {why}", advice))
-    return found
+            findings.append(Finding("constant", f"{told} {verbs[0]} with it, but {verbs[1]} {why}", advice))
+    return findings
 
 
 class _Trial:
-    """Tries whether a number is seen in a changed scene."""
+    """Trial of a number: whether it shows in changed scenes."""
 
     def __init__(self, subject: Subject, number: Number):
         self.subject, self.number = subject, number
 
     def shown(self, change: Change, **options: Any) -> np.ndarray:
-        """(H, W) bool, the pixels that the number changes in the changed scene, but not in the scene as it is."""
+        """Mask (H, W) bool of pixels that the number changes in a changed scene, but not in the scene itself."""
         return self._changed(change, **options) & ~self._anyway
 
     def seen_outside(self, change: Change | None = None) -> bool:
-        """Whether a larger window, or a camera that is moved back, sees what changes."""
+        """True if a larger window, or a camera moved back, sees the number's effect."""
         height, width = self.subject.size
         apron = max(height, width)
         larger = height + 2 * apron, width + 2 * apron
@@ -179,7 +179,7 @@ class _Trial:
 
 
 def why_flat(subject: Subject, number: Number, going: Callable[[], bool]) -> list[Finding]:
-    """Whether the loss is flat around a number that is seen, though a larger move changes it; if there is time."""
+    """Find out whether the loss is flat around a number that is seen, though larger moves change it."""
     engine, step = subject.engine, number.slope.step
     samples = 2
 
@@ -238,20 +238,20 @@ def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str,
     if len(numbers) < 2:
         return []
     gram = np.zeros((len(numbers), len(numbers)))
-    for row in range(subject.size[0]):  # So that not all are held once more.
+    for row in range(subject.size[0]):  # Row by row, without a copy of all images.
         columns = np.stack([n.pushed[row].reshape(-1) for n in numbers]).astype(np.float64)
         gram += columns @ columns.T
     lengths = np.sqrt(np.diag(gram))
     _, values, vectors = np.linalg.svd(gram / np.outer(lengths, lengths))
     units = lengths / np.array([n.slope.step for n in numbers])  # Of the image, for a unit of the number.
-    found = []
+    combinations = []
     for value, vector in zip(values, vectors, strict=True):
         if np.sqrt(max(value, 0)) > OPEN or not _stays(subject, numbers, vector / lengths):
             continue
-        found.append(vector / units)
-    if not found:
+        combinations.append(vector / units)
+    if not combinations:
         return []
-    basis = np.stack(found, axis=1)
+    basis = np.stack(combinations, axis=1)
     told = directions_in_words(basis, units, [n.slope.name for n in numbers], [()] * len(numbers))
     because = f"the image does not determine {told}: along it each number changes the image, and all together do not"
     advice = "Fix one of them, add a term that prefers one, or fit the combination that the image shows."
@@ -259,7 +259,7 @@ def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str,
 
 
 def _stays(subject: Subject, numbers: Sequence[Number], weights: np.ndarray) -> bool:
-    """Whether the image stays when numbers are moved together, by a step of the one that moves most."""
+    """True if the image stays the same while numbers move together; the fastest moves by its step."""
     weights = weights / np.abs(weights).max()
     largest = numbers[int(np.argmax(np.abs(weights)))]
 

@@ -1,4 +1,4 @@
-"""Scenes made of a scene, to see by experiment what stands in the way of a derivative."""
+"""Changes of a scene for experiments, each of which removes one obstacle to a derivative."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 CLEAR = 0.5
-"""Alpha of what is made transparent, of that which it was."""
+"""Alpha of parts made transparent, as a share of their own."""
 
 
 def alone(kept: Collection[int]) -> Change:
-    """Some parts without the others."""
+    """The scene with some of its parts only."""
     return lambda parts, camera: ([p for i, p in enumerate(parts) if i in kept], camera)
 
 
@@ -30,7 +30,7 @@ def unculled(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
 
 
 def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene with parts that can be looked through."""
+    """The scene with transparent parts."""
 
     def through(part: Part) -> Callable[..., Array]:
         shader = instance("rts.shaders", part.shader)
@@ -40,18 +40,18 @@ def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
 
 
 def unbounded(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene of surfaces whose derivatives are as large as they come."""
+    """The scene with surfaces that do not bound their derivatives."""
     surfaces = [p.surface.unbounded() for p in parts]
     return [p if s is None else p.replace(surface=s) for p, s in zip(parts, surfaces, strict=True)], camera
 
 
 def wider(size: tuple[int, int], apron: int) -> Change:
-    """The scene through a larger window; for images of `apron` more pixels on every side."""
+    """The scene through a larger window, for images with `apron` more pixels on every side."""
     return lambda parts, camera: (parts, camera.with_apron(size, apron))
 
 
 def farther(distance: float) -> Change:
-    """The scene from a camera that is moved back along its axis, or ahead where the distance is negative."""
+    """The scene from a camera moved back along its axis; a negative distance moves it ahead."""
     change = np.eye(4)
     change[2, 3] = -distance
 
@@ -64,7 +64,7 @@ def farther(distance: float) -> Change:
 
 
 def placed(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene where the colour of each sample is its place in the world."""
+    """The scene with each sample's world position as its colour."""
 
     def place(theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         position = gbuffer["position"]

@@ -23,7 +23,7 @@ def _shape(positions, rgba, row, settled, *, numbers, border):
 
 
 def _arguments(operands, numbers, border, checked=None):
-    """What every loop takes after its range; rows that name no sample are refused."""
+    """Arguments of every loop after its range; rows that refer to no sample are refused."""
     positions, rgba, row, settled = operands
     row = row[:1]
     if not checked:
@@ -60,13 +60,13 @@ def _pull(operands, g, results, *, numbers, border, kept):
     given = _arguments(operands, numbers, border, kept)
     (rgba, row, settled), g = given[1:4], read_only(g)
     none = (np.empty((0, n), g.dtype) for n in (3, 4))
-    found = [n if x is None else x for n, x in zip(none, results, strict=True)]
+    gradients = [n if x is None else x for n, x in zip(none, results, strict=True)]
     if repeats(row, np.zeros(len(rgba), np.bool_)):  # Threads would add to one sample at once.
-        pull(0, len(row), *given, g, *found)
+        pull(0, len(row), *given, g, *gradients)
     else:
-        parallel(pull, len(row), *given, g, *found, work=WORK * row.size)
+        parallel(pull, len(row), *given, g, *gradients, work=WORK * row.size)
     if len(settled) and results[1] is not None:
-        collect(settled, border, g, found[1])
+        collect(settled, border, g, gradients[1])
 
 
 def _used(operands):

@@ -89,7 +89,7 @@ def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
     """Add to the gradients of the samples of rows of cells; each collects from its nine targets."""
     width, zero = row.shape[1], g.dtype.type(0)
     sources, total, filled = np.empty(3 * SOURCE, g.dtype), np.empty(SUM, g.dtype), np.empty(3, np.bool_)
-    adjoints, given, found = np.empty(3 * SUM, g.dtype), np.empty(SUM, g.dtype), np.empty(8 * PITCH, g.dtype)
+    adjoints, given, gathered = np.empty(3 * SUM, g.dtype), np.empty(SUM, g.dtype), np.empty(8 * PITCH, g.dtype)
     active, slope = np.zeros(3, np.bool_), g.dtype.type(2) * scale * gamma
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
@@ -111,8 +111,8 @@ def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
                 adjoint[:] = zero
             if y > start and filled[(y + 2) % 3] and (active[0] | active[1] | active[2]):
                 s = slot(sources, y - 1, SOURCE)[2:]
-                gather(found, s, slot(adjoints, y - 2, SUM), slot(adjoints, y - 1, SUM), adjoint, count)
-                scatter(g_positions, g_rgba, row[y - 1, left:], found, s, slope, count)
+                gather(gathered, s, slot(adjoints, y - 2, SUM), slot(adjoints, y - 1, SUM), adjoint, count)
+                scatter(g_positions, g_rgba, row[y - 1, left:], gathered, s, slope, count)
 
 
 @compiled
@@ -152,22 +152,22 @@ def to_sums(to, total, g, count):
 
 
 @compiled
-def scatter(g_positions, g_rgba, row, found, s, slope, count):
+def scatter(g_positions, g_rgba, row, gathered, s, slope, count):
     """Hand what a row of cells has gathered to their samples."""
     for j in range(count):
         i = row[j]
         if i >= 0 and len(g_rgba) > 0:
             for c in range(4):
-                g_rgba[i, c] += found[c * PITCH + j]
+                g_rgba[i, c] += gathered[c * PITCH + j]
         if i >= 0 and len(g_positions) > 0:
-            h = found[5 * PITCH + j]
-            g_positions[i, 0] += slope * (found[6 * PITCH + j] - s[RX + j] * h)
-            g_positions[i, 1] += slope * (found[7 * PITCH + j] - s[RY + j] * h)
+            h = gathered[5 * PITCH + j]
+            g_positions[i, 0] += slope * (gathered[6 * PITCH + j] - s[RX + j] * h)
+            g_positions[i, 1] += slope * (gathered[7 * PITCH + j] - s[RY + j] * h)
 
 
 @loop
 def repeats(row, seen):
-    """Whether several cells name one sample; `seen` (N,) are zeros."""
+    """True if several cells refer to one sample; `seen` (N,) are zeros."""
     for y in range(row.shape[0]):
         for x in range(row.shape[1]):
             i = row[y, x]

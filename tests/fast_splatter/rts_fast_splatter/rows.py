@@ -60,7 +60,7 @@ def slot(s, y, size):
 
 @compiled
 def covered(row, y, first, count):
-    """Whether there is any sample in cells first, … of a row."""
+    """True if any of the cells first, …, first + count − 1 of a row has a sample."""
     some, height, width = False, *row.shape
     if 0 <= y < height:
         for x in range(max(first, 0), min(first + count, width)):

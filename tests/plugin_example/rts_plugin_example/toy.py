@@ -17,7 +17,7 @@ class Toy(rts.TriangleSampler):
         ids = np.full((layers, *size), -1, np.int32)
         weights = np.zeros((layers, *size, 2), np.float32)
         for index, corners in enumerate(prepared.vertices[prepared.faces].astype(np.float64)):
-            hit, depth, found = hits(corners, origins, directions, cull)
+            hit, depth, own = hits(corners, origins, directions, cull)
             point = origins + depth[..., None] * directions
             z, w = (point @ row[:3] + row[3] for row in clip[2:])
             depth = np.where(hit & (w > 0) & (np.abs(z) <= w), depth, np.inf)
@@ -26,7 +26,7 @@ class Toy(rts.TriangleSampler):
             order = np.argsort(depths, axis=0, kind="stable")[:layers]
             depths = np.take_along_axis(depths, order, axis=0)
             ids = np.take_along_axis(np.concatenate([ids, np.full((1, *size), index, np.int32)]), order, axis=0)
-            weights = np.take_along_axis(np.concatenate([weights, found[None]]), order[..., None], axis=0)
+            weights = np.take_along_axis(np.concatenate([weights, own[None]]), order[..., None], axis=0)
         covered = depths < np.inf
         return Fragments(
             np.where(covered, ids, -1),
@@ -36,7 +36,7 @@ class Toy(rts.TriangleSampler):
 
 
 def hits(corners, origins, directions, cull):
-    """Whether each ray hits, at what depth, and the weights there of the first two corners, by Cramer's rule."""
+    """Hits of rays, their depths, and the weights of the first two corners there, by Cramer's rule."""
     a, b, c = corners
     across = np.cross(directions, b - c)
     determinant = across @ (a - c)

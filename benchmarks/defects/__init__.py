@@ -1,0 +1,1 @@
+"""Mistakes planted on purpose: do the tests notice?"""
