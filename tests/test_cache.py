@@ -14,7 +14,7 @@ from rts import Camera, GBuffer, InputError, Part, PluginError, TriangleSampler,
 from rts.plugin_api.records import Proxy
 from rts.plugin_base import overrides
 from rts.sampling import cache
-from rts.sampling.cache import KEPT, fingerprint
+from rts.sampling.cache import KEPT, fingerprint, same_faces
 
 pytestmark = pytest.mark.sampling
 
@@ -223,6 +223,14 @@ def test_moved_vertices_are_followed_by_refitting_and_look_the_same_as_built_ane
     assert len(sampler.prepared) == KEPT and sampler.updated == 14 - KEPT
     # Both kept structures took turns, each built anew at every fourth move.
     assert sum(rebuilt) == 2 and len(rebuilt) == 14 - KEPT
+
+
+def test_only_vertices_may_differ_where_structures_are_refitted():
+    vertices, faces = icosphere(1)
+    proxy = Proxy(vertices.astype(np.float32), faces.astype(np.int32))
+    assert same_faces(proxy, proxy._replace(vertices=2 * proxy.vertices, faces=proxy.faces.copy()))
+    assert not same_faces(proxy, proxy._replace(faces=proxy.faces[:, ::-1]))
+    assert not same_faces(proxy, proxy._replace(vertices=proxy.vertices[:-1]))
 
 
 def test_the_opengl_buffers_of_moved_vertices_are_made_anew():

@@ -408,6 +408,10 @@ BAD = {
         lambda: rts.render_samples(rts.sample(PART, CAMERA, SIZE), [PART, PART], CAMERA),
         ("2 parts", "samples of 1"),
     ),
+    "samples of more parts": (
+        lambda: rts.render_samples(rts.sample([PART, PART], CAMERA, SIZE), PART, CAMERA),
+        ("1 parts", "samples of 2"),
+    ),
 }
 
 

@@ -171,6 +171,12 @@ def test_blinn_phong_is_brightest_where_the_normal_halves_light_and_view():
         np.testing.assert_allclose(highlight(30 - off), expected, atol=1e-9)
 
 
+def test_blinn_phong_has_no_highlight_where_the_light_comes_from_behind():
+    # 100° off the normal, halfway between light and view is still 50° off it.
+    lit = {"light": light(100, 0.0, (1.0, 1.0, 1.0)), "color": (0.0, 0.0, 0.0), "specular": (1.0, 1.0, 1.0)}
+    np.testing.assert_array_equal(shade(BlinnPhong(), shininess=0.5, **lit)[:3], 0)
+
+
 def test_blinn_phong_without_specular_is_lambert():
     for degrees in (0, 40, 130):
         found = shade(BlinnPhong(), light=light(degrees), specular=(0, 0, 0))

@@ -162,7 +162,7 @@ LOOPS = [
         "rts_surfaces/implicit/interpolation_loops.py",
         "return (above - below) / ((up + down) * step[axis])",
         "return (above - below) / ((up + down) * step[0])",
-        "isosurface fields isosurface_conformance",
+        "interpolation isosurface fields",
     ),
 ]
 """In compiled loops."""
@@ -264,7 +264,7 @@ ARRAYS = [
         "rts/sampling/hidden.py",
         "if (most < count and not _ran_out(sampled)) or count > LAYER_LIMIT:",
         "if most <= count or count > LAYER_LIMIT:",
-        "rendering sampling",
+        "pruning",
     ),
     Defect(
         "an outline's gain counts where the target is full",
@@ -299,14 +299,14 @@ ARRAYS = [
         "rts/splatting/layers.py",
         "    if high >= count:\n",
         "    if high > count:\n",
-        "splatting misuse",
+        "indices fused",
     ),
     Defect(
         "a count of parts that differs is not refused",
         "rts/rendering/image.py",
         "if len(scene.parts) != len(sampled.samples):",
         "if len(scene.parts) > len(sampled.samples):",
-        "rendering misuse sampling",
+        "rendering render_views sampling",
     ),
 ]
 """Elsewhere."""
