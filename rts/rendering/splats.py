@@ -133,7 +133,15 @@ def to_fine_splats(fine: Fine, parts: Sequence[CheckedPart], camera: Camera, con
     arrays = fine.index, fine.shift, fine.cells, fine.part, fine.wanted
     index, shift, cells, part, wanted = context_of(positions, rgba).constants(arrays)
     moved = take_shifted(positions, index, namespace(positions).astype(shift, positions.dtype))
-    return Splats(moved, take(rgba, index), cells, part, wanted=wanted, border=fine.apron, opaque=all(p.shader.opaque for p in parts))
+    return Splats(
+        moved,
+        take(rgba, index),
+        cells,
+        part,
+        wanted=wanted,
+        border=fine.apron,
+        opaque=all(p.shader.opaque for p in parts),
+    )
 
 
 def _shown(

@@ -45,14 +45,14 @@ class Source:
     alpha: list[Array]
 
     @classmethod
-    def at(cls, layers: Layers, n: Steps, still: Array | None) -> Source:
-        """The source from which steps `n` lead to the target; `still` as for `Layers.splats`."""
+    def at(cls, layers: Layers, n: Steps) -> Source:
+        """The source from which steps `n` lead to the target."""
         every = range(len(layers.target))
         return cls(
             layers.source(*n),
             layers.sides(*n),
             [layers.at(layers.covered[k], *n) for k in every],
-            layers.splats(*n, still=still),
+            layers.splats(*n),
             [layers.color(k, *n)[..., 3] for k in every],
         )
 
@@ -89,18 +89,17 @@ def picked(values: list[Array], index: Array, xp: Any) -> Array:
     return total
 
 
-def image(layers: Layers, shift: dict[Steps, Array], sigma: float, still: Array | None, gains: Any) -> Array:
+def image(layers: Layers, shift: dict[Steps, Array], sigma: float, gains: Any) -> Array:
     """The image (H, W, 4) of stacks of translucent layers.
 
     Args:
         layers: the samples.
         shift: for each offset the number s of `Visible` at the first level.
         sigma: of the kernel, cells.
-        still: (H, W) bool, targets at which weights have no derivative; None for none.
         gains: from the sums (H, W, 5) of F and S at the first level, the change (H, W, 5) of each with its coverage.
     """
     xp, count = layers.xp, len(layers.target)
-    sources = {n: Source.at(layers, n, still) for n in NEIGHBOURS}
+    sources = {n: Source.at(layers, n) for n in NEIGHBOURS}
     zero = xp.zeros_like(shift[NEIGHBOURS[0]])
     left = dict.fromkeys(NEIGHBOURS, Left(zero, zero))
     levels = []

@@ -90,7 +90,7 @@ class Visible(Kernel):
             m = xp.where(shown[n] & (-s < m), -s, m)
         differentiates = engine_of(splats.positions).differentiates
         lines, crossed = None, None
-        if self.crossings and count > 1 and differentiates:
+        if self.crossings and count > 1 and differentiates and splats.opaque:
             pairs = crossings.pairs_of(layers)
             lines, crossed = crossings.targets(layers, shift, pairs), functools.reduce(operator.or_, pairs.values())
         still = None if lines is None else lines.target
@@ -105,8 +105,7 @@ class Visible(Kernel):
             return [rims.spread(total, gain) for total, gain in zip(totals, moved, strict=True)]
 
         if not splats.opaque:
-            image = stacks.image(layers, shift, self.sigma, still, changes)
-            return image if lines is None else image + crossings.motion(self, layers, lines)
+            return stacks.image(layers, shift, self.sigma, changes)
         front, surface, behind = 0.0, 0.0, 0.0
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))

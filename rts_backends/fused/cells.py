@@ -17,11 +17,13 @@ from rts import InputError
 from rts.plugin_api.splats import Visible
 from rts.plugin_api.threads import parallel, read_only
 from rts_backends.fused import crossing_pairs, crossings, mixed_targets, outlines, stencil
+from rts_backends.fused import stacks as layered
 from rts_backends.fused import layer_pairing as listing
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.rows import Grid
+from rts_backends.fused.stacks import Stacks
 from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
@@ -40,6 +42,7 @@ class Settings(NamedTuple):
         one_part: whether all samples belong to one part.
         rims: `visible` only: whether coverage moves as outlines do.
         crossings: `visible` only: whether lines of crossing move as depths say.
+        opaque: whether alpha is sure to be 1; otherwise `visible` lets light through its layers.
     """
 
     kind: str
@@ -50,6 +53,7 @@ class Settings(NamedTuple):
     one_part: bool = False
     rims: bool = False
     crossings: bool = False
+    opaque: bool = True
 
 
 class Choices(NamedTuple):
@@ -68,6 +72,7 @@ class Choices(NamedTuple):
         listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: largest less least depth of the fronts, the camera's 0 included.
+        stacks: where layers are translucent, the plans of these targets.
     """
 
     mixed: np.ndarray
@@ -80,6 +85,7 @@ class Choices(NamedTuple):
     listed: np.ndarray
     repeated: bool
     extent: float
+    stacks: Stacks | None = None
 
 
 class Cells:
@@ -136,7 +142,8 @@ class Cells:
             self._wanted = self._wanted & (self._settled < 0)
         self.visible, self.border, self.one_part = settings.kind == "visible", settings.border, settings.one_part
         self.rims = self.visible and settings.rims
-        self.crosses = self.visible and settings.crossings
+        self.translucent = self.visible and not settings.opaque
+        self.crosses = self.visible and settings.crossings and settings.opaque
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
@@ -217,6 +224,12 @@ class Cells:
         if layers > 1 and self._wanted is not None:
             before, marks = marks, np.empty_like(marks)
             parallel(listing.narrow, height, before, self._wanted, marks, marked, work=self.row[0].size)
+        if self.translucent:
+            # Any target that some layer reaches; `narrow` comes before, since outlines look farther.
+            marks = layered.reached(self.row[0] >= 0)
+            marks = marks & self._wanted if self._wanted is not None else marks
+            marks = marks & ~amid if len(amid) else marks
+            marked = marks.sum(axis=1, dtype=np.int64)
         if len(amid) and not self.visible:
             marks &= ~amid
             marked = marks.sum(axis=1, dtype=np.int64)
@@ -229,7 +242,12 @@ class Cells:
             continued = kind.type(Visible.CONTINUED)
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             parallel(listing.choose, height, self.grid, *given, work=500 * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent)
+        stacks = None
+        if self.translucent:
+            stacks = Stacks.of(len(columns), layers, kind)
+            given = self.facing, beyond, offsets, columns, ranges, stacks
+            parallel(layered.fill, height, self.grid, *given, work=400 * layers * len(columns))
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, stacks)
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -257,6 +275,9 @@ class Cells:
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
             given = self.grid, *decide, *listed, ends
             parallel(outlines.fill, height, *given, result, work=90 * len(result.columns))
+            if choices.stacks is not None:
+                own = result.offsets, result.columns, choices.offsets, choices.columns, choices.stacks
+                parallel(layered.recolor, height, *own, result.changes, work=20 * len(result.columns))
             if self._crossed:
                 self.crossings.still(result.offsets, result.columns, result.changes)
         return result
@@ -289,7 +310,10 @@ class Cells:
         if out.size:
             given = self.plain_grid, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
-            if len(self.choices.columns):
+            if self.choices.stacks is not None:
+                given = self.choices.offsets, self.choices.columns, self.choices.stacks.images, self.border
+                parallel(layered.forward, len(out), *given, out, work=self._mixed_work // 10)
+            elif len(self.choices.columns):
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
                 )
@@ -345,6 +369,9 @@ class Cells:
         count, height = len(self.choices.columns), self.row.shape[1]
         if not (count and (len(g_positions) or len(g_rgba))):
             return
+        if self.choices.stacks is not None:
+            self._pull_stacks(self.choices.stacks, g, g_positions, g_rgba)
+            return
         adjoints, work = np.empty((count, 3, 5), g.dtype), self._mixed_work
         parallel(mixed_targets.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
         given = height, *self.mixed_arguments, adjoints
@@ -356,6 +383,13 @@ class Cells:
         if len(g_positions) or len(g_rgba):
             parallel(mixed_targets.pull, *given, g_positions, g_rgba, work=work)
 
+    def _pull_stacks(self, stacks: Stacks, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
+        """`_pull_mixed` of translucent layers."""
+        height, adjoints = self.row.shape[1], np.empty(stacks.sums.shape, g.dtype)
+        given, work = (self.choices.offsets, self.choices.columns, stacks), len(self.row) * self._mixed_work
+        parallel(layered.adjoint, height, *given, self.border, g, adjoints, work=work // 5)
+        parallel(layered.pull, height, self.grid, *given, adjoints, g_positions, g_rgba, work=work)
+
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
         if not out.size:
@@ -365,7 +399,11 @@ class Cells:
             for t, size in ((t_positions, 3), (t_rgba, 4))
         )
         parallel(stencil.push, out.shape[1], self.plain_grid, *tangents, self.choices.states, self.border, out)
-        if len(self.choices.columns):
+        if self.choices.stacks is not None:
+            given = self.grid, self.choices.offsets, self.choices.columns, self.choices.stacks, tangents, self.border
+            work = len(self.row) * self._mixed_work * len(out)
+            parallel(layered.push, out.shape[1], *given, out, work=work)
+        elif len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed_targets.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
         if self.rims and t_positions is not None:

@@ -34,6 +34,7 @@ def specification(
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
     cells = records.Cells(row, facing=facing, exit=exits, settled=settled)
     splats = records.Splats(positions, rgba, cells, part, border=settings.border, one_part=settings.one_part)
+    splats = splats.replace(opaque=settings.opaque)
     return _SPECIFICATIONS[settings.kind](*given, **options).cropped(splats)
 
 

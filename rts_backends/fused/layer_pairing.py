@@ -127,8 +127,10 @@ def choose(
                 _sides(sides, facing, y, x)
             for n in range(9):
                 shift[n], off = _pairing(z, n, target, sides)
-                if visible and shift[n] != 0 and _continues(positions, row, y, x, n, z[0], continued * off):
-                    shift[n] = 0
+                if visible and shift[n] != 0:
+                    empty = row[0, y, x] < 0
+                    if empty or _continues(positions, row, y, x, n, z[0], continued * off):
+                        shift[n] = 0
             if visible:
                 _choose_visible(choices[d], shift, z, row, y, x, target)
             else:
@@ -165,16 +167,16 @@ def _pairing(z, n, target, sides):
     best_a, best_b = abs(front - target[0]), abs(target[0] - front)
     for k in range(1, len(target)):
         distance = abs(z[k, n] - target[0])
-        if distance < best_a and not _opposite(sides[k, n], sides[0, 4], target[0] > z[k, n]):
+        if distance < best_a and not opposite_sides(sides[k, n], sides[0, 4], target[0] > z[k, n]):
             best_a, a = distance, k
         distance = abs(target[k] - front)
-        if distance < best_b and not _opposite(sides[k, 4], sides[0, n], front > target[k]):
+        if distance < best_b and not opposite_sides(sides[k, 4], sides[0, n], front > target[k]):
             best_b, b = distance, k
     return (-b, best_b) if best_b < best_a else (a, best_a)
 
 
 @compiled
-def _opposite(hidden, front, behind):
+def opposite_sides(hidden, front, behind):
     """True if a hidden layer shows the other side of a front's piece, and does not stand for layers behind it."""
     if front == 0 or (hidden > 0) == (front > 0):
         return False

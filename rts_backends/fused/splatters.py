@@ -56,13 +56,13 @@ class _Fused(SummingSplatter):
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if splats.rgba.shape[0] == 0 or self._left_out(splats):
+        if splats.rgba.shape[0] == 0:
             return self.array_code.image(splats)
         return self._of(splats.replace(border=0))
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if not self._own_image or splats.rgba.shape[0] == 0 or self._left_out(splats):
+        if not self._own_image or splats.rgba.shape[0] == 0:
             return super().cropped(splats)
         return self._of(splats)
 
@@ -78,10 +78,6 @@ class _Fused(SummingSplatter):
         none = splats.row[0, :0, :]
         known = splats.wanted, splats.settled, self._exits(splats)
         return splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
-
-    def _left_out(self, splats: Splats) -> bool:
-        """True where the specification makes the image: of translucent stacks."""
-        return self.kind == "visible" and not splats.opaque
 
     def _facing(self, splats: Splats) -> Array | None:
         return splats.facing if "facing" in self.reads else None
@@ -104,7 +100,8 @@ class _Fused(SummingSplatter):
 
     def _settings_of(self, splats: Splats) -> Settings:
         # `part` has the last word over `one_part`, as in `Splats.parts`.
-        return self._settings(splats.border, splats.one_part and splats.part is None)
+        settings = self._settings(splats.border, splats.one_part and splats.part is None)
+        return settings._replace(opaque=splats.opaque)
 
     @property
     def _motions(self) -> tuple[bool, ...]:
@@ -122,7 +119,7 @@ class _Fused(SummingSplatter):
         loss: Loss | None = None,
     ) -> tuple[Array, Array, Array] | None:
         """See `rts.Splatter`."""
-        if not self._sweeps or self._left_out(splats):
+        if not self._sweeps or (self.kind == "visible" and not splats.opaque):
             return None
         from rts_backends.fused import normal_equations
 

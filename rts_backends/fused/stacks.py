@@ -1,0 +1,462 @@
+"""Targets of translucent layers: the rule of `rts.splatting.stacks`, compiled, and its first derivatives.
+
+Plans are made once: for each level of a target, the layers that each source gives to the buffers in front, at the
+level, and in the gap beside it. Layers that a source gives to one buffer lie over one another, as chains.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.plugin_api.loops import compiled, loop
+from rts_backends.fused.layer_pairing import opposite_sides
+from rts_backends.fused.mixed_targets import splat
+
+
+class Stacks(NamedTuple):
+    """Plans and sums of M targets with up to K levels.
+
+    Attributes:
+        levels: (M,) int32, the number of levels of each target.
+        plans: (M, K, 9, 3) int16, for each source the first layer that it gives to each buffer, or −1; see `ends_of`.
+        ends: (M, K, 9) int16, the layer behind those in front.
+        least: (M, K), the least weight that fills a buffer.
+        sums: (M, K, 3, 5), of each buffer the colours over the weight, taken as at least `least`, and the weight.
+        images: (M, K + 1, 4), the image from each level on.
+    """
+
+    levels: np.ndarray
+    plans: np.ndarray
+    ends: np.ndarray
+    least: np.ndarray
+    sums: np.ndarray
+    images: np.ndarray
+
+    @classmethod
+    def of(cls, count: int, layers: int, kind: np.dtype) -> Stacks:
+        """Room for `count` targets."""
+        return cls(
+            np.zeros(count, np.int32),
+            np.empty((count, layers, 9, 3), np.int16),
+            np.empty((count, layers, 9), np.int16),
+            np.empty((count, layers), kind),
+            np.empty((count, layers, 3, 5), kind),
+            np.empty((count, layers + 1, 4), kind),
+        )
+
+
+# ---------------------------------------------------------------------------------------------------------- plans
+
+
+def reached(covered: np.ndarray) -> np.ndarray:
+    """(H, W) uint8, 1 at covered cells (H, W) bool and at the eight cells around each."""
+    wide = np.pad(covered, ((1, 1), (0, 0)))
+    wide = np.pad(wide[:-2] | wide[1:-1] | wide[2:], ((0, 0), (1, 1)))
+    return (wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]).view(np.uint8)
+
+
+@loop
+def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
+    """Make the plans, sums and images of the targets of rows [start, stop).
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        grid: the samples.
+        facing: (K, H, W), `Splats.facing`, or no layers.
+        beyond: depth of what is not covered.
+        offsets: (H + 1,), where the targets of each row begin.
+        columns: (M,), their columns.
+        ranges: (M, 9, 3, 2) of `layer_pairing.choose`, for the first level.
+        stacks: to be filled.
+    """
+    row, kind = grid.row, grid.positions.dtype.type
+    layers = len(row)
+    depths, sides = np.empty((9, layers), grid.positions.dtype), np.zeros((9, layers), np.int64)
+    counts, first, joins, shift = (
+        np.empty(9, np.int64),
+        np.empty(9, np.int64),
+        np.empty(9, np.int64),
+        np.empty(9, np.int64),
+    )
+    nominal, zero = np.empty(9, grid.positions.dtype), kind(0)
+    for n in range(9):
+        u, v = kind(n % 3 - 1), kind(n // 3 - 1)
+        nominal[n] = math.exp(-(u * u + v * v) * grid.scale)
+    whole = nominal.sum()
+    for n in range(9):
+        nominal[n] /= whole
+    for y in range(start, stop):
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d]
+            _load(depths, sides, counts, grid, facing, beyond, y, x)
+            first[:], joins[:] = 0, 0
+            levels = layers
+            for t in range(layers):
+                share, some = zero, False
+                for n in range(9):
+                    if joins[n] <= t:
+                        share += nominal[n]
+                        some |= first[n] < counts[n]
+                if not some:
+                    levels = t
+                    break
+                for n in range(9):
+                    if joins[n] <= t and first[n] < counts[n]:
+                        if t == 0 and ranges[d, n, 1, 1] > ranges[d, n, 1, 0]:
+                            shift[n] = ranges[d, n, 1, 0]
+                        else:
+                            shift[n] = _pair(depths, sides, len(facing) > 0, counts, n, t, first[n], t == 0)
+                _plan(stacks, d, t, depths, counts, first, joins, shift)
+                stacks.least[d, t] = kind(1) if t == 0 else share
+                _sum(stacks, d, t, grid, counts, y, x, t == layers - 1)
+                _advance(t, layers, counts, first, joins, shift)
+            stacks.levels[d] = levels
+            _composite(stacks, d, levels)
+
+
+@compiled
+def _load(depths, sides, counts, grid, facing, beyond, y, x):
+    """Depths, sides and numbers of layers of the nine sources of a target."""
+    row = grid.row
+    layers, height, width = row.shape
+    for n in range(9):
+        py, px = y - (n // 3 - 1), x - (n % 3 - 1)
+        counts[n] = 0
+        for k in range(layers):
+            i = row[k, py, px] if 0 <= py < height and 0 <= px < width else -1
+            depths[n, k] = grid.positions[i, 2] if i >= 0 else beyond
+            if i >= 0:
+                counts[n] += 1
+            if len(facing) > 0:
+                sides[n, k] = facing[k, py, px] if i >= 0 else 0
+
+
+@compiled
+def _pair(depths, sides, told, counts, n, t, first, behind_only):
+    """The number s of a source at level t; only below 0 if `behind_only`, since it is known not to be at the level."""
+    layers = depths.shape[1]
+    if t >= counts[4]:
+        return 0
+    own, z = depths[4, t], depths[n, first]
+    a, best_a = 0, abs(z - own)
+    for k in range(first + 1, layers):
+        distance = abs(depths[n, k] - own)
+        if distance < best_a and not (told and opposite_sides(sides[n, k], sides[4, t], own > depths[n, k])):
+            a, best_a = k - first, distance
+    b, best_b = 0, abs(own - z)
+    for k in range(t + 1, layers):
+        distance = abs(depths[4, k] - z)
+        if distance < best_b and not (told and opposite_sides(sides[4, k], sides[n, first], z > depths[4, k])):
+            b, best_b = k - t, distance
+    return -b if behind_only or best_b < best_a else a
+
+
+@compiled
+def _plan(stacks, d, t, depths, counts, first, joins, shift):
+    """Fill the plan of a level."""
+    plans, ends, layers = stacks.plans, stacks.ends, depths.shape[1]
+    least = layers
+    for n in range(9):
+        if joins[n] <= t and first[n] < counts[n] and shift[n] < 0:
+            least = min(least, -shift[n])
+    revealed = depths[4, t + least] if least < layers else depths[4, t]
+    for n in range(9):
+        plans[d, t, n, 0] = plans[d, t, n, 1] = plans[d, t, n, 2] = -1
+        ends[d, t, n] = 0
+        if joins[n] > t or first[n] >= counts[n]:
+            continue
+        at = first[n] + shift[n]
+        if shift[n] > 0:
+            plans[d, t, n, 0], ends[d, t, n] = first[n], min(at, counts[n])
+        if shift[n] >= 0 and at < counts[n]:
+            plans[d, t, n, 1] = at
+        if least == layers:
+            continue
+        if shift[n] < 0:
+            plans[d, t, n, 2] = first[n]
+            continue
+        best = np.inf
+        for k in range(at + 1, counts[n]):
+            distance = abs(depths[n, k] - revealed)
+            if distance < best:
+                plans[d, t, n, 2], best = k, distance
+
+
+@compiled
+def _advance(t, layers, counts, first, joins, shift):
+    """The layers that sources have left behind a level."""
+    for n in range(9):
+        if joins[n] > t:
+            continue
+        if first[n] >= counts[n]:
+            joins[n] = layers
+        elif shift[n] >= 0:
+            at = first[n] + shift[n]
+            first[n], joins[n] = at + 1, t + 1 if at < counts[n] else layers
+        else:
+            joins[n] = t - shift[n]
+
+
+@compiled
+def _last(plans, ends, d, t, n, b, whole):
+    """The layer behind a chain of a source; layers that are not covered follow, and count for nothing."""
+    if b == 0:
+        return ends[d, t, n]
+    return plans[d, t, n, 1] + 1 if b == 1 and not whole else 32767
+
+
+@compiled
+def _sum(stacks, d, t, grid, counts, y, x, whole):
+    """Fill the sums of a level; `whole` if layers behind it count at once."""
+    plans, ends, total = stacks.plans, stacks.ends, stacks.sums[d, t]
+    rgba, row = grid.rgba, grid.row
+    one = total.dtype.type(1)
+    total[:] = total.dtype.type(0)
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        for b in range(3):
+            first = plans[d, t, n, b]
+            if first < 0:
+                continue
+            through = one
+            for k in range(first, min(_last(plans, ends, d, t, n, b, whole), counts[n])):
+                i = row[k, py, px]
+                w, _, _ = splat(grid, i, py, px, u, v)
+                if k == first:
+                    total[b, 4] += w
+                w *= through
+                for c in range(4):
+                    total[b, c] += w * rgba[i, c]
+                through *= one - rgba[i, 3]
+    for b in range(3):
+        over = one / max(total[b, 4], stacks.least[d, t])
+        for c in range(4):
+            total[b, c] *= over
+
+
+@compiled
+def _composite(stacks, d, levels):
+    """Fill the images of a target from each level on."""
+    sums, images = stacks.sums, stacks.images
+    one = sums.dtype.type(1)
+    for c in range(4):
+        images[d, levels, c] = 0
+    for t in range(levels - 1, -1, -1):
+        coverage = min(sums[d, t, 1, 4] / stacks.least[d, t], one)
+        for c in range(4):
+            images[d, t, c] = sums[d, t, 0, c] + (one - sums[d, t, 0, 3]) * _under(sums, images, coverage, d, t, c)
+
+
+@compiled
+def _under(sums, images, coverage, d, t, c):
+    """A channel of the image of a level without what is in front."""
+    one = sums.dtype.type(1)
+    through = (coverage - sums[d, t, 1, 3]) * images[d, t + 1, c]
+    return sums[d, t, 1, c] + through + (one - coverage) * sums[d, t, 2, c]
+
+
+# ---------------------------------------------------------------------------------------------- value, derivatives
+
+
+@loop
+def recolor(start, stop, own, listed, offsets, columns, stacks, changes):
+    """Fill `outlines.Outlines.changes` (L, 2, 4) of listed targets: how colours change with coverage.
+
+    `own` (H + 1,) and `listed` (L,) are rows and columns of these targets, `offsets` and `columns` those of stacks.
+    """
+    sums, images, one = stacks.sums, stacks.images, changes.dtype.type(1)
+    for y in range(start, stop):
+        d = offsets[y]
+        for j in range(own[y], own[y + 1]):
+            while d < offsets[y + 1] and columns[d] < listed[j]:
+                d += 1
+            changes[j] = 0
+            if d == offsets[y + 1] or columns[d] != listed[j] or stacks.levels[d] == 0:
+                continue
+            front, surface = sums[d, 0, 0, 4], sums[d, 0, 1, 4]
+            coverage, shown = min(surface, one), one - sums[d, 0, 0, 3]
+            for c in range(4):
+                if 0 < front < 1:
+                    under = _under(sums, images, coverage, d, 0, c)
+                    changes[j, 0, c] = (sums[d, 0, 0, c] - sums[d, 0, 0, 3] * under) / front
+                if 0 < surface < 1:
+                    more = sums[d, 0, 1, c] + (surface - sums[d, 0, 1, 3]) * images[d, 1, c]
+                    changes[j, 1, c] = shown * (more / surface - sums[d, 0, 2, c])
+
+
+@loop
+def forward(start, stop, offsets, columns, images, border, image):
+    """Fill targets of rows [start, stop) of the image (H, W, 4)."""
+    for y in range(start + border, stop + border):
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d] - border
+            if 0 <= x < image.shape[1]:
+                for c in range(4):
+                    image[y - border, x, c] = images[d, 0, c]
+
+
+@loop
+def adjoint(start, stop, offsets, columns, stacks, border, g, adjoints):
+    """Fill the gradients (M, K, 3, 5) of the sums that are not normalised, from the image's (H, W, 4)."""
+    levels, sums, images, least = stacks.levels, stacks.sums, stacks.images, stacks.least
+    zero, one = g.dtype.type(0), g.dtype.type(1)
+    own, below = np.empty(4, g.dtype), np.empty(4, g.dtype)
+    for y in range(start, stop):
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d]
+            inside = 0 <= y - border < g.shape[0] and 0 <= x - border < g.shape[1]
+            for c in range(4):
+                own[c] = g[y - border, x - border, c] if inside else zero
+            for t in range(levels[d]):
+                a = adjoints[d, t]
+                coverage, alpha = min(sums[d, t, 1, 4] / least[d, t], one), sums[d, t, 1, 3]
+                shown, front, surface, covered = one - sums[d, t, 0, 3], zero, zero, zero
+                for c in range(4):
+                    h = own[c]
+                    front += h * _under(sums, images, coverage, d, t, c)
+                    h *= shown
+                    surface += h * images[d, t + 1, c]
+                    covered += h * (images[d, t + 1, c] - sums[d, t, 2, c])
+                    a[0, c], a[1, c], a[2, c] = own[c], h, (one - coverage) * h
+                    below[c] = (coverage - alpha) * h
+                a[0, 3] -= front
+                a[1, 3] -= surface
+                for b in range(3):
+                    full = sums[d, t, b, 4] >= least[d, t]
+                    over, dot = one / max(sums[d, t, b, 4], least[d, t]), zero
+                    for c in range(4):
+                        dot += a[b, c] * sums[d, t, b, c]
+                        a[b, c] *= over
+                    a[b, 4] = -dot * over if full else covered * over if b == 1 else zero
+                own[:] = below
+
+
+@loop
+def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
+    """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
+    layers, height, width = grid.row.shape
+    behind = np.empty((layers + 1, 4), grid.positions.dtype)
+    for y in range(start, stop):
+        for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
+            for d in range(offsets[y + v], offsets[y + v + 1]):
+                for u in range(-1, 2):
+                    x, n = columns[d] - u, 3 * (v + 1) + u + 1
+                    if 0 <= x < width:
+                        for t in range(stacks.levels[d]):
+                            _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba)
+
+
+@compiled
+def _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba):
+    """`pull` from one level of a target to one of its sources."""
+    positions, rgba, row = grid.positions, grid.rgba, grid.row
+    layers, one, slope = len(row), positions.dtype.type(1), positions.dtype.type(2) * grid.scale * grid.gamma
+    for b in range(3):
+        first = stacks.plans[d, t, n, b]
+        if first < 0:
+            continue
+        last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), layers)
+        while row[last - 1, y, x] < 0:
+            last -= 1
+        for c in range(4):
+            behind[last, c] = 0
+        for k in range(last - 1, first, -1):
+            i = row[k, y, x]
+            w, _, _ = splat(grid, i, y, x, u, v)
+            for c in range(4):
+                behind[k, c] = w * rgba[i, c] + (one - rgba[i, 3]) * behind[k + 1, c]
+        through = one
+        for k in range(first, last):
+            i = row[k, y, x]
+            w, dx, dy = splat(grid, i, y, x, u, v)
+            h, hidden = adjoints[d, t, b, 4] if k == first else 0 * one, 0 * one
+            for c in range(4):
+                h += through * adjoints[d, t, b, c] * rgba[i, c]
+                hidden += adjoints[d, t, b, c] * behind[k + 1, c]
+            if len(g_rgba) > 0:
+                for c in range(4):
+                    g_rgba[i, c] += w * through * adjoints[d, t, b, c]
+                g_rgba[i, 3] -= through * hidden
+            if len(g_positions) > 0:
+                g_positions[i, 0] += slope * w * h * dx
+                g_positions[i, 1] += slope * w * h * dy
+            through *= one - rgba[i, 3]
+
+
+@loop
+def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
+    """Fill targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
+    t_positions, t_rgba = tangents
+    change, grown = np.empty((3, 5), out.dtype), np.empty(4, out.dtype)
+    for y in range(start + border, stop + border):
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d]
+            if not 0 <= x - border < out.shape[2]:
+                continue
+            for direction in range(len(out)):
+                grown[:] = 0
+                for t in range(stacks.levels[d] - 1, -1, -1):
+                    _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba)
+                    _over(grown, change, stacks.sums, stacks.images, stacks.least, d, t)
+                for c in range(4):
+                    out[direction, y - border, x - border, c] = grown[c]
+
+
+@compiled
+def _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba):
+    """Tangents (3, 5) of the sums of a level: of normalised colours, and of the weight."""
+    rgba, row, sums = grid.rgba, grid.row, stacks.sums
+    layers, zero, one = len(row), change.dtype.type(0), change.dtype.type(1)
+    slope, moved, tinted = change.dtype.type(2) * grid.scale * grid.gamma, t_positions.shape[1] > 0, t_rgba.shape[1] > 0
+    change[:] = zero
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        for b in range(3):
+            first = stacks.plans[d, t, n, b]
+            if first < 0:
+                continue
+            through, d_through = one, zero
+            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), layers)
+            for k in range(first, last):
+                i = row[k, py, px]
+                if i < 0:
+                    break
+                w, dx, dy = splat(grid, i, py, px, u, v)
+                dw = zero
+                if moved:
+                    dw = slope * w * (dx * t_positions[direction, i, 0] + dy * t_positions[direction, i, 1])
+                if k == first:
+                    change[b, 4] += dw
+                for c in range(4):
+                    change[b, c] += (d_through * w + through * dw) * rgba[i, c]
+                    if tinted:
+                        change[b, c] += through * w * t_rgba[direction, i, c]
+                d_through *= one - rgba[i, 3]
+                if tinted:
+                    d_through -= through * t_rgba[direction, i, 3]
+                through *= one - rgba[i, 3]
+    for b in range(3):
+        over = one / max(sums[d, t, b, 4], stacks.least[d, t])
+        more = change[b, 4] if sums[d, t, b, 4] >= stacks.least[d, t] else zero
+        for c in range(4):
+            change[b, c] = (change[b, c] - more * sums[d, t, b, c]) * over
+
+
+@compiled
+def _over(grown, change, sums, images, least, d, t):
+    """From the tangent of the image of the next level to that of a level."""
+    zero, one = grown.dtype.type(0), grown.dtype.type(1)
+    part = sums[d, t, 1, 4] / least[d, t]
+    coverage, more = min(part, one), change[1, 4] / least[d, t] if part < one else zero
+    alpha, hidden, shown = sums[d, t, 1, 3], change[0, 3], one - sums[d, t, 0, 3]
+    behind = change[1, 3]
+    for c in range(4):
+        under = change[1, c] + (more - behind) * images[d, t + 1, c] + (coverage - alpha) * grown[c]
+        under += (one - coverage) * change[2, c] - more * sums[d, t, 2, c]
+        grown[c] = change[0, c] - hidden * _under(sums, images, coverage, d, t, c) + shown * under
