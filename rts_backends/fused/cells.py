@@ -16,14 +16,15 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.splats import Visible
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.fused import crossing_pairs, crossings, mixed_targets, outlines, stencil
-from rts_backends.fused import stacks as layered
+from rts_backends.fused import crossing_pairs, crossings, mixed_targets, outlines, stencil, straight_stacks
 from rts_backends.fused import layer_pairing as listing
+from rts_backends.fused import stacks as layered
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.rows import Grid
 from rts_backends.fused.stacks import Stacks
+from rts_backends.fused.straight_stacks import Straight
 from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
@@ -73,6 +74,7 @@ class Choices(NamedTuple):
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: largest less least depth of the fronts, the camera's 0 included.
         stacks: where layers are translucent, the plans of these targets.
+        straight: where layers are translucent, the targets that need no plan; they are not listed above.
     """
 
     mixed: np.ndarray
@@ -86,6 +88,7 @@ class Choices(NamedTuple):
     repeated: bool
     extent: float
     stacks: Stacks | None = None
+    straight: Straight | None = None
 
 
 class Cells:
@@ -224,12 +227,18 @@ class Cells:
         if layers > 1 and self._wanted is not None:
             before, marks = marks, np.empty_like(marks)
             parallel(listing.narrow, height, before, self._wanted, marks, marked, work=self.row[0].size)
+        straight = None
         if self.translucent:
             # Any target that some layer reaches; `narrow` comes before, since outlines look farther.
             marks = layered.reached(self.row[0] >= 0)
             marks = marks & self._wanted if self._wanted is not None else marks
             marks = marks & ~amid if len(amid) else marks
-            marked = marks.sum(axis=1, dtype=np.int64)
+            levels = (self.row >= 0).sum(axis=0, dtype=np.int32)
+            regular, both = np.empty_like(marks), np.empty((height, 2), np.int64)
+            parallel(straight_stacks.find, height, self.grid, levels, marks, regular, both, work=self.row.size * 9)
+            marked, straight = both[:, 0], Straight.of(both[:, 1], layers, kind)
+            given = self.grid, levels, regular, states, EMPTY, straight
+            parallel(straight_stacks.fill, height, *given, work=100 * layers * len(straight.columns))
         if len(amid) and not self.visible:
             marks &= ~amid
             marked = marks.sum(axis=1, dtype=np.int64)
@@ -243,11 +252,11 @@ class Cells:
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             parallel(listing.choose, height, self.grid, *given, work=500 * len(columns))
         stacks = None
-        if self.translucent:
+        if straight is not None:
             stacks = Stacks.of(len(columns), layers, kind)
             given = self.facing, beyond, offsets, columns, ranges, stacks
             parallel(layered.fill, height, self.grid, *given, work=400 * layers * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, stacks)
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, stacks, straight)
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -278,6 +287,8 @@ class Cells:
             if choices.stacks is not None:
                 own = result.offsets, result.columns, choices.offsets, choices.columns, choices.stacks
                 parallel(layered.recolor, height, *own, result.changes, work=20 * len(result.columns))
+                own = result.offsets, result.columns, choices.straight
+                parallel(straight_stacks.recolor, height, *own, result.changes, work=20 * len(result.columns))
             if self._crossed:
                 self.crossings.still(result.offsets, result.columns, result.changes)
         return result
@@ -313,6 +324,9 @@ class Cells:
             if self.choices.stacks is not None:
                 given = self.choices.offsets, self.choices.columns, self.choices.stacks.images, self.border
                 parallel(layered.forward, len(out), *given, out, work=self._mixed_work // 10)
+                regular = self.choices.straight
+                given = regular.offsets, regular.columns, regular.images, self.border
+                parallel(layered.forward, len(out), *given, out, work=10 * len(regular.columns))
             elif len(self.choices.columns):
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
@@ -367,10 +381,10 @@ class Cells:
     def _pull_mixed(self, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
         """Add mixed targets' shares to the gradients; a gradient of no rows gets none."""
         count, height = len(self.choices.columns), self.row.shape[1]
-        if not (count and (len(g_positions) or len(g_rgba))):
-            return
         if self.choices.stacks is not None:
-            self._pull_stacks(self.choices.stacks, g, g_positions, g_rgba)
+            self._pull_stacks(self.choices.stacks, self.choices.straight, g, g_positions, g_rgba)
+            return
+        if not (count and (len(g_positions) or len(g_rgba))):
             return
         adjoints, work = np.empty((count, 3, 5), g.dtype), self._mixed_work
         parallel(mixed_targets.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
@@ -383,8 +397,14 @@ class Cells:
         if len(g_positions) or len(g_rgba):
             parallel(mixed_targets.pull, *given, g_positions, g_rgba, work=work)
 
-    def _pull_stacks(self, stacks: Stacks, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
+    def _pull_stacks(
+        self, stacks: Stacks, straight: Straight, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray
+    ) -> None:
         """`_pull_mixed` of translucent layers."""
+        adjoints, work = np.empty(straight.sums.shape, g.dtype), 100 * len(self.row) * len(straight.columns)
+        parallel(straight_stacks.adjoint, self.row.shape[1], straight, self.border, g, adjoints, work=work // 5)
+        given = self.grid, straight, adjoints, g_positions, g_rgba
+        parallel(straight_stacks.pull, self.row.shape[1], *given, work=work)
         height, adjoints = self.row.shape[1], np.empty(stacks.sums.shape, g.dtype)
         given, work = (self.choices.offsets, self.choices.columns, stacks), len(self.row) * self._mixed_work
         parallel(layered.adjoint, height, *given, self.border, g, adjoints, work=work // 5)
@@ -403,6 +423,9 @@ class Cells:
             given = self.grid, self.choices.offsets, self.choices.columns, self.choices.stacks, tangents, self.border
             work = len(self.row) * self._mixed_work * len(out)
             parallel(layered.push, out.shape[1], *given, out, work=work)
+            given = self.grid, self.choices.straight, tangents, self.border
+            work = 100 * len(self.row) * len(self.choices.straight.columns) * len(out)
+            parallel(straight_stacks.push, out.shape[1], *given, out, work=work)
         elif len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed_targets.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
