@@ -185,11 +185,13 @@ class Question(NamedTuple):
         covered: (K, H, W) bool, true where there is a sample.
         depth: (K, H, W) float, the depths of the samples; anything where nothing is covered.
         size: the largest coordinate that depths were computed from, which bounds rounding; 0 if unknown.
+        part: (K, H, W) integers, the part of each sample; None if all are of one part, or if it is unknown.
     """
 
     covered: np.ndarray
     depth: np.ndarray
     size: float = 0.0
+    part: np.ndarray | None = None
 
 
 class Decision(NamedTuple):

@@ -25,7 +25,7 @@ from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
 from rts.sampling.facing import facing_of_views
-from rts.sampling.hidden import HiddenBySplatter, without_hidden
+from rts.sampling.hidden import HiddenRule, without_hidden
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
 from rts.sampling.packing import FAR, lift
@@ -90,7 +90,7 @@ class Sampling(NamedTuple):
         first = self.scenes[0]
         return list(zip(first.parts, first.chosen(), first.entries, strict=True))
 
-    def hidden(self) -> HiddenBySplatter | None:
+    def hidden(self) -> HiddenRule | None:
         """The rule for hidden samples of a view."""
         first, settings = self.scenes[0], self.settings
         gradient = first.context.engine.differentiates
@@ -98,7 +98,7 @@ class Sampling(NamedTuple):
         return first.hidden_by(settings.splatter, settles=True)
 
     def of_part(
-        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, hidden: HiddenBySplatter | None
+        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, hidden: HiddenRule | None
     ) -> tuple[Samples, Array, Array]:
         """The needed samples of a part in all views, by one call to the host.
 
@@ -312,9 +312,7 @@ def _drawn(
     return fragments, covered
 
 
-def decided_in_views(
-    hidden: HiddenBySplatter | None, picture: Picture, question: Question
-) -> tuple[Decision, np.ndarray]:
+def decided_in_views(hidden: HiddenRule | None, picture: Picture, question: Question) -> tuple[Decision, np.ndarray]:
     """Decide on the samples (K, height, width) of views; also the scales (B,) with which depths are compared.
 
     Args:
@@ -322,7 +320,7 @@ def decided_in_views(
         picture: the layout of the views.
         question: the samples of the picture.
     """
-    covered, depth, size = question
+    covered, depth, size, _ = question
     far = _largest(depth, picture)
     scales = depth_scales(far)
     if hidden is None:
@@ -333,7 +331,7 @@ def decided_in_views(
         return Decision(covered, settled, covered), scales
     if (scales != 1).any():
         depth = depth * _factors(scales, picture, depth.dtype)
-    return replace(hidden, size=0.0).decide(Question(covered, depth)), scales
+    return hidden.unsized().decide(question._replace(depth=depth, size=0.0)), scales
 
 
 def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:

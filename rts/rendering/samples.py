@@ -20,7 +20,7 @@ from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.fine_samples import Where, fine_samples
-from rts.sampling.hidden import HiddenBySplatter, with_layers_that_count, without_hidden
+from rts.sampling.hidden import HiddenRule, with_layers_that_count, without_hidden
 from rts.sampling.merging import merge
 from rts.sampling.prepared import Prepared
 from rts.sampling.sample_checks import check_samples
@@ -106,7 +106,7 @@ def _on_one_grid(
     size: tuple[int, int],
     settings: RenderSettings,
     side: int,
-    hidden: HiddenBySplatter | None,
+    hidden: HiddenRule | None,
     exits: bool = True,
 ) -> Sampled:
     """The samples of side² cells a pixel; with `exits`, also exits where the splatter reads them."""
@@ -145,7 +145,7 @@ def with_fine(
     size: tuple[int, int],
     coarse: Sampled,
     settings: RenderSettings,
-    hidden: HiddenBySplatter | None,
+    hidden: HiddenRule | None,
     colors: np.ndarray | None = None,
 ) -> Sampled:
     """Coarse samples, and fine ones at outlines and, if `colors` (N, 4) of coarse samples are given, at contrasts."""

@@ -10,7 +10,7 @@ from rts.arrays.trees import Tree
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
 from rts.contracts.splatter import Splatter
-from rts.sampling.hidden import HiddenBySplatter, hidden_by
+from rts.sampling.hidden import HiddenRule, hidden_by
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import warn_of_winding
 from rts.scene.camera import Camera
@@ -60,7 +60,7 @@ class Scene(NamedTuple):
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
 
-    def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenBySplatter | None:
+    def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenRule | None:
         """The decider on hidden samples; None to keep all. See `rts.sampling.hidden.hidden_by`."""
         return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
 

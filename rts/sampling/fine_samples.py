@@ -13,7 +13,7 @@ from rts.arrays.engines import engine_of
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
-from rts.sampling.hidden import HiddenBySplatter, planned, with_layers_that_count
+from rts.sampling.hidden import HiddenRule, planned, with_layers_that_count
 from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
 
@@ -54,7 +54,7 @@ def fine_samples(
     grid: FineGrid,
     where: Where,
     take: Callable[..., Sampled],
-    hidden: HiddenBySplatter | None,
+    hidden: HiddenRule | None,
     layers: int | Literal["auto"],
     capacity: int | None,
     flat: bool,

@@ -20,7 +20,7 @@ from rts.arrays.engines import Engine, constants, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import ArraySpec, Cells, Decision, Fine, Question, Sampled, Samples
-from rts.sampling.hidden import HiddenBySplatter, numbers_of
+from rts.sampling.hidden import HiddenRule, numbers_of
 
 STRIP = 16
 """Approximate lines of fine cells in a strip without its apron: fewer mean more aprons, more mean more empty cells."""
@@ -220,7 +220,7 @@ class HiddenInStrips:
         layout: the layout, on the host.
     """
 
-    rule: HiddenBySplatter
+    rule: HiddenRule
     layout: Layout
 
     @property
@@ -237,12 +237,16 @@ class HiddenInStrips:
         """See `Hidden`; cells are (K, L, LINE)."""
         from rts.sampling import strips_loops
 
-        covered, depth, size = question
+        covered, depth, size, part = question
         layers, (place, wanted) = len(covered), (self.layout.place, self.layout.wanted)
         lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
         laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
         parallel(strips_loops.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
-        kept, settled, asked = self.rule.decide(Question(laid, deep, size), wanted)
+        if part is not None:
+            number, owner = read_only(part, depth.dtype).reshape(layers, -1), np.empty_like(deep)
+            parallel(strips_loops.gather, layers * len(place), lists[0], number, place, laid, owner, work=2 * laid.size)
+            part = owner.astype(np.int32)
+        kept, settled, asked = self.rule.decide(Question(laid, deep, size, part), wanted)
         needed = covered
         if asked is not laid:
             needed = np.concatenate([covered[:1], self._listed(asked[1:], covered[1:], self.layout.kinds)])

@@ -1,0 +1,229 @@
+"""Translucent layers: what is seen through them, and how their edges move; closed forms, and compiled loops."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from helpers import ALL, arrays, derivative, icosphere, low_passed, mesh_part, quad, splats_of, to_numpy
+from test_splatting import random_scene
+
+import rts
+from rts.splatting import Visible
+from rts_backends.fused import splatters as fused
+
+pytestmark = pytest.mark.splatting
+
+BOTH = [Visible, fused.Visible]
+CAMERA = rts.Camera.look_at((0.1, 0.2, 6), (0, 0, 0), (0.21, 1, 0), fov_y=30)
+"""Edges of upright cards are aslant in its images."""
+
+
+def card(z, color, alpha, **sides):
+    """A rectangle of one colour that faces +z."""
+    vertices, faces = quad(**sides, z=z)
+    colors = np.tile(np.float32([*color, alpha]), (4, 1))
+    shader = rts.plugin("shaders", "unlit")(opaque=alpha == 1)
+    return mesh_part((vertices, faces), theta={"colors": colors}, shader=shader)
+
+
+def ball(alpha, color=(0.2, 0.9, 0.4), radius=0.8):
+    vertices, faces = icosphere(4)
+    colors = np.tile(np.float32([*color, alpha]), (len(vertices), 1))
+    shader = rts.plugin("shaders", "unlit")(opaque=alpha == 1)
+    return mesh_part(((vertices * radius).astype(np.float32), faces), theta={"colors": colors}, shader=shader)
+
+
+def backdrop(z=-0.5):
+    """A large card, each corner of another colour."""
+    part = card(z, (0, 0, 0), 1, left=-3, right=3, bottom=-3, top=3)
+    part.theta["colors"] = np.float32([[0.1, 0.2, 0.3, 1], [0.9, 0.3, 0.2, 1], [0.8, 0.9, 0.1, 1], [0.2, 0.8, 0.9, 1]])
+    return part
+
+
+def translucent(layers, seed, dtype=np.float64, **options):
+    """A random scene whose layers let light through."""
+    positions, rgba, row = random_scene(layers, seed=seed, **options)
+    return splats_of(positions.astype(dtype), rgba.astype(dtype), row, opaque=False)
+
+
+def on(splats, positions, rgba):
+    """Splats with other positions and colours, in arrays of their engine."""
+    row = rts.engine_of(positions).constant(splats.row)
+    return splats.replace(positions=positions, rgba=rgba, cells=dataclasses.replace(splats.cells, row=row))
+
+
+def sorted_over(colors):
+    """Premultiplied colours (K, 4), front to back, over one another."""
+    image = np.zeros(4)
+    for color in reversed(colors):
+        image = color + (1 - color[3]) * image
+    return image
+
+
+# ------------------------------------------------------------------------------------------------------ order
+
+
+@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("target", ALL)
+def test_red_and_green_glass_before_blue(kind, target):
+    parts = [card(0.5, (1, 0, 0), 0.5), card(0.0, (0, 1, 0), 0.5), card(-0.5, (0, 0, 1), 1)]
+    parts = [part.replace(theta=arrays(target, part.theta)) for part in parts]
+    image = to_numpy(rts.render(parts, CAMERA, (24, 24), layers=4, splatter=kind()))
+    np.testing.assert_allclose(image[12, 12], (0.5, 0.25, 0.25, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_cards_in_any_order_of_parts_are_sorted(kind):
+    rng = np.random.default_rng(0)
+    colors = rng.random((8, 3))
+    cards = [card(1 - 0.25 * k, colors[k], 0.3) for k in range(8)]
+    expected = sorted_over([np.append(0.3 * c, 0.3) for c in colors])
+    for _ in range(3):
+        parts = [cards[k] for k in rng.permutation(8)]
+        image = rts.render(parts, CAMERA, (24, 24), layers=8, splatter=kind())
+        np.testing.assert_allclose(image[8:16, 8:16], np.broadcast_to(expected, (8, 8, 4)), atol=1e-6)
+
+
+def test_either_card_of_a_pair_that_crosses_is_in_front_on_its_side():
+    aslant = mesh_part(
+        (np.float32([(-1, -1, -1), (1, -1, 1), (1, 1, 1), (-1, 1, -1)]), quad()[1]),
+        theta={"colors": np.tile(np.float32([1, 0, 0, 0.5]), (4, 1))},
+        shader=rts.plugin("shaders", "unlit")(opaque=False),
+    )
+    image = rts.render([card(0, (0, 1, 0), 0.5), aslant], rts.Camera.look_at((0, 0, 6), (0, 0, 0)), (32, 32))
+    np.testing.assert_allclose(image[16, 13], (0.25, 0.5, 0, 0.75), atol=1e-6)
+    np.testing.assert_allclose(image[16, 18], (0.5, 0.25, 0, 0.75), atol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------------- opaque
+
+
+@pytest.mark.parametrize("layers", [1, 2, 4])
+@pytest.mark.parametrize("seed", range(3))
+def test_opaque_stacks_are_those_of_opaque_layers(layers, seed):
+    splats = translucent(layers, seed)
+    splats.rgba[:, 3] = 1
+    positions, rgba = arrays("torch-cpu", (splats.positions, splats.rgba), np.float64)
+    tangent = arrays("torch-cpu", np.random.default_rng(seed).normal(size=positions.shape), np.float64)
+    (image, change), (expected, expected_change) = (
+        derivative(
+            "torch-cpu",
+            lambda p, opaque=opaque: Visible().image(on(splats.replace(opaque=opaque), p, rgba)),
+            positions,
+            tangent,
+        )
+        for opaque in (False, True)
+    )
+    np.testing.assert_array_equal(image, expected)
+    np.testing.assert_allclose(change, expected_change, atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------------------- compiled
+
+
+def agree(splats, seed=0):
+    """The compiled image, its gradients and its tangent are those of the specification."""
+    torch = pytest.importorskip("torch")
+    rng = np.random.default_rng(seed)
+    given = arrays("torch-cpu", (splats.positions, splats.rgba), np.float64)
+    along = arrays("torch-cpu", tuple(rng.normal(size=x.shape) for x in given), np.float64)
+    results = []
+    for kind in BOTH:
+
+        def image(positions, rgba, kind=kind):
+            return kind().image(on(splats, positions, rgba))
+
+        value, pull = torch.func.vjp(image, *given)
+        weights = arrays("torch-cpu", np.random.default_rng(1).normal(size=value.shape), np.float64)
+        results.append((value, *pull(weights), torch.func.jvp(image, given, along)[1]))
+    for found, expected in zip(*map(to_numpy, results), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * max(1, np.abs(expected).max()))
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3, 6])
+def test_compiled_they_are_those_of_the_specification(layers):
+    for seed in range(4):
+        agree(translucent(layers, seed), seed)
+
+
+@functools.cache
+def scene():
+    return [card(0.5, (1, 0.1, 0.1), 0.5, right=0.13), card(0, (0.1, 1, 0.1), 0.5, left=-0.41), ball(0.5), backdrop(-1)]
+
+
+@pytest.mark.parametrize("supersample", [1, 2])
+def test_compiled_images_of_smooth_scenes_are_those_of_the_specification(supersample):
+    torch = pytest.importorskip("torch")
+
+    def image(move, kind):
+        parts = [part.replace(transform=rts.rigid(move)) for part in scene()[:3]]
+        return rts.render([*parts, scene()[3]], CAMERA, (24, 24), layers=6, splatter=kind(), supersample=supersample)
+
+    move = torch.zeros(6)
+    results = [derivative("torch-cpu", lambda m, k=kind: image(m, k), move, torch.ones(6)) for kind in BOTH]
+    np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-5)
+    np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-4 * np.abs(results[1][1]).max())
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_gradients_of_colour_and_alpha_are_finite_differences(kind):
+    splats = translucent(3, 1)
+    weights, step = np.random.default_rng(0).normal(size=(5, 6, 4)), 1e-6
+    positions, rgba = arrays("torch-cpu", (splats.positions, splats.rgba), np.float64)
+    found = to_numpy(
+        pytest.importorskip("torch").func.grad(
+            lambda c: (kind().image(on(splats, positions, c)) * arrays("torch-cpu", weights, np.float64)).sum()
+        )(rgba)
+    )
+    for i, c in [(0, 0), (3, 3), (7, 1), (9, 3), (20, 3)]:
+        ends = []
+        for sign in (-1, 1):
+            moved = splats.rgba.copy()
+            moved[i, c] += sign * step
+            ends.append((kind().image(splats.replace(rgba=moved)) * weights).sum())
+        assert found[i, c] == pytest.approx((ends[1] - ends[0]) / (2 * step), abs=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------------ edges
+
+
+def test_a_glass_ball_keeps_its_coverage():
+    image, solid = (rts.render(ball(alpha), CAMERA, (48, 48), layers=2) for alpha in (0.5, 1))
+    # Front and back of alpha ½ let a quarter through, at the outline, too.
+    assert image[..., 3].sum() == pytest.approx(0.75 * solid[..., 3].sum(), rel=0.003)
+    assert image[..., 3].max() == pytest.approx(0.75, abs=1e-6)
+
+
+EDGES = {
+    "the upper of two cards": (scene()[:2], 0),
+    "the lower of two cards": (scene()[:2], 1),
+    "a ball": ([ball(0.5)], 0),
+    "a card behind a ball": (
+        [ball(0.5), card(-1.2, (0.9, 0.2, 0.1), 1, left=-0.3, right=0.5, bottom=-0.4, top=0.3)],
+        1,
+    ),
+}
+
+
+@pytest.mark.parametrize("supersample, most", [(1, 0.06), (2, 0.04)])
+@pytest.mark.parametrize("name", EDGES)
+def test_edges_move_as_areas_do(name, supersample, most):
+    torch = pytest.importorskip("torch")
+    parts, index = EDGES[name]
+    parts, size = [*parts, backdrop(-1.5)], (96, 96)
+    pixel = 3.2 / size[0]
+
+    def image(step, **options):
+        move = step * torch.tensor([0, 0, 0, pixel, pixel / 2, 0])
+        moved = [p.replace(transform=rts.rigid(move)) if i == index else p for i, p in enumerate(parts)]
+        return rts.render(moved, CAMERA, size, layers=4, **options)
+
+    ends = [to_numpy(image(torch.tensor(step), splatter="none", supersample=16)) for step in (-0.5, 0.5)]
+    expected = low_passed((ends[1] - ends[0])[..., :3])
+    _, change = derivative(
+        "torch-cpu", functools.partial(image, supersample=supersample), torch.zeros(()), torch.ones(())
+    )
+    found = low_passed(change[..., :3])
+    assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
+    assert (found * expected).sum() / (expected**2).sum() == pytest.approx(1, abs=0.025)
