@@ -255,6 +255,7 @@ def test_auto_of_an_empty_view_takes_one_layer():
 
 def test_auto_says_what_is_beyond_its_limit(monkeypatch):
     parts = [card(-0.1 * i, 0.5 + 0.02 * i, 0.02 * i) for i in range(12)]
+    monkeypatch.setattr(hidden, "LAYER_LIMIT", 8)
     with pytest.warns(rts.errors.LayersWarning, match="more than the 8 layers") as warned:
         sampled = rts.sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
     assert warned[0].filename == __file__

@@ -111,10 +111,10 @@ def opaque_layers(mended):
 
 
 def transparent(mended):
-    """A pane behind a pane, for which the default splatter is not made."""
+    """A pane behind a pane, of which `single` shows the front alone."""
     panes = [card(-9.2, 8.3, -8.4, 8.1, 5, BLUE), card(-5.3, 4.2, -4.4, 4.1, 0, RED)]
     panes = [p.replace(shader=glass) for p in panes]
-    return lambda p: ([panes[0], moved(panes[1], p)], CAMERA), ZERO, {"splatter": "multi"} if mended else {}
+    return lambda p: ([panes[0], moved(panes[1], p)], CAMERA), ZERO, {} if mended else {"splatter": "single"}
 
 
 def outlines(mended):

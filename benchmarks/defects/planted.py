@@ -255,8 +255,8 @@ ARRAYS = [
     Defect(
         "hidden samples are dropped behind glass",
         "rts/sampling/hidden.py",
-        " or not all(p.shader.opaque for p in parts):",
-        ":",
+        "return rule if opaque.all() else HiddenBehindOpaque(rule, opaque)",
+        "return rule",
         "pruning rendering",
     ),
     Defect(

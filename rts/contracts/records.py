@@ -339,7 +339,7 @@ def _first_part(row: Array) -> Array:
     return namespace(row).clip(row, None, 0)
 
 
-@record(static=("border", "one_part"))
+@record(static=("border", "one_part", "opaque"))
 class Splats(_OnCells):
     """Shaded samples in their cells, the input of a splatter.
 

@@ -51,7 +51,7 @@ def render(
         sampler: name or object of a `Sampler`.
         splatter: name or object of a `Splatter`.
         layers: K, the number of surface layers kept at each pixel. With "auto" it is the number that the image needs
-            where surfaces hide one another, up to 8 (a warning says if more are needed).
+            where surfaces hide one another, up to 16 (a warning says if more are needed).
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
             bands of rows, so that memory stays bounded; for a gradient each band is then rendered twice. An
             `rts.Adaptive` takes s² samples only at outlines, and renders without bands.

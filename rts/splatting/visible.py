@@ -1,4 +1,4 @@
-"""The splatter `Visible`: `Multi` with a calibrated derivative, where opaque layers hide each other."""
+"""The splatter `Visible`: `Multi` with a calibrated derivative, where layers of one source hide each other."""
 
 from __future__ import annotations
 
@@ -40,6 +40,9 @@ class Visible(Kernel):
     such sources the buffer is empty.
 
     Closed surfaces need no culling, if K reaches through their back faces to the layers behind.
+
+    If samples may be translucent (`Splats.opaque` is False), the same rule goes on behind each layer (`stacks.py`).
+    Lines of crossing then move as samples do.
 
     Attributes:
         rims: whether coverage moves as outlines do, extrapolated from the samples inside of them (`rims.py`). Otherwise

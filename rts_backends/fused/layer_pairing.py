@@ -127,10 +127,10 @@ def choose(
                 _sides(sides, facing, y, x)
             for n in range(9):
                 shift[n], off = _pairing(z, n, target, sides)
-                if visible and shift[n] != 0:
-                    empty = row[0, y, x] < 0
-                    if empty or _continues(positions, row, y, x, n, z[0], continued * off):
-                        shift[n] = 0
+                if visible and shift[n] != 0 and row[0, y, x] < 0:
+                    shift[n] = 0
+                if visible and shift[n] != 0 and _continues(positions, row, y, x, n, z[0], continued * off):
+                    shift[n] = 0
             if visible:
                 _choose_visible(choices[d], shift, z, row, y, x, target)
             else:

@@ -82,7 +82,7 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
         np.empty(9, np.int64),
         np.empty(9, np.int64),
     )
-    nominal, zero = np.empty(9, grid.positions.dtype), kind(0)
+    nominal = np.empty(9, grid.positions.dtype)
     for n in range(9):
         u, v = kind(n % 3 - 1), kind(n // 3 - 1)
         nominal[n] = math.exp(-(u * u + v * v) * grid.scale)
@@ -91,31 +91,43 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
         nominal[n] /= whole
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
-            x = columns[d]
-            _load(depths, sides, counts, grid, facing, beyond, y, x)
+            _load(depths, sides, counts, grid, facing, beyond, y, columns[d])
             first[:], joins[:] = 0, 0
-            levels = layers
+            stacks.levels[d] = layers
             for t in range(layers):
-                share, some = zero, False
-                for n in range(9):
-                    if joins[n] <= t:
-                        share += nominal[n]
-                        some |= first[n] < counts[n]
-                if not some:
-                    levels = t
+                share = _share(t, counts, first, joins, nominal)
+                if share < 0:
+                    stacks.levels[d] = t
                     break
-                for n in range(9):
-                    if joins[n] <= t and first[n] < counts[n]:
-                        if t == 0 and ranges[d, n, 1, 1] > ranges[d, n, 1, 0]:
-                            shift[n] = ranges[d, n, 1, 0]
-                        else:
-                            shift[n] = _pair(depths, sides, len(facing) > 0, counts, n, t, first[n], t == 0)
+                _shift(shift, t, d, ranges, depths, sides, len(facing) > 0, counts, first, joins)
                 _plan(stacks, d, t, depths, counts, first, joins, shift)
                 stacks.least[d, t] = kind(1) if t == 0 else share
-                _sum(stacks, d, t, grid, counts, y, x, t == layers - 1)
+                _sum(stacks, d, t, grid, counts, y, columns[d], t == layers - 1)
                 _advance(t, layers, counts, first, joins, shift)
-            stacks.levels[d] = levels
-            _composite(stacks, d, levels)
+            _composite(stacks, d, stacks.levels[d])
+
+
+@compiled
+def _share(t, counts, first, joins, nominal):
+    """The share of the weights of sources that take part in level t; −1 if none has a layer left."""
+    share, some = nominal.dtype.type(0), False
+    for n in range(9):
+        if joins[n] <= t:
+            share += nominal[n]
+            some |= first[n] < counts[n]
+    return share if some else -nominal.dtype.type(1)
+
+
+@compiled
+def _shift(shift, t, d, ranges, depths, sides, told, counts, first, joins):
+    """Fill the numbers s of sources that take part in level t."""
+    for n in range(9):
+        if joins[n] > t or first[n] >= counts[n]:
+            continue
+        if t == 0 and ranges[d, n, 1, 1] > ranges[d, n, 1, 0]:
+            shift[n] = ranges[d, n, 1, 0]
+        else:
+            shift[n] = _pair(depths, sides, told, counts, n, t, first[n], t == 0)
 
 
 @compiled
@@ -304,8 +316,7 @@ def forward(start, stop, offsets, columns, images, border, image):
 def adjoint(start, stop, offsets, columns, stacks, border, g, adjoints):
     """Fill the gradients (M, K, 3, 5) of the sums that are not normalised, from the image's (H, W, 4)."""
     levels, sums, images, least = stacks.levels, stacks.sums, stacks.images, stacks.least
-    zero, one = g.dtype.type(0), g.dtype.type(1)
-    own, below = np.empty(4, g.dtype), np.empty(4, g.dtype)
+    zero, own, below = g.dtype.type(0), np.empty(4, g.dtype), np.empty(4, g.dtype)
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d]
@@ -313,42 +324,53 @@ def adjoint(start, stop, offsets, columns, stacks, border, g, adjoints):
             for c in range(4):
                 own[c] = g[y - border, x - border, c] if inside else zero
             for t in range(levels[d]):
-                a = adjoints[d, t]
-                coverage, alpha = min(sums[d, t, 1, 4] / least[d, t], one), sums[d, t, 1, 3]
-                shown, front, surface, covered = one - sums[d, t, 0, 3], zero, zero, zero
-                for c in range(4):
-                    h = own[c]
-                    front += h * _under(sums, images, coverage, d, t, c)
-                    h *= shown
-                    surface += h * images[d, t + 1, c]
-                    covered += h * (images[d, t + 1, c] - sums[d, t, 2, c])
-                    a[0, c], a[1, c], a[2, c] = own[c], h, (one - coverage) * h
-                    below[c] = (coverage - alpha) * h
-                a[0, 3] -= front
-                a[1, 3] -= surface
-                for b in range(3):
-                    full = sums[d, t, b, 4] >= least[d, t]
-                    over, dot = one / max(sums[d, t, b, 4], least[d, t]), zero
-                    for c in range(4):
-                        dot += a[b, c] * sums[d, t, b, c]
-                        a[b, c] *= over
-                    a[b, 4] = -dot * over if full else covered * over if b == 1 else zero
+                _adjoint_level(adjoints[d, t], d, t, sums, images, least, own, below)
                 own[:] = below
+
+
+@compiled
+def _adjoint_level(a, d, t, sums, images, least, own, below):
+    """Fill the gradients (3, 5) of a level's sums from that of its image (4,), and that of the next level's."""
+    zero, one = own.dtype.type(0), own.dtype.type(1)
+    coverage, alpha = min(sums[d, t, 1, 4] / least[d, t], one), sums[d, t, 1, 3]
+    shown, front, surface, covered = one - sums[d, t, 0, 3], zero, zero, zero
+    for c in range(4):
+        h = own[c]
+        front += h * _under(sums, images, coverage, d, t, c)
+        h *= shown
+        surface += h * images[d, t + 1, c]
+        covered += h * (images[d, t + 1, c] - sums[d, t, 2, c])
+        a[0, c], a[1, c], a[2, c] = own[c], h, (one - coverage) * h
+        below[c] = (coverage - alpha) * h
+    a[0, 3] -= front
+    a[1, 3] -= surface
+    for b in range(3):
+        full = sums[d, t, b, 4] >= least[d, t]
+        over, dot = one / max(sums[d, t, b, 4], least[d, t]), zero
+        for c in range(4):
+            dot += a[b, c] * sums[d, t, b, c]
+            a[b, c] *= over
+        a[b, 4] = -dot * over if full else covered * over if b == 1 else zero
 
 
 @loop
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
     """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
-    layers, height, width = grid.row.shape
+    layers, height, _ = grid.row.shape
     behind = np.empty((layers + 1, 4), grid.positions.dtype)
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
-                for u in range(-1, 2):
-                    x, n = columns[d] - u, 3 * (v + 1) + u + 1
-                    if 0 <= x < width:
-                        for t in range(stacks.levels[d]):
-                            _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba)
+                _pull_target(d, columns[d], v, grid, y, stacks, adjoints, behind, g_positions, g_rgba)
+
+
+@compiled
+def _pull_target(d, column, v, grid, y, stacks, adjoints, behind, g_positions, g_rgba):
+    """`pull` from one target, v rows farther on, to its sources in row y."""
+    for u in range(-1, 2):
+        x, n = column - u, 3 * (v + 1) + u + 1
+        for t in range(stacks.levels[d] if 0 <= x < grid.row.shape[2] else 0):
+            _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba)
 
 
 @compiled
@@ -434,9 +456,8 @@ def _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba):
                 if k == first:
                     change[b, 4] += dw
                 for c in range(4):
-                    change[b, c] += (d_through * w + through * dw) * rgba[i, c]
-                    if tinted:
-                        change[b, c] += through * w * t_rgba[direction, i, c]
+                    tint = through * w * t_rgba[direction, i, c] if tinted else zero
+                    change[b, c] += (d_through * w + through * dw) * rgba[i, c] + tint
                 d_through *= one - rgba[i, 3]
                 if tinted:
                     d_through -= through * t_rgba[direction, i, 3]

@@ -157,27 +157,33 @@ def adjoint(start, stop, straight, border, g, adjoints):
 @loop
 def pull(start, stop, grid, straight, adjoints, g_positions, g_rgba):
     """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
-    rgba, height = grid.rgba, grid.row.shape[1]
-    slope = grid.positions.dtype.type(2) * grid.scale * grid.gamma
+    height = grid.row.shape[1]
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(straight.offsets[y + v], straight.offsets[y + v + 1]):
-                for t in range(straight.levels[d]):
-                    red, green, blue = adjoints[d, t, 0], adjoints[d, t, 1], adjoints[d, t, 2]
-                    alpha, weight = adjoints[d, t, 3], adjoints[d, t, 4]
-                    for u in range(-1, 2):
-                        x = straight.columns[d] - u
-                        i = grid.row[t, y, x]
-                        w, dx, dy = splat(grid, i, y, x, u, v)
-                        if len(g_rgba) > 0:
-                            g_rgba[i, 0] += w * red
-                            g_rgba[i, 1] += w * green
-                            g_rgba[i, 2] += w * blue
-                            g_rgba[i, 3] += w * alpha
-                        if len(g_positions) > 0:
-                            h = weight + red * rgba[i, 0] + green * rgba[i, 1] + blue * rgba[i, 2] + alpha * rgba[i, 3]
-                            g_positions[i, 0] += slope * w * h * dx
-                            g_positions[i, 1] += slope * w * h * dy
+                levels, column = straight.levels[d], straight.columns[d]
+                _pull_target(d, levels, column, v, grid, y, adjoints, g_positions, g_rgba)
+
+
+@compiled
+def _pull_target(d, levels, column, v, grid, y, adjoints, g_positions, g_rgba):
+    """`pull` from one target, v rows farther on, to its sources in row y."""
+    rgba, row, slope = grid.rgba, grid.row, grid.positions.dtype.type(2) * grid.scale * grid.gamma
+    for t in range(levels):
+        red, green, blue = adjoints[d, t, 0], adjoints[d, t, 1], adjoints[d, t, 2]
+        alpha, weight = adjoints[d, t, 3], adjoints[d, t, 4]
+        for u in range(-1, 2):
+            i = row[t, y, column - u]
+            w, dx, dy = splat(grid, i, y, column - u, u, v)
+            if len(g_rgba) > 0:
+                g_rgba[i, 0] += w * red
+                g_rgba[i, 1] += w * green
+                g_rgba[i, 2] += w * blue
+                g_rgba[i, 3] += w * alpha
+            if len(g_positions) > 0:
+                h = weight + red * rgba[i, 0] + green * rgba[i, 1] + blue * rgba[i, 2] + alpha * rgba[i, 3]
+                g_positions[i, 0] += slope * w * h * dx
+                g_positions[i, 1] += slope * w * h * dy
 
 
 @loop

@@ -161,13 +161,13 @@ def _outlines(case: _Case, touched: Touched) -> None:
 
 def _transparent(case: _Case, touched: Touched) -> None:
     """Name shaders that are not opaque under a splatter that takes them to be."""
-    if case.subject.opaque or case.subject.splats_as("multi"):
+    if case.subject.opaque or case.subject.splats_as("visible"):
         return
-    before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
+    before, advice = case.try_out(splatter="visible"), "Say splatter='visible'."
     if before is None:
-        before, advice = case.try_out(splatter="multi", layers=DEEP), f"Say splatter='multi', layers={DEEP}."
+        before, advice = case.try_out(splatter="visible", layers=DEEP), f"Say splatter='visible', layers={DEEP}."
     if before is not None:
-        because = "shaders are not opaque, but the splatter shows the front of what it covers"
+        because = "shaders are not opaque, but the splatter loses what shines through layers"
         case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
 
 
