@@ -196,7 +196,7 @@ def _sort(sheets, row, mixed, ranges, m, around, y, x):
 
 @compiled
 def _incline(slopes, sheets, z, gap, y, x):
-    """Fill the slopes of the sheets a and b, each along x and y; False if no sorted neighbour along an axis has both."""
+    """Fill the slopes of sheets a and b, each along x and y; False if no sorted neighbour along an axis has both."""
     for axis in range(2):
         # The sources ahead and behind.
         ahead, behind = (3, 5) if axis == 0 else (1, 7)

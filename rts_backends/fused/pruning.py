@@ -162,7 +162,7 @@ def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2,
 
 @compiled
 def _near(z, r, x, margin):
-    """True if, for some source, a hidden layer pairs about as near as the two fronts; comparisons with NaN are false."""
+    """True if a hidden layer pairs with some source about as near as the fronts do; comparisons with NaN are false."""
     target = z[0, r, x + 1]
     for n in range(9):
         source = z[0, r - 1 + n // 3, x + n % 3]
