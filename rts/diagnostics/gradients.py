@@ -40,7 +40,7 @@ class GradientImage(NamedTuple):
 
     Attributes:
         derivative: (H, W, C) float, change of the image for a unit step along the direction.
-        scale: the change that the picture shows at full strength.
+        scale: the change that the picture shows as full white; its negative is black.
     """
 
     derivative: np.ndarray
