@@ -62,7 +62,7 @@ def places(vertices, faces):
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Test triangle `t` at a pixel position: True if it covers it; least barycentric, depth, first two barycentrics.
 
-    The least barycentric is −∞ if the triangle is culled, has no area or is clipped there.
+    The least barycentric is −∞ if the triangle is culled or has no area, or lies behind the eye or is clipped there.
     """
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)

@@ -1,4 +1,4 @@
-"""Claims about proxies, the triangles that stand for a surface."""
+"""Claims about proxies, the triangles by which samplers find a surface."""
 
 from __future__ import annotations
 

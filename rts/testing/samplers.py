@@ -292,7 +292,7 @@ class SamplerConformance(Conformance):
                 claim(same.mean() >= 0.99, f"in {engine}{how}, {np.sum(~same)} of {same.size} cells are not NumPy's")
 
     def test_engines_agree(self, sampler: Any, parts: list[Part]) -> None:
-        """Engines agree on image, gradient and derivative along a direction, each at samples of its own."""
+        """Engines agree on image, gradient and derivative along a direction, each at the samples that it finds."""
         part = parts[0]
         values, join = split(part.theta)
 

@@ -55,7 +55,7 @@ UNSEEN = {"behind the camera": AWAY, "beside the image": BESIDE}
 
 
 def mesh(vertices: Any, faces: Any, **options: Any) -> Part:
-    """A mesh as a part."""
+    """A part that is a triangle mesh."""
     surface = registry.plugin("rts.surfaces", "mesh")(faces)
     return Part(surface, {"vertices": np.asarray(vertices, np.float32)}, **options)
 

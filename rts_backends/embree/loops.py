@@ -62,7 +62,7 @@ def _call(typing_context, function, a, b, c):
 
 @_intrinsic
 def _pointer(typing_context, address):
-    """An integer as a pointer."""
+    """A pointer from an address, an integer."""
 
     def generate(context, builder, signature, arguments):
         return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
@@ -177,7 +177,7 @@ def _keep_nearest(arguments):
 
 
 def keep_nearest_address() -> int:
-    """Address of the intersection filter."""
+    """Address of the intersection filter, for Embree to call."""
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
@@ -205,8 +205,8 @@ def cast(
         faces: (T, 3).
         owners: see `Covers`.
         margins: (T,), see `Covers`.
-        width: of the image.
-        height: of the image.
+        width: the image's width.
+        height: the image's height.
         cells: (M,) int32, flat indices of the pixels to cast rays through, −1 for none; empty for all H · W pixels.
         triangle_ids: (K, M or H · W) to fill.
         barycentrics: (K, M or H · W, 2) to fill.

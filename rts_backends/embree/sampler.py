@@ -46,10 +46,10 @@ class Structure:
 
 
 class Embree(TriangleSampler):
-    """K nearest hits a pixel by an intersection filter, decided in float64 as the rasterizer decides."""
+    """Sampler that casts rays: K nearest hits a pixel, tested in float64 by the rules of the sampler "raster"."""
 
     def prepare(self, proxy: Proxy) -> Structure:
-        """Build the acceleration structure."""
+        """Build Embree's acceleration structure of a proxy."""
         return Structure(super().prepare(proxy))
 
     def update(self, prepared: Structure, proxy: Proxy) -> Structure | None:

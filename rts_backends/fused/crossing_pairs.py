@@ -212,7 +212,7 @@ def _find(start, stop, z, gap, most, rules, candidates, bits, some):
 
 @compiled
 def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, that a cell of a window of rows belongs to."""
+    """Find pairs, or `candidates`, of which one cell is (y, x) of a window of rows."""
     rows, width = z.shape[1:]
     for n in range(8):
         u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]

@@ -90,14 +90,16 @@ OUTWARD = np.array([_ordered(bits) for bits in range(LISTED)], np.int8)
 
 @loop
 def narrow(start, stop, ends, wanted, kept, counts):
-    """Copy `ends` to `kept` in rows [start, stop), less marks at targets neither wanted nor beside wanted ones.
+    """Copy `ends` to `kept` in rows [start, stop), without LISTED at targets that are not wanted.
+
+    Of these, targets beside wanted ones that are LISTED get the mark BESIDE.
 
     Args:
         start: first row.
         stop: end of the rows.
         ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`.
-        wanted: (H, W) uint8, 1 for targets whose colour is wanted.
-        kept: (H, W) uint16, to be filled as `ends`, and with marks BESIDE.
+        wanted: (H, W) uint8, not 0 for targets whose colour is wanted.
+        kept: (H, W) uint16, to be filled.
         counts: (H,), to be filled with the number of listed targets.
     """
     height, width = ends.shape
@@ -409,7 +411,7 @@ def _pull(start, stop, row, outlines, border, g, first, g_positions):
 
 @compiled
 def _pull_rows(top, bottom, row, beta, partner, offsets, columns, gives, slopes, changes, border, g, g_positions):
-    """`pull` of some rows."""
+    """`pull` of the targets of rows [top, bottom)."""
     width, zero = g.shape[1], g_positions.dtype.type(0)
     for y in range(top, bottom):
         for d in range(offsets[y], offsets[y + 1]):

@@ -197,7 +197,7 @@ def fill(s, rgba, cells, states, left, count):
 
 @compiled
 def store(image, y, left, s, count):
-    """Write planes to a row of an image."""
+    """Write the four planes of colour of s to `count` cells of row y of an image, from column `left` on."""
     for j in range(count):
         for c in range(4):
             image[y, left + j, c] = s[c * PITCH + j]

@@ -158,10 +158,10 @@ class Visible(_Fused):
     """`rts.splatting.Visible`, compiled; see there for the settings.
 
     Attributes:
-        rims: whether coverage moves as outlines do.
-        crossings: whether lines of crossing move as depths say.
-        facing: whether opposite sides of one sheet are kept from pairing.
-        exits: whether outlines of culled parts move as the middles of their chords.
+        rims: True to have coverage move as outlines do.
+        crossings: True to have lines of crossing move as depths say.
+        facing: True to keep opposite sides of one sheet from pairing.
+        exits: True to have outlines of culled parts move as the middles of their chords.
     """
 
     kind = "visible"

@@ -259,7 +259,7 @@ def change_row(to, tangents, sources, total, layers, y, count, planes=COLORS):
 
 @compiled
 def add_tangent_row(to, s, tangent, v, count, planes=COLORS):
-    """The tangent of `add_row`."""
+    """Add a source row's tangents to the tangents of a buffer's row: the derivative of `add_row`."""
     wy, dv = s[WY + (v + 1) * PITCH :], s.dtype.type(v)
     for j in range(count):
         w0, w1, w2 = s[WX + 2 * PITCH + j] * wy[j], s[WX + PITCH + j + 1] * wy[j + 1], s[WX + j + 2] * wy[j + 2]

@@ -252,7 +252,7 @@ def _fill_ends(ends, partial, above, level, below):
 
 @compiled
 def _empty(kinds, x, n):
-    """Bit n where a cell is empty."""
+    """Bit n if the cell with index x in `kinds` is empty, else 0."""
     return np.uint16(kinds[x] & NOTHING) << n
 
 

@@ -81,7 +81,7 @@ class _Kept:
         self._lock, self._bytes = threading.Lock(), 0
 
     def add(self, kept: Any) -> int:
-        """Keep an object, and give its number."""
+        """Keep an object, and return its number; beyond `MOST_KEPT` bytes the oldest objects are dropped."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._found[number] = kept
@@ -155,7 +155,7 @@ class _Differentiable:
         return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:
-        """The result."""
+        """The operation's result."""
         return self._value(*operands, **params)[0]
 
     # ------------------------------------------------------------------------------------------ by compiled loops

@@ -165,7 +165,7 @@ class HostPrimitive:
     def _over_samples(
         self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
     ) -> tuple[list, list[int]]:
-        """Compute a batch whose items have samples of their own, item by item."""
+        """Compute a batch whose items differ in samples, item by item."""
         inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
         if not inner:
             results = self(*operands, **params)

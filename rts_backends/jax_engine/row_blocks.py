@@ -102,7 +102,7 @@ class _Pieces:
         self._total, self._size = self._rows[0].shape[0], first.shape[0]
 
     def zeros(self) -> jax.Array:
-        """Zeros in the shape of the value."""
+        """Zeros in the shape of the value of all rows, (N, ·)."""
         out: Any = self._jaxpr.outvars[0].aval
         return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
 

@@ -21,7 +21,7 @@ class UsedRows:
         self._record: dict[int, tuple[weakref.ref, jax.Array | np.int32]] = {}
 
     def note(self, x: jax.Array, used: jax.Array | np.int32) -> None:
-        """Record the number () int32 of rows in use of a traced array; arrays of known values need no record."""
+        """Record the number () int32 of rows in use of `x`, if `x` is traced; other arrays need no record."""
         if isinstance(x, Tracer):
             key = id(x)
             self._record[key] = weakref.ref(x, lambda _: self._record.pop(key, None)), used

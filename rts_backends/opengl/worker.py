@@ -1,4 +1,4 @@
-"""One thread that owns one headless OpenGL context: contexts belong to the thread that made them."""
+"""One thread that owns one headless OpenGL context: only the thread that made a context may use it."""
 
 from __future__ import annotations
 

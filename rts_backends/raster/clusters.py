@@ -59,7 +59,7 @@ class Clusters(NamedTuple):
 
     @classmethod
     def of(cls, proxy: Proxy) -> Clusters:
-        """The clusters of a proxy's triangles."""
+        """Sort a proxy's triangles into clusters."""
         vertices, faces = read_only(proxy.vertices, np.float32), read_only(proxy.faces, np.int32)
         count, clusters = len(faces), -(-len(faces) // SIZE)
         keys = np.empty(count, np.uint64)

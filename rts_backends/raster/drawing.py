@@ -28,7 +28,7 @@ corners; and their w + z and w − z of clip space."""
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
     """Fill the three fragment arrays (K, H · W), band by band.
 
-    `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `EVERYTHING`; `size` is (H, W).
+    `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `cells.EVERYTHING`; `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
     layers, (height, width), (table, numbers, bits) = len(triangle_ids), size, asked

@@ -211,7 +211,7 @@ class TorchEngine(Engine):
         return x
 
     def concurrent(self) -> bool:
-        """True unless a transform or inference mode is on: these belong to one thread."""
+        """True unless a transform or inference mode is on: torch sets these for one thread alone."""
         return not transformed() and not torch.is_inference_mode_enabled()
 
     def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:

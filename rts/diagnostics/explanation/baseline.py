@@ -1,4 +1,4 @@
-"""Baseline for a derivative's error: a similar sphere or box, moved alike, whose derivative is well known."""
+"""Baseline for a derivative's error: the error of a similar sphere or box, moved in the same manner."""
 
 from __future__ import annotations
 

@@ -53,8 +53,8 @@ class Looked(NamedTuple):
 
     Attributes:
         numbers: some numbers of each array, measured.
-        planned: how many numbers were to be measured.
-        rough: how many of `numbers` have fewer samples than asked for.
+        planned: count of the numbers that were to be measured.
+        rough: count of the `numbers` that have fewer samples than asked for.
     """
 
     numbers: list[Number]

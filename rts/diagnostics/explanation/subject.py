@@ -98,14 +98,14 @@ class Subject:
         return scene
 
     def drawn(self, scene: tuple[Any, Camera], change: Change | None = None, size: Any = None, **options: Any) -> Array:
-        """The image of parts and a camera, changed; an image in NumPy becomes a constant of the engine."""
+        """The image (H, W, 4) of a scene after a change; an image in NumPy becomes a constant of the engine."""
         parts, camera = scene if change is None else change(listed_parts(scene[0]), scene[1])
         image = render(parts, camera, size or self.size, **{**self.options, **options})
         check_colors(image.shape[-1] - 1)
         return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
 
     def image(self, parameters: Tree, change: Change | None = None, **options: Any) -> Array:
-        """The image (H, W, 4) of the scene at some parameters, changed."""
+        """The image (H, W, 4) of the scene at some parameters, after a change."""
         return self.drawn(self.shown(parameters), change, **options)
 
     def require_dependence(self) -> None:

@@ -77,5 +77,5 @@ def _thinner(part: np.ndarray, across: int) -> np.ndarray:
 
 
 def on_host(x: Any) -> np.ndarray:
-    """An array as NumPy."""
+    """An array of any engine as NumPy."""
     return engine_of(x).to_numpy(x)

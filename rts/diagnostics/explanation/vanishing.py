@@ -234,7 +234,7 @@ def _seen_by_blur(subject: Subject, number: Number) -> int | None:
 
 
 def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str, Finding]]:
-    """Combinations of numbers along which the image stays as it is, though each of them changes it."""
+    """Combinations of numbers along which the image does not change, though each number alone changes it."""
     numbers = [n for n in numbers if np.isfinite(n.pushed).all() and not is_quiet(n.pushed)]
     if len(numbers) < 2:
         return []

@@ -16,7 +16,7 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 CLEAR = 0.5
-"""Alpha of parts made transparent, as a share of their own."""
+"""Factor of the alpha and colours of parts that are made transparent."""
 
 
 def alone(kept: Collection[int]) -> Change:
@@ -25,12 +25,12 @@ def alone(kept: Collection[int]) -> Change:
 
 
 def unculled(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene with both sides of all triangles."""
+    """The scene with both sides of all triangles shown: cull="none"."""
     return [p.replace(cull="none") for p in parts], camera
 
 
 def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene with transparent parts."""
+    """The scene with all parts made transparent, by the factor `CLEAR`."""
 
     def through(part: Part) -> Callable[..., Array]:
         shader = instance("rts.shaders", part.shader)
