@@ -1,4 +1,4 @@
-"""Hits of a rasterizer that snaps vertices, made exact: each goes to the triangle that truly covers the pixel."""
+"""Hits of a rasterizer that rounds vertices, made exact: each goes to the triangle that truly covers the pixel."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from rts.plugin_api.loops import compiled, loop
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 WALK = 16
-"""Steps from triangle to triangle at most."""
+"""The most steps from triangle to triangle, in search of one that covers the pixel."""
 
 
 @loop
 def corner_lists(faces, count):
-    """For each of `count` vertices the triangles around it: offsets (V + 1,) into members (3 T,)."""
+    """Offsets (V + 1,) and members (3 T,): `members[offsets[v] : offsets[v + 1]]` are the triangles around vertex v."""
     offsets = np.zeros(count + 1, np.int32)
     for t in range(len(faces)):
         for c in range(3):
@@ -31,7 +31,7 @@ def corner_lists(faces, count):
 
 @loop
 def places(vertices, faces):
-    """(T, 3) faces in which corners at one place have one number, though they may be different vertices."""
+    """(T, 3) `faces` with vertices at one position replaced by the first of them, so that triangles there connect."""
     size = 4
     while size < 2 * len(vertices):
         size *= 2
@@ -60,7 +60,10 @@ def places(vertices, faces):
 
 @compiled
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
-    """True if a triangle covers a pixel exactly; its least barycentric there, its depth, two barycentrics."""
+    """Test triangle `t` at a pixel position: True if it covers it; least barycentric, depth, first two barycentrics.
+
+    The least barycentric is −∞ if the triangle is culled or has no area, or lies behind the eye or is clipped there.
+    """
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
     to_corner(matrix, vertices, ib, corners, 1)
@@ -79,7 +82,7 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
 
 @compiled
 def holds(triangles, count, t):
-    """True if a triangle is among the first `count` of a list."""
+    """True if triangle `t` is among the first `count` of `triangles`."""
     same = False
     for n in range(count):
         same |= triangles[n] == t
@@ -88,9 +91,9 @@ def holds(triangles, count, t):
 
 @compiled
 def _walk(t, x, y, hits, count, scene, around, offsets, members):
-    """Go from triangle to triangle towards one that covers a pixel and is not among the first `count` hits.
+    """Go from triangle `t` to its neighbours, towards one that covers a pixel and is not among the first `count` hits.
 
-    Returns whether there is one, the triangle, its depth and two barycentrics.
+    Returns True if it is reached, the last triangle, its depth and its first two barycentrics.
     """
     inside, least, z, a, b = look(t, x, y, *scene)
     for _ in range(WALK):
@@ -119,9 +122,9 @@ def _walk(t, x, y, hits, count, scene, around, offsets, members):
 def correct(
     first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
 ):  # fmt: skip
-    """Correct the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop triangles that miss.
+    """Correct the hits of pixel rows [first, last): fill barycentrics and depths, correct ids, drop those that miss.
 
-    `around` are the faces by place, `offsets` and `members` their `corner_lists`.
+    `around` is the result of `places`, `offsets` and `members` are its `corner_lists`.
     """
     layers, _, width = triangle_ids.shape
     scene = matrix, row, keep, vertices, faces, np.empty((3, 4))

@@ -1,4 +1,4 @@
-"""NumPy: forward rendering only."""
+"""The engine of NumPy arrays: forward rendering only, without derivatives."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class NumpyEngine(Engine):
         return fn(*args)
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
-        """The result by compiled code if all floats are float32 or all float64, else by specification."""
+        """The operation's result: by compiled code if `operation.fits` the dtypes, else by specification."""
         if not operation.fits(list(map(_DTYPE, operands))):
             return operation.specification(*operands, **params)
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
@@ -53,7 +53,7 @@ class NumpyEngine(Engine):
         return True
 
     def concurrent(self) -> bool:
-        """True: NumPy keeps nothing that belongs to a thread."""
+        """True: NumPy keeps no state for a thread, so several may compute at once."""
         return True
 
     def stop_gradient(self, x: Array) -> Array:
@@ -61,7 +61,7 @@ class NumpyEngine(Engine):
         return x
 
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
-        """Sums of the rows of `values` that share a segment."""
+        """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
         return np.stack([np.bincount(segments, weights=v, minlength=count) for v in values.T], axis=-1).astype(
             values.dtype
         )

@@ -13,7 +13,7 @@ from rts.plugin_api.records import ArraySpec, Cells, RayHits, Request, Samples
 
 
 class Rays(Sampler):
-    """Casts a ray through every pixel's centre, on the device, so that a traced function may hold the surface."""
+    """Sampler that casts a ray through each pixel's centre, in array code on the device, which engines can trace."""
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
@@ -72,7 +72,7 @@ class Rays(Sampler):
 
 
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
-    """The result of a surface's `intersect`, refused if its shapes are wrong."""
+    """`hits`, the result of `surface.intersect`; raises InputError if its type, shapes or dtype are wrong."""
     if not isinstance(hits, RayHits):
         raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected RayHits")
     grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths
@@ -88,6 +88,6 @@ def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, 
 
 
 def _checked(view: np.ndarray, projection: np.ndarray, *transform: np.ndarray) -> tuple[np.ndarray]:
-    """Refuse a camera that has no rays; in a compiled function, where nothing needs the result, this is left out."""
+    """Refuse a camera without rays, or a bad transform. A compiled program leaves out this call: the 0 is unused."""
     check_camera(Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64)), *transform)
     return (np.asarray(0, np.int32),)

@@ -8,6 +8,7 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.records import Fragments, Proxy
 
 CANDIDATES_AT_ONCE = 1 << 20
+"""About how many pairs of a triangle and a pixel are tested at once, which bounds memory."""
 
 
 class Reference(TriangleSampler):
@@ -44,7 +45,7 @@ class Reference(TriangleSampler):
 
 
 def _chunks(counts: np.ndarray) -> list[np.ndarray]:
-    """Indices of non-zero counts, split where the running total passes a multiple of the limit."""
+    """Indices of non-zero counts, split where the running total passes a multiple of `CANDIDATES_AT_ONCE`."""
     indices = np.flatnonzero(counts)
     if not len(indices):
         return []
@@ -53,7 +54,10 @@ def _chunks(counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First and last pixel (x, y) that each triangle may cover, and marks of triangles that may cover any."""
+    """First and last pixel (x, y) that each triangle may cover, and marks of triangles that may cover any.
+
+    `corners` (T, 3, 4) are in clip space.
+    """
     height, width = size
     w = corners[..., 3]
     whole = np.all(w > 0, axis=1)
@@ -77,7 +81,7 @@ def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _hits(triangle, x, y, corners, depth, size):
-    """Triangle, pixel, barycentrics and depth of the candidates that are hits."""
+    """Triangles, flat pixel indices, first two barycentrics and depths of those candidates that hit."""
     height, width = size
     ndc_x, ndc_y = (x + 0.5) * 2 / width - 1, 1 - (y + 0.5) * 2 / height
     c = corners[triangle]
@@ -104,7 +108,7 @@ def _cross(ax, ay, bx, by):
 
 
 def _edge_slopes(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative of gᵢ × gⱼ along +x of NDC, and along −y, for the three edges."""
+    """Derivatives of gᵢ × gⱼ (see `Reference`) along +x of NDC, and along −y: (T, 3) each, for the three edges."""
     pairs = ((1, 2), (2, 0), (0, 1))
     along_x = [c[:, i, 1] * c[:, j, 3] - c[:, i, 3] * c[:, j, 1] for i, j in pairs]
     down = [c[:, i, 0] * c[:, j, 3] - c[:, i, 3] * c[:, j, 0] for i, j in pairs]

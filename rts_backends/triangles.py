@@ -5,8 +5,8 @@ A corner is (X, Y, clip z, w), at the pixel (X / w, Y / w). The edge function of
 clipping, and two triangles that share an edge evaluate exactly opposite numbers on it. All of it is float64.
 
 These helpers are not cached on disk, only the loops that call them are: a helper loaded from the cache is not
-inlined, which costs a factor of three. After a change here, touch the files of the loops, whose caches go by their
-own dates.
+inlined, which costs a factor of three. After a change in this file, touch the files of the loops that call it: a
+loop's cache goes by the date of the loop's own file.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from rts.plugin_api.loops import compiled, loop
 
 
 def pixel_matrix(camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """(4, 4) from the proxy's space to homogeneous pixels."""
+    """(4, 4) matrix from the proxy's space to homogeneous pixel coordinates (X, Y, clip z, w)."""
     height, width = size
     to_pixels = np.array([[width / 2, 0, 0, width / 2], [0, -height / 2, 0, height / 2], [0, 0, 1, 0], [0, 0, 0, 1]])
     return to_pixels @ camera.projection @ camera.view
 
 
 def facing(camera: Camera, cull: str) -> float:
-    """Sign that the determinant of a triangle to keep has; 0 keeps both.
+    """Sign of `determinant` for the triangles that are kept, not culled; 0 keeps both orientations.
 
     A y-flip of the projection, or a mirroring view, reverses the winding on screen.
     """
@@ -36,7 +36,7 @@ def facing(camera: Camera, cull: str) -> float:
 
 @loop
 def bounding_sphere(vertices, faces):
-    """(4,) centre and radius of a sphere around the vertices that triangles refer to, by their bounding box."""
+    """(4,) centre and radius of the sphere around the bounding box of the vertices that triangles use."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for t in range(len(faces)):
         for c in range(3):
@@ -60,7 +60,7 @@ def to_corner(matrix, vertices, v, corners, i):
 
 @compiled
 def depth_of(row, vertices, v):
-    """Linear depth of vertex `v`; `row` is minus the third row of the view."""
+    """Linear depth of vertex `v`; `row` (4,) is minus the third row of the camera's view matrix."""
     return row[0] * vertices[v, 0] + row[1] * vertices[v, 1] + row[2] * vertices[v, 2] + row[3]
 
 
@@ -83,13 +83,16 @@ def edge(corners, i, j):
 
 @compiled
 def owns(x, y):
-    """True if an edge with these coefficients, turned inward, owns the pixels exactly on it: a top or left edge."""
+    """True if an edge owns the pixels exactly on it: a top or left edge.
+
+    `x` and `y` are coefficients of its edge function, positive inside.
+    """
     return x > 0 or (x == 0 and y > 0)
 
 
 @compiled
 def edge_values(corners, ia, ib, ic, x, y):
-    """Edge functions at a pixel position, positive inside, and True if the position belongs to the triangle."""
+    """Edge functions opposite `ia`, `ib`, `ic` at a pixel position, positive inside; True if the triangle covers it."""
     xa, ya, wa = edge(corners, ib, ic)
     xb, yb, wb = edge(corners, ic, ia)
     xc, yc, wc = edge(corners, ia, ib)
@@ -106,7 +109,7 @@ def edge_values(corners, ia, ib, ic, x, y):
 
 @compiled
 def clipped(corners, ia, ib, ic, ea, eb, ec):
-    """True if the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
+    """True if the point with barycentrics in the ratio ea : eb : ec lies before the near or beyond the far plane."""
     near = ea * (corners[ia, 2] + corners[ia, 3]) + eb * (corners[ib, 2] + corners[ib, 3])
     far = ea * (corners[ia, 3] - corners[ia, 2]) + eb * (corners[ib, 3] - corners[ib, 2])
     return near + ec * (corners[ic, 2] + corners[ic, 3]) < 0 or far + ec * (corners[ic, 3] - corners[ic, 2]) < 0

@@ -13,7 +13,7 @@ import pytest
 
 import rts
 import rts.testing
-from benchmarks.defects import planted
+from benchmarks.defects import planted, run
 
 pytestmark = pytest.mark.core
 
@@ -271,3 +271,13 @@ def test_forty_planted_defects_apply_to_the_tree():
         assert (ROOT / defect.path).read_text().count(defect.before) == 1, defect.name
         missing = [name for name in defect.tests.split() if not (ROOT / f"tests/test_{name}.py").is_file()]
         assert not missing and defect.after != defect.before
+
+
+def test_a_planted_defect_is_caught_only_by_a_test_that_is_named():
+    whole = "=== short test summary info ===\nFAILED tests/test_a.py::test_b[two words] - assert 1 == 2\n1 failed"
+    assert run.verdict(1, whole) == "tests/test_a.py::test_b[two words]"
+    assert run.verdict(2, "ERROR tests/test_a.py - ImportError: no c\n") == "tests/test_a.py"
+    assert run.verdict(0, "ERROR    root:a.py:1 a record of a log\n3 passed") is None
+    for code, output in ((4, "ERROR: file or directory not found: tests/test_a.py"), (-11, "Segmentation fault")):
+        with pytest.raises(RuntimeError, match=f"pytest ended with {code}"):
+            run.verdict(code, output)

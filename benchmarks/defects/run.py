@@ -71,19 +71,28 @@ def forget(copy: Path, path: str) -> None:
             kept.unlink()
 
 
+def verdict(code: int, output: str) -> str | None:
+    """The first test that fails, by pytest's exit status and output; None if all pass.
+
+    Raises:
+        RuntimeError: pytest ended without a verdict. That shows nothing about the defect.
+    """
+    # Identifiers may contain spaces; lines of captured logs have several after "ERROR".
+    found = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - |$)", output, re.MULTILINE)
+    if found:
+        return found[1]
+    if code in (0, 5):
+        return None
+    raise RuntimeError(f"pytest ended with {code}, and names no test that fails:\n{output[-2000:]}")
+
+
 def failing(copy: Path, arguments: list[str]) -> str | None:
-    """The first test that fails, or "" if none does; None where the time is over."""
+    """The first test that fails; None if all pass."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_WAIT_POLICY": "PASSIVE"}
     environment.setdefault("RTS_DATA", str(ROOT.parent / "shared" / "data"))
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-header", *arguments]
-    try:
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
-    except subprocess.TimeoutExpired:
-        return None
-    found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    if found:
-        return found[1]
-    return "" if done.returncode in (0, 5) else f"pytest ended with {done.returncode}"
+    done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
+    return verdict(done.returncode, done.stdout)
 
 
 def catch(defect: Defect, copy: Path, likely_only: bool) -> dict[str, str | None]:
@@ -98,7 +107,7 @@ def catch(defect: Defect, copy: Path, likely_only: bool) -> dict[str, str | None
     forget(copy, defect.path)
     try:
         for command, arguments in stages[:: 2 if likely_only else 1]:
-            if (test := failing(copy, arguments)) != "":
+            if test := failing(copy, arguments):
                 return {"name": defect.name, "test": test, "command": command}
         return {"name": defect.name, "test": None, "command": None}
     finally:
@@ -127,7 +136,9 @@ def main(
             with output.open("a") as file:
                 print(json.dumps(row), file=file)
             print(f"{defect.name}: {row['command'] or 'not caught'} {row['test'] or ''}", flush=True)
-    caught = [row for row in rows if row["command"]]
+        caught = [row for row in rows if row["command"]]
+        if caught and (test := failing(copy, [*THOROUGH[2:], *sorted({row["test"] for row in caught})])):
+            sys.exit(f"{test} fails without a defect, too: it catches nothing")
     loops = {defect.name for defect in LOOPS}
     print(f"{len(caught)} of {len(rows)} are caught, {sum(row['name'] in loops for row in caught)} of them in loops")
 

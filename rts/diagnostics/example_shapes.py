@@ -15,7 +15,7 @@ QUAD = ((0, 1, 2), (0, 2, 3))
 
 
 def box(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (24, 3), four a face, and triangles (12, 3) that face outwards."""
+    """A box from corner `low` to corner `high`: vertices (24, 3), four a side, and faces (12, 3), seen from outside."""
     corners, faces = [], []
     for axis in range(3):
         for side in (0, 1):
@@ -31,7 +31,7 @@ def box(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit sphere: vertices (V, 3) and faces (20 · 4ⁿ, 3)."""
+    """Unit sphere: vertices (V, 3) and faces (20 · 4ⁿ, 3), n the number of subdivisions."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
@@ -39,7 +39,7 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh(vertices: np.ndarray, faces: Any, shader: str, cull: str = "none", **entries: Any) -> Part:
-    """A mesh with further entries of θ."""
+    """A part that is a mesh; `entries` are further entries of θ."""
     return Part(plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices, **entries}, shader, cull=cull)
 
 

@@ -51,11 +51,11 @@ def pixel_step(
     None where neither changes.
 
     Args:
-        engine: of the parameters.
+        engine: the engine of the parameters.
         image: parameters and options of `rts.render` → (H, W, 4).
         parameters: the point of the derivative.
         direction: a tree of the parameters' structure.
-        deep: whether all kept layers count, not only the front one.
+        deep: True to look at motion and colour in all kept layers, not only in the front one.
     """
     for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
         probe = partial(image, splatter=_Probe(color, deep), supersample=1, background=None)

@@ -40,7 +40,7 @@ class GradientImage(NamedTuple):
 
     Attributes:
         derivative: (H, W, C) float, change of the image for a unit step along the direction.
-        scale: the change that the picture shows at full strength.
+        scale: the change that the picture shows at full strength: as 1 in a channel, or, if negative, as 0.
     """
 
     derivative: np.ndarray
@@ -166,12 +166,12 @@ def check_gradient(
         parameters: a torch or jax array, or nested dicts and lists of them.
         size: (height, width).
         loss: image (H, W, 4) → scalar; None for a smooth random weighting of the image, with a fixed seed.
-        entries: how many numbers of each array to check: those of largest gradient, and some at random.
+        entries: the most numbers of each array to check: those of largest gradient, and some at random.
         samples: samples a pixel along each axis.
         tolerance: the largest error of a derivative, relative to it.
         budget_s: seconds after which nothing more is begun; the result covers what was checked until then, at least
             one number. If time is short, all numbers are checked with few samples before any is with more.
-        progress: whether to show a bar on standard error; None to do so on a terminal.
+        progress: True to show a bar on standard error, False for none; None to show it on a terminal.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
     Raises:

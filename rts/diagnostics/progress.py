@@ -12,10 +12,10 @@ Phase = Callable[[str, int], Callable[[], None]]
 
 @contextlib.contextmanager
 def phases(wanted: bool | None) -> Iterator[Phase]:
-    """A bar for each phase, with the time that is left.
+    """A context with a `Phase`, a function that shows a bar for each phase, with the time that is left.
 
     Args:
-        wanted: whether to show bars; None to do so on a terminal.
+        wanted: True to show bars; None to show them on a terminal.
     """
     if wanted is False or (wanted is None and not sys.stderr.isatty()):
         yield lambda what, steps: lambda: None

@@ -1,4 +1,4 @@
-"""Claims about views that show nothing, or show it badly."""
+"""Claims about views that do not show a part, or show it from inside, cut or edge-on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rts.testing.derivatives import joined, split
 
 
 def image_and_gradient(part: Part, camera: Camera, sampler: Any, engine: Engine) -> tuple[np.ndarray, list]:
-    """The image of a part, and the gradient of its weighted sum in θ."""
+    """The image of a part, and the gradient in θ of the image's sum under random weights."""
     values, join = split(part.theta)
     weights = engine.constant(derivatives.single(np.random.default_rng(0).random((*scenes.SIZE, 4))))
 

@@ -29,7 +29,7 @@ CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], pr
 LAYERS = 2
 APRON = RenderSettings(None, 1, 1, None).apron
 CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
-"""A row for every cell: the same shapes each time, so that engines compile once."""
+"""A row of samples for every cell, so that all calls have the same shapes, and engines compile once."""
 
 DIFFERING, SHARE = 1e-3, 0.02
 """The largest difference of a pixel from the reference's, and the share of pixels that may differ by more."""
@@ -59,11 +59,11 @@ def example(surface: str) -> Part | None:
 
 
 def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
-    """The image of an example; with an engine that differentiates, its gradient in θ is tried first.
+    """The image of an example; if the engine differentiates, the gradient in θ is checked, too.
 
     Raises:
-        RtsError: the image is empty; it is not that of the sampler `reference`, if of triangles; or a value or
-            derivative is not finite. Errors of rendering pass through.
+        RtsError: the image is empty or not finite; one of triangles is not that of the sampler `reference`; or the
+            gradient is zero or not finite. Errors of rendering pass through.
     """
     chosen = engine_named(engine)
     theta = constants(map_leaves(single, part.theta), chosen, None)
@@ -83,7 +83,7 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
 
 
 def _is_of_triangles(part: Part, sampler: Any) -> bool:
-    """True if a sampler can show only the part's triangles, not its intersections with rays."""
+    """True if a sampler shows the part's triangles, not the hits of the surface's own `intersect`."""
     surface = check_scene(part, CAMERA)[0][0].surface
     if not isinstance(surface, RaySurface):
         return isinstance(surface, TriangleSurface)

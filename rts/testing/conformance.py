@@ -1,4 +1,4 @@
-"""The base of the kit's classes, which decides what pytest collects."""
+"""The base of the kit's classes: pytest collects only subclasses of them made outside the kit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Conformance:
     __test__ = False
     pytestmark = pytest.mark.filterwarnings(
         "ignore::rts.errors.EmptyImageWarning"
-    )  # The kit shows plugins nothing, too.
+    )  # The kit renders empty images, too.
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

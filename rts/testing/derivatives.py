@@ -22,7 +22,7 @@ DIFFERENTIABLE = sorted((name for name in ENGINES if name != "numpy"), key=lambd
 
 
 def engine_or_skip(name: str) -> Engine:
-    """The engine; skip the test, with the reason, if it is not installed."""
+    """The engine of this name; skip the test, with the reason, if it is not installed."""
     try:
         engine = engine_named(name)
         importlib.import_module(name)
@@ -32,7 +32,7 @@ def engine_or_skip(name: str) -> Engine:
 
 
 def differentiating(name: str) -> Engine:
-    """The engine; skip the test, with the reason, if it is not installed or does not differentiate."""
+    """The engine of this name; skip the test, with the reason, if it is not installed or does not differentiate."""
     engine = engine_or_skip(name)
     if not engine.differentiates:
         pytest.skip(f"the engine {name} does not differentiate")
@@ -65,7 +65,7 @@ def host(engine: Engine, tree: Tree) -> Tree:
 
 
 def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]]:
-    """The floating leaves of a tree of NumPy arrays, and a function that puts other leaves in their place."""
+    """The floating leaves of a tree of NumPy arrays, and a function from new values for them to the whole tree."""
     floating: list[np.ndarray] = []
 
     def collect(x: Any) -> Any:
@@ -84,7 +84,7 @@ def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]
 
 
 def names(tree: Tree) -> list[str]:
-    """Names of the leaves that `split` returns, by their place in the tree."""
+    """For each leaf of `split`, in order, the name of its entry of θ, "theta['a']", however deep the leaf lies."""
     return [f"theta[{key!r}]" for key in sorted(tree) for _ in split(tree[key])[0]]
 
 
@@ -100,7 +100,7 @@ def directions(values: Sequence[np.ndarray], seed: int = 1) -> list[np.ndarray]:
 
 
 def claim_slope(gradient: np.ndarray, along: np.ndarray, slope: float, what: str) -> None:
-    """Fail unless a float32 gradient agrees with a slope, a difference along a direction in float64."""
+    """Fail unless a float32 gradient, times the direction `along`, is `slope`, a finite difference in float64."""
     product = float(np.sum(gradient * along))
     scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-3)
     claim(
@@ -118,7 +118,7 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(engine: Engine, f: Callable, at: list, along: list, weights: np.ndarray) -> Derivatives:
-    """Both modes of differentiation of a function of a list of arrays, in float32, on the host."""
+    """Value and derivatives, in both modes, of `f`, from a list of arrays to an array: float32, as NumPy arrays."""
     at, along, weights = on(engine, at), on(engine, along), on(engine, weights)
     xp = engine.namespace
     _, gradient = engine.value_and_grad(lambda x: xp.sum(f(x) * weights))(at)

@@ -388,7 +388,7 @@ def _curvature(engine: Engine, f: Callable, operands: list, along: list, weights
 
 @contextlib.contextmanager
 def owning(engine: Engine) -> Iterator[None]:
-    """Context in which the core uses this object as the engine of its arrays."""
+    """Context in which the core uses the object `engine` for arrays of its kind."""
     kinds = {type(engine.constant(np.ones(1)))} - {np.ndarray}
     before = {kind: OWNERS.get(kind) for kind in kinds}
     OWNERS.update(dict.fromkeys(kinds, engine))

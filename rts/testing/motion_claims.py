@@ -18,20 +18,20 @@ from rts.testing.normal_claims import normals_at
 
 STEP = 1e-5
 MOVED = 0.02
-"""The motion of the fastest point: a tenth of a pixel."""
+"""The motion of the fastest point, in world units: about a tenth of a pixel."""
 
 BEHIND = 0.35
 """The largest distance of points from the moved surface, as a share of the surface's motion."""
 
 ENOUGH = 20
-"""The least samples to judge from."""
+"""The least number of samples to judge from."""
 
 
 class Move(NamedTuple):
     """A small change of one array of θ.
 
     Attributes:
-        name: of the array.
+        name: the array's, such as "theta['vertices']".
         part: the part with θ changed.
         points: (N, 3) float64, the changed part's points at samples of the unchanged one.
     """
@@ -42,7 +42,7 @@ class Move(NamedTuple):
 
 
 def moves(part: Part, samples: Samples) -> Iterator[Move]:
-    """A move by `MOVED` for each array of θ that moves the surface, each along a random direction."""
+    """A `Move` for each array of θ that moves the surface: along a random direction, the fastest point by `MOVED`."""
     values, join = split(part.theta)
     values = [v.astype(np.float64) for v in values]
     for i, along in enumerate(directions(values)):

@@ -61,7 +61,7 @@ def claim_upright(part: Part, sampler: Any) -> None:
 
 
 def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Fail unless the mean of the normals at a triangle's corners is about its own, as far as neighbours differ.
+    """Fail if the mean normal of a triangle's corners leans from the triangle's own by more than neighbours differ.
 
     Args:
         normals: (3, T, 3), at the corners of the triangles; of any length.
@@ -87,7 +87,7 @@ def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces:
 
 
 def normals_at(part: Part, samples: Samples) -> np.ndarray | None:
-    """Unit normals (N, 3) at samples: by their two parameters, or else the surface's; None if it has none."""
+    """Unit normals (N, 3) at samples: by slopes in their two parameters, else the surface's own, if any, or None."""
     if samples.params.shape[1] == 2:
         return _by_parameters(part, samples)
     gbuffer = part.surface.evaluate(part.theta, samples)
@@ -123,7 +123,7 @@ def _by_parameters(part: Part, samples: Samples) -> np.ndarray:
 
 
 def _perpendicular(part: Part, sampler: Any, samples: Samples) -> np.ndarray | None:
-    """`_by_parameters`, or for samples without two parameters normals from slightly shifted images."""
+    """`_by_parameters`; without two parameters, normals from slightly shifted images; None if not at pixel centres."""
     if samples.params.shape[1] == 2:
         return _by_parameters(part, samples)
     if not samples.centered:

@@ -200,7 +200,7 @@ def _pulled(operation: Operation, operands: Sequence, g: np.ndarray, which: Sequ
 
 
 def _choices(count: int) -> Iterator[list[int]]:
-    """Each operand alone, then all together."""
+    """Lists of operands' indices: each alone, then all together."""
     yield from ([i] for i in range(count))
     if count > 1:
         yield list(range(count))

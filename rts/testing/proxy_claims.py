@@ -1,4 +1,4 @@
-"""Claims about proxies, the triangles that stand for a surface."""
+"""Claims about proxies, the triangles by which samplers find a surface."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VIEWS = {"a view": scenes.CAMERA, "another": scenes.AXES[0], "one from afar": sc
 
 
 def triangles_of(part: Part) -> TriangleSurface:
-    """The surface; skip the test if it has no triangles."""
+    """The part's surface; skip the test if it has no triangles."""
     surface = scenes.checked(part).surface
     if not isinstance(surface, TriangleSurface):
         pytest.skip("the surface has no triangles")
@@ -32,7 +32,7 @@ def inputs_of(part: Part, surface: TriangleSurface) -> Tree:
 
 
 def claim_corners(part: Part, surface: TriangleSurface, when: str) -> None:
-    """Fail unless corners evaluate to themselves, normals are the triangles', and their numbers are those promised."""
+    """Fail unless triangles' corners evaluate to themselves, normals face as triangles do, and `face_count` holds."""
     proxy = surface.proxy(inputs_of(part, surface), scenes.CAMERA, scenes.SIZE)
     count = surface.face_count
     claim(count in (None, len(proxy.faces)), f"face_count is {count}; proxy gives {len(proxy.faces)} triangles{when}")

@@ -23,13 +23,13 @@ DEEP = 5
 """Layers of rays that are cast in both directions."""
 
 BEYOND, NOWHERE = 6.0, 1e3
-"""Distance behind the last hit at which such a ray begins, beyond everything; and the distance for no hit."""
+"""Distance behind the last hit at which the ray back begins, beyond everything; and a distance that means no hit."""
 
 SHORT = 2e-3
 """Distance before a hit at which the second ray begins, in units of depth."""
 
 GROWN = 1.15
-"""The factor by which triangles are too large, so that rays at outlines miss the surface inside."""
+"""The factor by which triangles are enlarged, so that rays at outlines miss the surface inside."""
 
 MISSED = 0.01
 """The share of hits that the second ray may miss: those where rays touch the surface."""
@@ -116,7 +116,7 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
 
 
 def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
-    """Fail unless rays from behind hit at the same places."""
+    """Fail unless rays cast back, from behind all hits, hit at the same places."""
     theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, DEEP)
     hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)

@@ -15,9 +15,10 @@ REPROJECTION = 0.02
 """The largest distance of a sample from its pixel's centre, pixels: rounding of float32 positions."""
 
 RESIDUAL = 0.25
-"""The same, pixels, for the few samples at edges of curved surfaces that no refinement can move to the centre."""
+"""The limit, pixels, for the few samples at edges of curved surfaces that no refinement can move to the centre."""
 
 FEW = 0.03
+"""The share of samples that may be beyond a stricter limit."""
 
 
 def claim_reprojected(part: Part, sampled: Sampled, camera: Camera, view: str) -> None:

@@ -127,7 +127,7 @@ class SamplerConformance(Conformance):
     # -------------------------------------------------------------------------------------- the contract
 
     def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
-        """Two calls agree to the last bit; new arrays on the same surfaces, sampled between, are right."""
+        """Two calls agree to the last bit; parts with new θ on the same surfaces, sampled in between, are right."""
         between = [_scaled(part, 0.9) for part in parts]
         expected = [right(part, scenes.AXES[2], sampler) for part in between]
         silhouettes = Silhouettes()
@@ -232,7 +232,7 @@ class SamplerConformance(Conformance):
             claim((near | ~covered).all(), f"part {index}: depths are not those of the cells in the whole grid")
 
     def test_exits_lie_on_the_part_behind_its_front(self, sampler: Any, parts: list[Part]) -> None:
-        """Exits, if a sampler gives them, have rows of their own, where the ray meets the part again."""
+        """Exits, if a sampler gives them, have rows that `row` does not name, and lie behind the front on the part."""
         chosen, told = check_sampler(sampler), []
         for index, part in enumerate(map(scenes.checked, parts)):
             if part.cull != "back":
@@ -292,7 +292,7 @@ class SamplerConformance(Conformance):
                 claim(same.mean() >= 0.99, f"in {engine}{how}, {np.sum(~same)} of {same.size} cells are not NumPy's")
 
     def test_engines_agree(self, sampler: Any, parts: list[Part]) -> None:
-        """Engines agree on image, gradient and derivative along a direction, each at samples of its own."""
+        """Engines agree on image, gradient and derivative along a direction, each at the samples that it finds."""
         part = parts[0]
         values, join = split(part.theta)
 
@@ -386,7 +386,7 @@ def right(part: Part, camera: Camera, sampler: Any) -> Expected:
 
 
 def _new(sampler: Any) -> Any:
-    """A new object of a sampler's class; None if the class may need arguments."""
+    """A new sampler of the same class; None if that fails, or if the class of a given object takes arguments."""
     kind = type(registry.instance("rts.samplers", sampler) if isinstance(sampler, str) else sampler)
     plain = kind.__init__ is object.__init__ or len(inspect.signature(kind.__init__).parameters) == 1
     if not (isinstance(sampler, str) or plain):
@@ -398,7 +398,7 @@ def _new(sampler: Any) -> Any:
 
 
 def claim_like(actual: Sampled, expected: Expected, what: str) -> Silhouettes:
-    """Fail unless samples have the expected ids and depths, except at silhouettes."""
+    """Fail unless samples have the expected ids and depths, except at silhouettes, which are counted."""
     sampled, edge, source = expected
     different = (_ids(actual) != _ids(sampled)).any(axis=(0, -1)) | (_covered(actual) != _covered(sampled)).any(axis=0)
     inside = different & ~edge
@@ -430,7 +430,7 @@ def _covered(sampled: Sampled) -> np.ndarray:
 
 
 def _off(actual: Sampled, expected: Sampled) -> np.ndarray:
-    """Mask (K, H, W) bool of cells whose depths differ by more than 1e-5 of themselves."""
+    """Mask (K, H, W) bool of cells whose depths differ by more than 1e-5 of the expected depth."""
     depth, other = np.asarray(actual.depth), np.asarray(expected.depth)
     return np.abs(depth - other) > 1e-5 * other
 

@@ -32,7 +32,7 @@ def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: A
 
 
 def shifted(camera: Camera, by: float, axis: int) -> Camera:
-    """A camera whose image is shifted by part of a pixel, along x (axis 0) or y."""
+    """A camera whose image is shifted by `by` pixels, to the right (axis 0) or upward (axis 1)."""
     shift = np.eye(4)
     shift[axis, 3] = 2 * by / SIZE[1 - axis]
     return camera.replace(projection=shift @ camera.projection)
@@ -55,7 +55,7 @@ UNSEEN = {"behind the camera": AWAY, "beside the image": BESIDE}
 
 
 def mesh(vertices: Any, faces: Any, **options: Any) -> Part:
-    """A mesh as a part."""
+    """A part that is a triangle mesh."""
     surface = registry.plugin("rts.surfaces", "mesh")(faces)
     return Part(surface, {"vertices": np.asarray(vertices, np.float32)}, **options)
 
@@ -78,17 +78,17 @@ def flat() -> Part:
 
 
 def checked(part: Part) -> Part:
-    """The part as the core checks it for samplers."""
+    """The part as the core checks it and passes it to samplers."""
     return check_scene(part, CAMERA)[0][0]
 
 
 def find(part: Part, camera: Camera = CAMERA, sampler: Any = "auto", layers: int = LAYERS, **options: Any) -> Sampled:
-    """Sample a scene of NumPy arrays."""
+    """The samples of a part whose θ holds NumPy arrays."""
     return sample(part, camera, SIZE, sampler=sampler, layers=layers, **options)
 
 
 def frozen(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Sampled:
-    """Samples of NumPy arrays, to evaluate in any engine; their number of rows is fixed."""
+    """Samples in NumPy arrays of `CAPACITY` rows, to evaluate in any engine."""
     sampled = find(part, camera, sampler, capacity=CAPACITY)
     claim(
         (np.asarray(sampled.row) >= 0).sum() >= 20,

@@ -118,7 +118,7 @@ class SplatterConformance(Conformance):
             claim_close(actual, expected, 1e-4, "the derivative of needed samples")
 
     def test_settled_cells_show_the_colors_that_they_name(self, splatter: Any) -> None:
-        """Settled cells show the colour of the sample that they name; samples that only they need may be missing."""
+        """Cells for which `settled` names a sample show its colour; samples that no other cell needs may be missing."""
         chosen = _instance(splatter)
         if not promised(chosen, "fills_interiors"):
             pytest.skip("the splatter does not read which cells are settled")
@@ -139,7 +139,7 @@ class SplatterConformance(Conformance):
             claim_close(actual, expected, 1e-4, "the gradients of the colours that settled cells show")
 
     def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
-        """`cropped` returns the image of all cells, without the border."""
+        """`cropped` returns the image that all cells splat into, those of the border too, with the border cut off."""
         whole = _splat(splatter, scattered())
         for border in (1, 2):
             image = np.asarray(_instance(splatter).cropped(scattered().replace(border=border)))
@@ -257,7 +257,7 @@ def _on_the_left(splats: Splats) -> np.ndarray:
 
 
 def square() -> Splats:
-    """A white square of one layer, from cell (2, 3) to (4, 5)."""
+    """A white square of one layer, from cell (2, 3) to (4, 5), each (row, column)."""
     splats = everywhere(LAYERS)
     row = np.full_like(splats.row, -1)
     row[0, 2:5, 3:6] = splats.row[0, 2:5, 3:6]

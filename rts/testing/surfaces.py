@@ -152,7 +152,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
-        """`evaluate` reads no value of θ, and uses its namespace alone."""
+        """`evaluate` can be traced: it reads no values of θ, and uses functions of its namespace alone."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
         samples = derivatives.on(chosen, sampled)

@@ -20,11 +20,13 @@ CUTS = 4, 8
 """Cuts along each side of a patch: twice as many make four times the triangles, at a quarter of the distance."""
 
 FOURFOLD = 3.4, 5.0
+"""Limits of the ratio of triangles, many cuts to few."""
+
 NEARER, EXACT = 0.5, 2e-4
 """The share of the distance that may remain at twice the rate, and the distance that counts as none."""
 
 OFF = 0.02
-"""The largest distance of a mesh from the surface, as a rate, in the units of θ."""
+"""A rate that is not a number of cuts: the largest distance of a mesh from the surface, in the units of θ."""
 
 
 def claim_tessellated(part: Part, surface: TriangleSurface, sampler: Any) -> None:
@@ -102,7 +104,7 @@ def _front(part: Part, sampler: Any) -> np.ndarray:
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:
-    """The median difference of two depths, over cells where both see the surface."""
+    """The median difference of two arrays of depths (H, W), over cells where both see the surface."""
     apart = np.abs(one - other)
     both = np.isfinite(apart)
     claim(both.sum() >= 0.3 * np.isfinite(one).sum(), "a coarser or finer form is seen elsewhere than the surface")

@@ -1,9 +1,9 @@
-"""The public interface of the package embreex, where Embree's library cannot be found.
+"""Rays cast by the public interface of the package embreex, where Embree's library cannot be found.
 
 It gives the first hit of a ray, on one core. So rays are cast again, each from just beyond its last hit, until every
 pixel has its layers. Each hit is decided in float64 as the rasterizer decides, along with all triangles around its
-corners: so edges are hit once, and layers that share a corner keep their order however close they are. Others closer
-than `STEP` may get lost.
+corners: so edges are hit once, and layers that share a corner keep their order however close they are. Layers that
+share none, and are closer than `STEP`, may get lost.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ REACH = 1.01
 
 
 class Scene:
-    """Stands in for `rts_backends.embree.library.Scene`.
+    """Substitute for `rts_backends.embree.library.Scene`.
 
     Args:
-        vertices: (V + 1, 3) float32, of covers (`Covers`); the last row is padding.
-        faces: (M, 3) int32.
+        vertices: (3 M + 1, 3) float32, the corners of `Covers`; the last row is padding.
+        faces: (M, 3) int32, the faces of `Covers`.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
@@ -54,13 +54,13 @@ class Scene:
         layers: int,
         cull: str,
     ) -> Fragments:
-        """The K nearest hits a pixel.
+        """The `layers` nearest hits of each pixel.
 
         Args:
             proxy: the object.
-            owners: the triangle of each cover.
-            sphere: (4,) its centre and radius; the scene is the object moved and scaled to the unit sphere.
-            planes: depths; nothing is seen before the first or beyond the second.
+            owners: (M,) int32, the index of each cover's triangle in the proxy.
+            sphere: (4,) the object's centre and radius; the scene is the object moved and scaled to the unit sphere.
+            planes: (4,) depths; nothing is seen before the first or beyond the second.
             camera: see `TriangleSampler.rasterize`.
             size: see `TriangleSampler.rasterize`.
             layers: see `TriangleSampler.rasterize`.
@@ -112,7 +112,7 @@ class Scene:
 def _take(
     first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, nearest
 ):  # fmt: skip
-    """Put the hit of each pixel, and hits of all triangles around its corners, among the pixel's nearest."""
+    """Put hits of each pixel's candidate triangle, and of all triangles around its corners, among the nearest."""
     layers = ids.shape[1]
     corners = np.empty((3, 4))
     for n in range(first, last):
@@ -129,7 +129,7 @@ def _take(
 
 @compiled
 def _insert(ids, nearest, t, z, a, b):
-    """Put a hit among a pixel's nearest, if it is one of them."""
+    """Insert a hit among a pixel's nearest, by depth, then by triangle; drop it if they are full and all nearer."""
     at = layers = len(ids)
     while at > 0 and (ids[at - 1] < 0 or z < nearest[at - 1, 0] or (z == nearest[at - 1, 0] and t < ids[at - 1])):
         at -= 1

@@ -22,21 +22,21 @@ LEAST, MOST = 2e-6, 2e-5
 """Limits of the distance by which edges move out; in between, a two-hundredth of the inscribed circle's radius."""
 
 SMALL = 100 * LEAST
-"""The longest edge below which a thin triangle has a third cover."""
+"""A thin triangle has a third cover if its longest edge is shorter than this."""
 
 NEVER = 255
 """The margin of triangles whose hits are always decided in float64."""
 
 
 class Covers(NamedTuple):
-    """Triangles that cover a proxy's: first one for each, then further ones for thin and small triangles.
+    """M covers of a proxy's T triangles: first one for each, then further ones for thin and small triangles.
 
     Attributes:
         corners: (3 M + 1, 3) float32, three for each cover; the last row is padding, since Embree reads 16 bytes each.
-        faces: (M, 3) int32, which count up.
-        owners: (M,) int32, the triangle that each covers.
-        margins: (T,) uint8. A ray that meets the first cover with all barycentrics above a thousandth of it surely
-            meets the triangle; `NEVER` if none does.
+        faces: (M, 3) int32: 0, 1, 2; 3, 4, 5; and so on.
+        owners: (M,) int32, the index of the triangle that each covers.
+        margins: (T,) uint8, in thousandths. A ray that meets a triangle's first cover with all barycentrics above its
+            margin surely meets the triangle; `NEVER` if no ray surely does.
     """
 
     corners: np.ndarray
@@ -51,7 +51,7 @@ class Covers(NamedTuple):
         Args:
             vertices: (V, 3) float32.
             faces: (T, 3) int32.
-            sphere: (4,) centre and radius.
+            sphere: (4,) centre and radius of the object's bounding sphere.
         """
         wanted = np.empty(len(faces), np.uint8)
         parallel(_count, len(faces), vertices, faces, sphere, wanted, work=60 * len(faces))
@@ -62,7 +62,7 @@ class Covers(NamedTuple):
         return covers
 
     def follow(self, vertices: np.ndarray, faces: np.ndarray, sphere: np.ndarray) -> bool:
-        """Cover moved triangles, in place; False if they need more covers than there are."""
+        """Cover the triangles of moved vertices, in place; False if they need more covers than there are."""
         wanted = np.empty(len(faces), np.uint8)
         parallel(_count, len(faces), vertices, faces, sphere, wanted, work=60 * len(faces))
         if len(faces) + int(wanted.sum(dtype=np.int64)) > len(self.faces):
@@ -71,7 +71,7 @@ class Covers(NamedTuple):
         return True
 
     def _fill(self, vertices: np.ndarray, faces: np.ndarray, sphere: np.ndarray, wanted: np.ndarray) -> None:
-        # Those that are not needed are points.
+        # Covers that are not needed are points.
         self.corners[3 * len(faces) :] = 0
         self.owners[len(faces) :] = 0
         places = len(faces) + np.cumsum(wanted, dtype=np.int64) - wanted
@@ -81,7 +81,10 @@ class Covers(NamedTuple):
 
 @compiled
 def _shape(vertices, faces, t, sphere, points):
-    """Fill corners (3, 3) in units of the sphere; lengths of the edges opposite to them, and twice the area."""
+    """Fill `points` (3, 3) with the corners, in units of the sphere.
+
+    Returns the lengths of the edges opposite them, and twice the triangle's area.
+    """
     for c in range(3):
         for r in range(3):
             points[c, r] = (np.float64(vertices[faces[t, c], r]) - sphere[r]) / sphere[3]
@@ -95,7 +98,7 @@ def _shape(vertices, faces, t, sphere, points):
 
 @loop
 def _count(start, stop, vertices, faces, sphere, wanted):
-    """Count the further covers that triangles need."""
+    """Fill `wanted` with the number of further covers that each triangle needs: 0, 1 or 2."""
     points = np.empty((3, 3))
     for t in range(start, stop):
         a, b, c, area = _shape(vertices, faces, t, sphere, points)
@@ -150,7 +153,7 @@ def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners
 
 @compiled
 def _perpendicular(points, p, s, along, height, side):
-    """A unit vector across `along`, in the plane of the triangle if it has one."""
+    """Fill `side` with a unit vector perpendicular to `along`, in the plane of the triangle if it has one."""
     if height > 1e-12:
         dot = 0.0
         for r in range(3):
@@ -170,7 +173,7 @@ def _perpendicular(points, p, s, along, height, side):
 
 @compiled
 def _ribbon(corners, start, along, side, length, height):
-    """A long triangle around a segment, at which it is half as wide at the end as at the beginning."""
+    """Fill `corners` with a long triangle around a segment; at the segment's end it is half as wide as at its start."""
     wide = 2 * (height + 2 * LEAST)
     for r in range(3):
         corners[0, r] = start[r] - 2 * LEAST * along[r] - wide * side[r]

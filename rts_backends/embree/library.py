@@ -1,6 +1,6 @@
 """Embree's C interface through ctypes: the library that ships inside the embreex wheel, or the system's.
 
-It covers only what a scene of one triangle mesh needs. Buffers are shared: Embree reads our arrays where they lie.
+Only functions for a scene of one triangle mesh are declared. Buffers are shared: Embree reads our arrays in place.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Rays through pixel centres, K nearest hits each, by compiled code that calls Embree.
 
-Embree finds candidates in float32, among covers of the triangles (`covers.py`), and hands each to our intersection
-filter. A hit well inside its triangle, and at a depth of its own, is believed. Any other is decided in float64 by the
-edge functions of `rts_backends.triangles`, exactly as the rasterizer decides: so hits are those of the rasterizer, an
-edge between triangles is hit once, and coplanar layers keep their order.
+Embree finds candidates in float32, among covers of the triangles (`enlarged_triangles.py`), and hands each to our
+intersection filter. A hit well inside its triangle, and at a depth unlike that of other hits, is believed. Any other is
+decided in float64 by the edge functions of `rts_backends.triangles`, exactly as the rasterizer decides: so hits are
+those of the rasterizer, an edge between triangles is hit once, and coplanar layers keep their order.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ TILE = 8
 ACCEPT, REJECT = -1, 0
 COHERENT, INVOKE_FILTER = 1 << 16, 1 << 1
 SLACK, REACH_SLACK_SHARE = 1e-5, 1e-4
-"""Depths that differ by less than the first share of the object's size are compared in float64; rays end as far behind
-the last hit as the second."""
+"""Shares of the object's radius. Hits whose depths differ by less than the first are compared in float64; a ray with
+all its layers ends the second beyond its last hit."""
 
 GRAZING = 0.05
 """Cosine between ray and normal below which Embree's depth, and side, are not believed."""
@@ -35,7 +35,7 @@ REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 
 # Per ray: hits so far, pixel x, y, sign of determinants to keep, slack of depths and of the ray's end, depth where the
-# ray starts, the depths between which no plane clips, and the sign of what normals to leave out have along the ray.
+# ray starts, the depths between which no plane clips, and `left_out` of `cast`.
 COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, REACH_SLACK, START, NEAREST, FARTHEST, LEFT_OUT = range(10)
 HEADER = 10
 
@@ -62,7 +62,7 @@ def _call(typing_context, function, a, b, c):
 
 @_intrinsic
 def _pointer(typing_context, address):
-    """An integer as a pointer."""
+    """A pointer from an address, an integer."""
 
     def generate(context, builder, signature, arguments):
         return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
@@ -72,7 +72,10 @@ def _pointer(typing_context, address):
 
 @compiled
 def _decide(t, state, work, vertices, faces):
-    """True if a triangle is hit, and the depth of the hit; see `cast` for `work`."""
+    """Test triangle `t` in float64: True if the ray hits it, and the hit's depth.
+
+    `work` (8, 4) holds `matrix` and `row` of `cast`, then room for three corners.
+    """
     matrix, row, corners = work[:4], work[4], work[5:]
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -91,7 +94,10 @@ def _decide(t, state, work, vertices, faces):
 
 @compiled
 def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
-    """Put a hit in its place among the nearest; True if it is one of them."""
+    """Insert a hit among the nearest, by depth, then by triangle; False if it is not among the nearest.
+
+    Hits at nearly the same depth are tested in float64 first, unless they are `exact` or `sure` already.
+    """
     slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
     while i < count:
         if ids[i] == t:
@@ -171,7 +177,7 @@ def _keep_nearest(arguments):
 
 
 def keep_nearest_address() -> int:
-    """Address of the intersection filter."""
+    """Address of the intersection filter, for Embree to call."""
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
@@ -180,28 +186,28 @@ def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
     vertices, faces, owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
 ):  # fmt: skip
-    """Fill the fragment arrays for tiles of pixels, or for pieces of a list of them.
+    """Fill the fragment arrays for tiles of pixels, or for pieces of the list `cells`.
 
     Args:
         first: first tile or piece, of TILE² pixels.
-        last: past the last.
+        last: the tile or piece past the last.
         intersect: address of rtcIntersect1.
         filter_address: address of the intersection filter.
         scene: Embree's handle.
         matrix: (4, 4) to homogeneous pixels.
-        row: (4,) of linear depth.
+        row: (4,) coefficients of linear depth, see `depth_of`.
         ray_space: (8, 4): the camera's projection, and the inverse of its view.
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
-        planes: (4,) depths outside of which near or far plane clips, and between which neither does.
-        keep: sign of the determinants to keep, or 0.
+        planes: (4,) depths: nothing is seen before the first or beyond the second; between the others no plane clips.
+        keep: sign of the determinants of triangles to keep; 0 keeps both.
         left_out: 1 to leave out triangles seen from behind, −1 from the front, 0 for none.
         vertices: (V, 3) of the proxy.
         faces: (T, 3).
-        owners: (M,) of `Covers`.
-        margins: (T,) of `Covers`.
-        width: of the image.
-        height: of the image.
-        cells: (M,) int32, flat indices of the pixels to cast rays through, −1 for none; of no length for all H · W.
+        owners: see `Covers`.
+        margins: (T,), see `Covers`.
+        width: the image's width.
+        height: the image's height.
+        cells: (M,) int32, flat indices of the pixels to cast rays through, −1 for none; empty for all H · W pixels.
         triangle_ids: (K, M or H · W) to fill.
         barycentrics: (K, M or H · W, 2) to fill.
         depths_out: (K, M or H · W) to fill.
@@ -288,7 +294,10 @@ def cast(
 
 @compiled
 def _pixels(tile, across, width, height, cells, at, columns, lines):
-    """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; and their number."""
+    """Fill in the pixels of a tile, or of a piece of `cells`: index of output, column (−1 for none), row.
+
+    Returns the number of pixels.
+    """
     count = 0
     if len(cells) > 0:
         for m in range(tile * TILE * TILE, min(len(cells), (tile + 1) * TILE * TILE)):

@@ -1,7 +1,7 @@
 """Ray casting with Embree 4: the structure of a static mesh is built once, and only rays move.
 
-Embree's library is called directly, on shared buffers and from compiled loops on all cores; where it cannot be found,
-the public interface of the package embreex serves, slower and to the same end.
+Embree's library is called directly, on shared buffers and from compiled loops on all cores. Where it cannot be found,
+the public interface of the package embreex is used instead, which is slower.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ REFITS = 32
 
 
 class Structure:
-    """A proxy and Embree's structure over covers of its triangles, moved and scaled to the unit sphere."""
+    """A proxy and Embree's acceleration structure over covers of its triangles, scaled to the unit sphere."""
 
     def __init__(self, proxy: Proxy):
         self.proxy = _packed(proxy)
@@ -34,7 +34,7 @@ class Structure:
         self.refits = 0
 
     def move(self, proxy: Proxy) -> bool:
-        """Follow other vertices of the same faces; False if they need a new structure."""
+        """Refit to a proxy with the same faces and moved vertices; False if it needs a new structure."""
         proxy = _packed(proxy)
         sphere = bounding_sphere(proxy.vertices, proxy.faces)
         if not self.covers.follow(proxy.vertices, proxy.faces, sphere):
@@ -46,14 +46,14 @@ class Structure:
 
 
 class Embree(TriangleSampler):
-    """K nearest hits a pixel by an intersection filter, decided in float64 as the rasterizer decides."""
+    """Sampler that casts rays: K nearest hits a pixel, tested in float64 by the rules of the sampler "raster"."""
 
     def prepare(self, proxy: Proxy) -> Structure:
-        """Build the acceleration structure."""
+        """Build Embree's acceleration structure of a proxy."""
         return Structure(super().prepare(proxy))
 
     def update(self, prepared: Structure, proxy: Proxy) -> Structure | None:
-        """Refit the structure to moved vertices."""
+        """Refit the structure to moved vertices; None if the proxy must be prepared anew."""
         return prepared if prepared.move(proxy) else None
 
     def rasterize(
@@ -69,7 +69,7 @@ class Embree(TriangleSampler):
     def rasterize_cells(
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: a ray for each of these cells."""
+        """See `TriangleSampler.rasterize_cells`: a ray for each of `cells`."""
         if isinstance(prepared.scene, embreex_fallback.Scene) or not cells.size:
             return super().rasterize_cells(prepared, camera, size, layers, cull, cells)
         flat = np.ascontiguousarray(cells, np.int32).reshape(-1)
@@ -79,7 +79,7 @@ class Embree(TriangleSampler):
 def _cast(
     prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, cells: np.ndarray, shape: tuple[int, ...]
 ) -> Fragments:
-    """Fragments (K, ·, ·) of some cells, or of all where none are named."""
+    """Fragments of `shape` (K, ·, ·): of `cells`, flat indices of pixels, or of all pixels if `cells` is empty."""
     scene: Any = prepared.scene
     (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(cells) // TILE**2) if len(cells) else -(-height // TILE) * -(-width // TILE)
@@ -112,7 +112,7 @@ def _cast(
 
 
 def _packed(proxy: Proxy) -> Proxy:
-    """The proxy in arrays as compiled code and Embree read them: row by row, without gaps."""
+    """The proxy with C-contiguous arrays, float32 and int32, as compiled code and Embree read them."""
     vertices = np.ascontiguousarray(proxy.vertices, np.float32)
     return proxy._replace(vertices=vertices, faces=np.ascontiguousarray(proxy.faces, np.int32))
 
@@ -120,7 +120,7 @@ def _packed(proxy: Proxy) -> Proxy:
 def _planes(p: np.ndarray) -> np.ndarray:
     """(4,) depths: nothing is seen before the first or beyond the second, and all between the other two.
 
-    Planes that are not straight on have no one depth: then everything is left to the exact test.
+    A slanted plane has no single depth: then every hit is left to the exact test.
     """
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return np.array([-np.inf, np.inf, np.inf, -np.inf])

@@ -1,6 +1,6 @@
 """Pairs of cells between which a line of crossing runs: those of `rts.splatting.crossings`, compiled.
 
-A quick test by vector instructions leaves few other cells: beside a line the gap between two layers is small, and
+A quick test by vector instructions leaves few cells to look at: beside a line the gap between two layers is small, and
 grows.
 """
 
@@ -17,7 +17,7 @@ from rts.plugin_api.threads import parallel, read_only
 BORDER = 3
 """Rows added on each side of depths (2, ·, W), and rows and columns of gaps (·, ·).
 
-Cells as far away as this decide whether two neighbours form a pair. Rows y below count from the first added one."""
+Whether two neighbours form a pair depends on cells as far away as this. In windows, row 0 is the first added one."""
 STEPS = np.array([(1, 0), (0, 1), (1, 1), (1, -1)])
 """Steps (x, y) from one cell of a pair to the other, for bits 0 to 3."""
 CHUNK = 32
@@ -83,14 +83,14 @@ def nothing(width: int) -> tuple[np.ndarray, np.ndarray]:
 
 @loop
 def gather(start, stop, positions, row, some, z, gap):
-    """Fill the rows of depths and gaps, within [start, stop), that decide about pairs.
+    """Fill the rows of depths and gaps, within [start, stop), that pairs depend on.
 
     Args:
-        start: first row, as z counts them.
+        start: first row, an index of z.
         stop: end of the rows.
         positions: (N, 3).
         row: (K, H, W).
-        some: (H,), whether a row has pairs.
+        some: (H,), True for rows that have pairs.
         z: (2, H + 2 BORDER, W), to be filled with depths of the first two layers, where a cell has both.
         gap: (H + 2 BORDER, W + 2 BORDER), to be filled with their distance, or infinity.
     """
@@ -149,7 +149,7 @@ def _window(width, kind):
 
 @compiled
 def _load_cells(z, gap, positions, row, y):
-    """Fill depths (2, W) and gaps of a row, for its cells of two layers; return whether it has any."""
+    """Fill depths (2, W) and gaps of a row, for its cells of two layers; return True if there are any."""
     width, some = row.shape[2], False
     for left in range(0, width, CHUNK):
         right = min(left + CHUNK, width)
@@ -212,7 +212,7 @@ def _find(start, stop, z, gap, most, rules, candidates, bits, some):
 
 @compiled
 def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, that a cell of a window of rows belongs to."""
+    """Find pairs, or `candidates`, of which one cell is (y, x) of a window of rows."""
     rows, width = z.shape[1:]
     for n in range(8):
         u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
@@ -259,7 +259,7 @@ def _suspect(marks, gap, above, level, below):
 
 @compiled
 def _crosses(z, gap, rules, y, x, v, u):
-    """True if a line runs between a cell and the one a step (u, v) farther on."""
+    """True if a line of crossing runs between a cell and the one a step (u, v) farther on."""
     ratio = _ratio(z, gap, rules, y, x, v, u)
     if not ratio < rules.largest:
         return False
@@ -358,7 +358,7 @@ def steps(bits, y, x):
 
 @loop
 def _keep(covered, bits, some, reach, kept):
-    """Keep the first two layers near pairs."""
+    """Mark in `kept` the samples of the first two layers that are at most `reach` rows and columns from a pair."""
     _, height, width = covered.shape
     for y in range(height):
         for x in range(width if some[y] else 0):

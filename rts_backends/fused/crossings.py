@@ -1,6 +1,6 @@
 """Lines of crossing, where surfaces pass through one another: `rts.splatting.crossings` for the compiled `Visible`.
 
-The derivatives of targets beside a line are computed here: in positions always, in colours unless the target is mixed.
+Here the derivatives of targets beside a line are computed: by positions always, by colours unless the target is mixed.
 These targets are few: one thread adds up their gradients, in order.
 """
 
@@ -26,13 +26,13 @@ class Crossings(NamedTuple):
 
     Attributes:
         offsets: (H + 1,) int64, where the cells of each row begin in the lists below.
-        columns: (M,) int32, their columns; −1 where the derivative turns out not to be that of a line.
-        mixed: (M,) int64, their places in the list of mixed targets (`rts_backends.fused.cells.Choices`), or −1.
-        sheets: (M, 9) uint8, the sheet of each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
-        weights: (M, 9, 3), of the sources' fronts: the share of their colour in that of a target that is not mixed; and
-            the slopes of their weight with their position, over the sum of all weights.
+        columns: (M,) int32, the targets' columns; −1 where the derivative turns out not to be that of a line.
+        mixed: (M,) int64, indices in the list of mixed targets (`rts_backends.fused.cells.Choices`), −1 if not mixed.
+        sheets: (M, 9) uint8, the sheet of each source; source 3 (v + 1) + (u + 1) lies at −(u, v) from the target.
+        weights: (M, 9, 3), for each source's front: the share of its colour in a target that is not mixed; and the
+            derivatives of its weight by its position x and y, over the sum of all weights.
         colors: (M, 2, 4), the sheets' mean colours.
-        slopes: (M, 5), the share of the difference of these colours that a unit of ġ moves; and ∇z of both sheets.
+        slopes: (M, 5), the derivative of sheet b's share of the target by ġ (`rate`); and ∇z of both sheets.
     """
 
     offsets: np.ndarray
@@ -44,22 +44,22 @@ class Crossings(NamedTuple):
     slopes: np.ndarray
 
     def cells(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of these targets."""
+        """Rows and columns of the targets whose derivative is that of a line."""
         own, rows = self.columns >= 0, np.arange(len(self.offsets) - 1)
         return np.repeat(rows, np.diff(self.offsets))[own], self.columns[own]
 
     def still(self, offsets: np.ndarray, columns: np.ndarray, changes: np.ndarray) -> None:
-        """Clear these targets' changes with coverage in the list of `Outlines`: lines of crossing replace them.
+        """Clear the changes of these targets in a list of `Outlines`: lines of crossing replace them.
 
         Args:
-            offsets: (H + 1,), where the targets of each row begin in the list.
-            columns: (M,) of the list.
-            changes: (M, 2, 4), changed in place.
+            offsets: (H + 1,), where the targets of each row begin in that list.
+            columns: (M,) of that list.
+            changes: (M, 2, 4) of that list, changed in place.
         """
         parallel(_still, len(offsets) - 1, *self[:2], offsets, columns, changes, work=4 * len(columns))
 
     def among_mixed(self) -> np.ndarray:
-        """Places in the list of mixed targets, of the targets that are mixed."""
+        """Indices in the list of mixed targets of the targets that are beside a line and mixed."""
         return self.mixed[(self.columns >= 0) & (self.mixed >= 0)]
 
 
@@ -77,14 +77,14 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
 
 
 def listed(grid: Grid, choices: Any, extent: np.floating, bits: np.ndarray, some: np.ndarray) -> Crossings:
-    """The targets beside lines.
+    """The targets beside lines of crossing.
 
     Args:
         grid: the samples.
         choices: see `rts_backends.fused.cells.Choices`.
         extent: largest less least depth of the fronts, the camera's 0 included.
-        bits: the pairs of `crossing_pairs.py`.
-        some: (H,) bool, whether a row has pairs.
+        bits: (H, W), the pairs of `crossing_pairs.py`.
+        some: (H,) bool, True for rows that have pairs.
     """
     positions, row = grid.positions, grid.row
     height, width = bits.shape
@@ -114,9 +114,10 @@ def _still(start, stop, firsts, crossed, offsets, columns, changes):
 
 @loop
 def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, z, gap, rules, around, counts):
-    """Find targets of rows [start, stop): bits 3 (v + 1) + (u + 1) of the steps to partners, and numbers by row.
+    """Find targets beside lines in rows [start, stop).
 
-    A target amid one colour is left out: its derivative is already that of a line.
+    Fills `around`, bits 3 (v + 1) + (u + 1) of the steps (u, v) from a target to its partners, and `counts`, the number
+    of targets in each row. A target amid one colour is left out: its derivative is already that of a line.
     """
     height, width = bits.shape
     sheets, slopes = np.empty(9, np.uint8), np.empty(4, z.dtype)
@@ -136,7 +137,7 @@ def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, 
 
 @compiled
 def _place(columns, m, mixed, y, x):
-    """The place of a mixed target in the list of them, searched from m on; any place if it is not mixed."""
+    """The index of a mixed target in the list of mixed targets, searched from m on; any index if it is not mixed."""
     while mixed[y, x] and columns[m] < x:
         m += 1
     return m
@@ -157,7 +158,7 @@ def _fill(
     around,
     result,
 ):
-    """Fill the lists of the targets of rows [start, stop)."""
+    """Fill the lists of `result` for targets of rows [start, stop)."""
     row = grid.row
     slopes = np.empty(4, grid.positions.dtype)
     for y in range(start, stop):
@@ -173,7 +174,7 @@ def _fill(
 
 @compiled
 def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
-    """Sort the sources of a pair's cell into sheets, and find the sheets' slopes; return whether both are possible."""
+    """Sort the sources of a target into sheets, and fill in the sheets' slopes; True if both succeed."""
     _sort(sheets, row, mixed[y, x], ranges, m, around, y, x)
     at = y + BORDER, x
     return _incline(slopes, sheets, z, gap, *at) and _complete(sheets, slopes, z, gap, rules.fit, *at)
@@ -181,7 +182,7 @@ def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
 
 @compiled
 def _sort(sheets, row, mixed, ranges, m, around, y, x):
-    """Sort sources into sheets, by pairs and by layers paired front to front."""
+    """Sort sources into sheets: partners into b, others paired front to front into a, the rest into neither."""
     _, height, width = row.shape
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
@@ -195,7 +196,7 @@ def _sort(sheets, row, mixed, ranges, m, around, y, x):
 
 @compiled
 def _incline(slopes, sheets, z, gap, y, x):
-    """Fill the slopes of the sheets a and b, each along x and y; return whether all are known."""
+    """Fill the slopes of sheets a and b, each along x and y; False if no sorted neighbour along an axis has both."""
     for axis in range(2):
         # The sources ahead and behind.
         ahead, behind = (3, 5) if axis == 0 else (1, 7)
@@ -217,7 +218,7 @@ def _incline(slopes, sheets, z, gap, y, x):
 
 @compiled
 def _complete(sheets, slopes, z, gap, fit, y, x):
-    """Sort unsorted sources of two layers by the sheets' planes through the target; return whether all are sorted."""
+    """Sort unsorted sources of two layers by the sheets' planes through the target; True if all get sorted."""
     kind = slopes.dtype.type
     gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
     square = gx * gx + gy * gy
@@ -242,7 +243,7 @@ def _complete(sheets, slopes, z, gap, fit, y, x):
 
 @compiled
 def _weigh(d, result, slopes, grid, y, x):
-    """Fill the terms of a target's derivative."""
+    """Fill entry d of `result`, the terms of a target's derivative."""
     rgba, row, kind = grid.rgba, grid.row, grid.positions.dtype.type
     zero, one, slope = kind(0), kind(1), kind(2) * grid.scale * grid.gamma
     weights, colors, sheets = result.weights[d], result.colors[d], result.sheets[d]
@@ -279,14 +280,14 @@ def _weigh(d, result, slopes, grid, y, x):
 
 @compiled
 def rate(slopes, t_positions, i, j):
-    """ġ along a tangent of positions, at a target with the samples i and j."""
+    """ġ, the rate of sheet a's depth less sheet b's at a target, along a tangent of its samples i and j."""
     a = t_positions[i, 2] - slopes[1] * t_positions[i, 0] - slopes[2] * t_positions[i, 1]
     return a - (t_positions[j, 2] - slopes[3] * t_positions[j, 0] - slopes[4] * t_positions[j, 1])
 
 
 @compiled
 def change_of(pixel, d, lines, grid, ranges, sums, y, t_positions, t_rgba):
-    """The derivative (4,) of a listed target along tangents (N, 3) and (N, 4), or of no rows: zeros."""
+    """Fill `pixel` (4,) with the derivative of listed target d along tangents (N, 3) and (N, 4); no rows mean zeros."""
     rgba, row, x, m = grid.rgba, grid.row, lines.columns[d], lines.mixed[d]
     colors, moves = lines.colors[d], pixel.dtype.type(0)
     if len(t_positions) > 0:
@@ -318,9 +319,9 @@ def push(start, stop, grid, ranges, sums, lines, t_positions, t_rgba, border, ou
 
 @loop
 def pull(rgba, row, lines, border, g, g_positions, g_rgba):
-    """Add listed targets' shares to the gradients of positions (N, 3) and rgba (N, 4), or of no rows.
+    """Add listed targets' shares to the gradients of positions (N, 3) and rgba (N, 4); one of no rows is not wanted.
 
-    Mixed targets add nothing to that of rgba.
+    Mixed targets add nothing to the gradient of rgba here.
     """
     zero = g.dtype.type(0)
     for y in range(border, len(g) + border):

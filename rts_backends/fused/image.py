@@ -28,7 +28,7 @@ def specification(
     *,
     settings: Settings,
 ) -> Array:
-    """The image in array code."""
+    """The image, with the border cut off, in array code; operands without rows are absent."""
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
@@ -111,7 +111,7 @@ IMAGE = Operation(
     sweeps=True,
     **_OPTIONS,
 )
-"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
-a border.
+"""The image of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit: (H, W, 4), less
+the border, which is cut off.
 
 The last five are fields of `Splats`; absent ones have no rows: (0, H, W) or (0, W)."""

@@ -14,13 +14,13 @@ FAR, LEAST_SHARE = Loss.FAR, Loss.LEAST_SHARE
 
 
 def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:
-    """A loss in the form that loops take: its number, and its scale in the residuals' dtype."""
+    """A loss in the form that loops take: its number, such as HUBER, and its scale in the residuals' dtype."""
     return loss.place, np.dtype(dtype).type(loss.f_scale)
 
 
 @compiled
 def cost_and_weight(residual, loss):
-    """s² ρ((r / s)²) of a residual r, and ρ'."""
+    """Cost s² ρ((r / s)²) of a residual r, for a loss ρ of scale s; and the weight ρ'."""
     place, scale = loss
     one = type(scale)(1)
     if place == LINEAR or residual == 0:

@@ -9,7 +9,7 @@ from rts_backends.fused.rows import Grid, compiled, exp, loop
 
 @compiled
 def splat(grid, i, y, x, u, v):
-    """Weight of sample i of cell (y, x) at offset (u, v), and the target's distance from it along x and y."""
+    """Weight of sample i of cell (y, x) at the target (u, v) farther on, and the offset from sample to target."""
     positions, peak, gamma = grid.positions, grid.peak, grid.gamma
     kind, half = positions.dtype.type, positions.dtype.type(0.5)
     dx = kind(u) - gamma * (positions[i, 0] - (kind(x) + half))
@@ -19,7 +19,7 @@ def splat(grid, i, y, x, u, v):
 
 @compiled
 def sums_of(total, grid, y, x, choice):
-    """Sums (3, 5) of a target's buffers, their colours over the weight, taken as at least one."""
+    """Fill `total` (3, 5) with a target's buffers: colours over the weight, taken as at least one; and the weight."""
     rgba, row = grid.rgba, grid.row
     _, height, width = row.shape
     one = total.dtype.type(1)
@@ -46,7 +46,7 @@ def sums_of(total, grid, y, x, choice):
 
 @loop
 def forward(start, stop, offsets, columns, sums, border, image):
-    """Fill mixed targets of rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
+    """Fill mixed targets of rows [start, stop) of the image (H, W, 4), the cells less a border `border` wide."""
     one = image.dtype.type(1)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
@@ -60,7 +60,7 @@ def forward(start, stop, offsets, columns, sums, border, image):
 
 @loop
 def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
-    """Adjoints (M, 3, 5) of the sums of mixed targets from that of the image, zero beyond it."""
+    """Fill adjoints (M, 3, 5) of the sums of mixed targets, from the image's; zero for targets in the border."""
     zero, one = g.dtype.type(0), g.dtype.type(1)
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
@@ -87,7 +87,7 @@ def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
 
 @compiled
 def _any(adjoints, d):
-    """True if any adjoint of a target's sums is not zero: beside wanted targets many are."""
+    """True if any adjoint of a target's sums is not zero; beside wanted targets, many have zeros alone."""
     some = False
     for b in range(3):
         for c in range(5):
@@ -167,7 +167,7 @@ def tint_of(pixel, total, grid, y, x, choice, t_rgba):
 
 @compiled
 def changes_of(changes, total, grid, y, x, choice, t_positions, t_rgba):
-    """Tangents (T, 3, 5) of the normalised sums of a target's buffers."""
+    """Fill `changes` (T, 3, 5), tangents of `total`, the normalised sums of a target's buffers."""
     rgba, row = grid.rgba, grid.row
     _, height, width = row.shape
     zero, one = total.dtype.type(0), total.dtype.type(1)

@@ -47,18 +47,18 @@ FINEST = TILE
 """The most cells a pixel, along each axis, that fit into a tile."""
 
 OPACITY = 3 * PITCH
-"""Place of alpha among the planes of a row."""
+"""Index at which alpha begins among the planes of a row."""
 
 
 def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tuple[Array, ...] | None:
     """`normal_equations` of arrays of any engine on the host, traced or not.
 
-    None for arrays elsewhere, or if a pixel has more cells than a tile.
+    None for arrays on other devices or of several dtypes, or if a pixel has more cells than a tile.
 
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
-        loss: of the residuals.
+        loss: the loss of the residuals.
         *given: positions, rgba, row, part, facing, wanted, settled, exit and the arguments of `normal_equations` from
             `t_positions`, arrays or None.
     """
@@ -100,9 +100,9 @@ def normal_equations(
         t_positions: (T, N, 3), tangents of their positions along T directions.
         t_rgba: (T, N, 4) of their colours; None for zeros.
         target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
-        weights: (H, W, 1) or (H, W, C), or None.
-        background: (H, W, 4), what the image is composited onto, or None.
-        loss: of the residuals; W and S are diagonals of its `weights`.
+        weights: (H, W, 1) or (H, W, C); None for ones.
+        background: (H, W, 4), the image that this one is composited onto, or None.
+        loss: the loss of the residuals; W and S are diagonal matrices of its `weights`.
     """
     count, dtype = len(t_positions), cells.positions.dtype
     if t_rgba is None or not _any(t_rgba):
@@ -133,9 +133,9 @@ def _any(tangents: np.ndarray) -> bool:
 def _accumulate(
     start, stop, planes, plain, grid, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
 ):
-    """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop) of rows; lower triangles.
+    """Fill `sums` (B, T + 1, T + 1) for bands [start, stop): products of T tangents and, last, the residuals.
 
-    Each pixel is the mean of `fine` rows and columns of cells.
+    Only lower triangles are filled. Each pixel is the mean of `fine` rows and columns of cells.
     """
     positions, rgba, row = grid.positions, grid.rgba, grid.row
     t_positions, t_rgba = tangents
@@ -262,7 +262,7 @@ def _move_lines(change, grid, choices, crossings, tangents, border, y, left, cou
 
 @compiled
 def _counts(weights):
-    """True if any weight (·, C) is not zero."""
+    """True if any of `weights` (·, C) is not zero."""
     some = False
     for j in range(len(weights)):
         for c in range(weights.shape[1]):
@@ -272,7 +272,10 @@ def _counts(weights):
 
 @compiled
 def _settle(change, value, rgba, t_rgba, settled, moving):
-    """Fill values and tangents of the settled targets of a row of a tile; return whether any of them changes."""
+    """Fill values and tangents of targets of a row of a tile that have one colour (`settled`, an index of rgba).
+
+    Returns True if their tangents may differ from zero.
+    """
     some, colored = False, t_rgba.shape[1] > 0
     for j in range(len(settled)):
         some |= settled[j] >= 0
@@ -292,7 +295,7 @@ def _settle(change, value, rgba, t_rgba, settled, moving):
 
 @compiled
 def _multiply(sums, products, change, value, fields, loss, y, left, count, changing):
-    """Add the products of a row of a tile; if nothing changes in it, those of the residuals alone."""
+    """Add the products of a row of a tile to `sums`; unless `changing`, those of the residuals alone."""
     target, weights, background = fields
     channels, many = target.shape[2], len(change)
     first, one = 3 if channels == 1 else 0, value.dtype.type(1)

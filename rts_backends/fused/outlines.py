@@ -1,8 +1,8 @@
 """Derivatives of the compiled `Visible` by moving outlines; these move as `rts.splatting.rims` says.
 
 Let v̂ be the motion of the outline beside a cell, and v that of its front. A source of weight w adds to a target's
-derivative ∂w · (v̂ − v), times the change of the target's colour with the coverage of one buffer. Only targets count
-that a buffer covers in part. Gradients add up in one order: every other band of rows first, then those between.
+derivative ∂w · (v̂ − v), times the change of the target's colour with the coverage of one buffer, if the buffer covers
+the target in part. Gradients add up in one order: every other band of rows first, then those between.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class Outlines(NamedTuple):
     """Motions of outlines, and the targets that they cover in part.
 
     Attributes:
-        beta: (H, W), β of the targets below that are covered; 0 where the front's own motion is the outline's.
-        partner: (H, W) int32, the partner's sample where β is not 0.
+        beta: (H, W), β at the targets below that are covered: v̂ = v + β (v − the motion of the partner's sample).
+        partner: (H, W) int32, the partner's sample, an index of positions, where β is not 0.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
-        columns: (M,) int32, their columns.
+        columns: (M,) int32, the targets' columns.
         gives: (M, 9) uint8, the kind of coverage from each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
         slopes: (M, 9, 2), derivatives of these sources' weights with their position.
         changes: (M, 2, 4), derivatives of the target's colour with coverage in front, and at the surface.
@@ -67,7 +67,7 @@ DIRECTIONS = LISTED - 1
 """Bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends, in the `ends` of `survey`."""
 
 BESIDE = LISTED << 1
-"""Mark in `ends` of targets whose outline affects listed ones beside them."""
+"""Mark in `ends` of targets that are not LISTED, but whose outline affects LISTED ones beside them."""
 
 
 def _ordered(bits: int) -> list[int]:
@@ -90,14 +90,16 @@ OUTWARD = np.array([_ordered(bits) for bits in range(LISTED)], np.int8)
 
 @loop
 def narrow(start, stop, ends, wanted, kept, counts):
-    """Clear marks of rows [start, stop) at targets that are neither wanted nor beside wanted ones.
+    """Copy `ends` to `kept` in rows [start, stop), without LISTED at targets that are not wanted.
+
+    Of these, targets beside wanted ones that are LISTED get the mark BESIDE.
 
     Args:
         start: first row.
         stop: end of the rows.
         ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`.
-        wanted: (H, W) uint8.
-        kept: (H, W) uint16, to be filled as `ends`, and with marks BESIDE.
+        wanted: (H, W) uint8, not 0 for targets whose colour is wanted.
+        kept: (H, W) uint16, to be filled.
         counts: (H,), to be filled with the number of listed targets.
     """
     height, width = ends.shape
@@ -128,7 +130,7 @@ def _beside(ends, wanted, y, x):
 
 @compiled
 def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
-    """β and the partner's sample of a cell whose front ends somewhere."""
+    """β and the partner's sample (see `Outlines`) of a cell whose front ends in some direction."""
     layers, height, width = row.shape
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
     bits, front = ends[y, x] & DIRECTIONS, positions[row[0, y, x], 2]
@@ -196,7 +198,7 @@ def fill(
         stop: end of the rows.
         grid: the samples.
         part: (K, H, W), the part of each sample, or no layers.
-        one_part: whether all samples belong to one part.
+        one_part: True if all samples are of one part.
         exits: (H, W), where rays leave the part of the front, or no rows.
         extent: largest less least depth of the fronts, the camera's 0 included.
         rules: limits of the rules.
@@ -325,7 +327,7 @@ def _change_mixed(changes, d, sums, m):
 
 @compiled(inline="always")
 def _list(gives, d, ranges, m, front, surface):
-    """Fill the kinds of coverage that a mixed target gets; sources with a front are marked before."""
+    """Fill the kinds of coverage that a mixed target gets; `gives` is NOTHING before for sources without a front."""
     for n in range(9):
         if gives[d, n] != NOTHING:
             if front and ranges[m, n, 0, 1] == 1:
@@ -399,7 +401,7 @@ def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_posi
 
 @loop
 def _pull(start, stop, row, outlines, border, g, first, g_positions):
-    """`pull` of every other band of rows, from band `first` on: these share no sample."""
+    """`pull` of every other band of rows, from band `first` on: such bands share no sample."""
     beta, partner, offsets, columns, gives, slopes, changes = outlines
     arrays = beta, partner, offsets, columns, gives, slopes, changes
     for band in range(start, stop):
@@ -409,7 +411,7 @@ def _pull(start, stop, row, outlines, border, g, first, g_positions):
 
 @compiled
 def _pull_rows(top, bottom, row, beta, partner, offsets, columns, gives, slopes, changes, border, g, g_positions):
-    """`pull` of some rows."""
+    """`pull` of the targets of rows [top, bottom)."""
     width, zero = g.shape[1], g_positions.dtype.type(0)
     for y in range(top, bottom):
         for d in range(offsets[y], offsets[y + 1]):

@@ -1,4 +1,4 @@
-"""Mixed targets: those with a source that is not paired front to front, by depths."""
+"""Mixed targets, found by depths: targets with a source that is not paired front to front."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
 
     Args:
         mixed: (W,) uint8, to be filled.
-        asked: (B,) uint8, the blocks of columns to look at; in others nothing is mixed.
+        asked: (B,) uint8, 1 for the blocks of columns to look at; targets in others are not mixed.
         positions: (N, 3).
         row: (K, H, W).
         y: the row.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
-        z: (3, K, W + 2), depths of this row and its neighbours, one more at each side; filled where `loaded` says so.
-        loaded: (3, B) int64, the rows that z holds.
+        z: (3, K, W + 2), depths of rows y − 1 to y + 1, one more at each side; filled where `loaded` has another row.
+        loaded: (3, B) int64, the row that z holds in each block.
         target: (K, BLOCK), working memory.
     """
     layers, _, width = row.shape
@@ -80,7 +80,7 @@ def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front
 
 @compiled
 def _nearer(front, hidden, x, target_front, target_hidden):
-    """`_mark` for three sources; comparisons with NaN are false."""
+    """True if `_mark` marks a target for one of three sources in a row; comparisons with NaN are false."""
     some = False
     for u in range(3):
         f, h = front[x + u], hidden[x + u]

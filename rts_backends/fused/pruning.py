@@ -11,13 +11,13 @@ from rts_backends.fused import crossing_pairs
 from rts_backends.fused.cells import Settings
 
 HALO = 3
-"""Rows on either side that decide about a row: its marks depend on neighbours, and these on theirs."""
+"""Rows on either side that a row's samples depend on: a row's marks depend on neighbours, and these on theirs."""
 
 UNSIGNED = np.int32(0x7FFFFFFF)
 """All bits of a float32 but the sign's."""
 
 MIXED, RING = 1, 2
-"""Marks: targets at which hidden layers may count, and cells beside empty ones."""
+"""Marks of targets whose colour may depend on hidden layers, and of cells beside empty ones."""
 
 
 def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.ndarray:
@@ -67,7 +67,7 @@ def _find_extremes(start, stop, bits, covered, extremes):
 
 @loop
 def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued, kept):
-    """Keep the fronts of rows [start, stop), and hidden layers around marks; around RING alone, only the second."""
+    """Keep the fronts of rows [start, stop), and hidden layers around marks; around RING alone, the second layer."""
     layers, height, width = covered.shape
     # From row start − HALO on: depths with a border, NaN where there is nothing; least and largest front, least hidden.
     rows = stop - start + 2 * HALO
@@ -121,7 +121,7 @@ def _bound(least, largest, hidden, front, second):
 
 @compiled
 def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
-    """Mark the targets of a row."""
+    """Mark the targets of row r whose colour may depend on hidden layers."""
     width = z.shape[2] - 2
     above, level, below = bounds[r - 1], bounds[r], bounds[r + 1]
     least, largest = (above[0], level[0], below[0]), (above[1], level[1], below[1])
@@ -145,7 +145,7 @@ def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
 
 @compiled
 def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2, hidden0, hidden1, hidden2, margin):
-    """Mark covered targets whose hidden layers are not all farther behind the fronts than these are apart: few."""
+    """Mark the covered targets, few, whose hidden layers are not all farther behind fronts than fronts are apart."""
     for x in range(len(least0)):
         a, b, c = least0[x], least1[x], least2[x]
         least = b if b < a else a
@@ -162,7 +162,7 @@ def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2,
 
 @compiled
 def _near(z, r, x, margin):
-    """True if a hidden layer is about as near as the fronts are; NaN of an empty cell compares as false."""
+    """True if a hidden layer pairs with some source about as near as the fronts do; comparisons with NaN are false."""
     target = z[0, r, x + 1]
     for n in range(9):
         source = z[0, r - 1 + n // 3, x + n % 3]

@@ -1,4 +1,4 @@
-"""Rows of cells and of buffers as planes of numbers, for the splatting of plain targets.
+"""Rows of cells and of buffers as planes of numbers, for the splatting of plain targets, which are not mixed.
 
 A task owns a band of rows and works through it in tiles of columns. A row of a tile is kept as planes of `PITCH`
 numbers in one flat array. The planes' places are constants: so the compiler sees that they do not overlap, and uses
@@ -30,10 +30,11 @@ PITCH = TILE + 8
 """A plane holds a row of a tile, and up to two cells more at each end."""
 
 COLOR, ONE, WX, WY, RX, RY, SOURCE = (PITCH * p for p in (0, 4, 5, 8, 11, 12, 13))
-"""Places in a source's slot: colour, 1 if covered, weights by u and by v, offset from the cell's centre."""
+"""Where planes begin in a source's slot: colour, 1 if covered, weights by u and by v, offset from the cell's centre.
+SOURCE is the slot's length."""
 
 SUM, SUMS = 5 * PITCH, 10 * PITCH
-"""Numbers of one buffer's sums, and of two buffers': colours and the weight."""
+"""Length of one buffer's sums, and of two buffers': colours and the weight."""
 
 compiled = partial(loops.compiled, fastmath={"contract"})
 loop = partial(loops.loop, fastmath={"contract"})
@@ -75,9 +76,9 @@ class Grid(NamedTuple):
         positions: (N, 3).
         rgba: (N, 4).
         row: (K, H, W) int32, the sample of each cell, or −1.
-        scale: the exponent's factor.
-        peak: the largest weight, along one axis.
-        gamma: the calibration.
+        scale: the factor of squared distances in the exponent.
+        peak: the largest weight along one axis.
+        gamma: the calibration, a factor of offsets from cells' centres.
     """
 
     positions: np.ndarray
@@ -93,7 +94,7 @@ class Grid(NamedTuple):
 
 @compiled
 def slot(s, k, y, size):
-    """The slot of layer k in row y ≥ −2."""
+    """The slot, `size` numbers of s, of layer k in row y ≥ −2."""
     start = (3 * k + (y + 3) % 3) * size
     return s[start : start + size]
 
@@ -107,7 +108,7 @@ def tile(width, t):
 
 @compiled
 def busy(states, y, first, count, least):
-    """True if a target of a row has at least this state."""
+    """True if any of `count` targets of row y, from `first` on, has at least the state `least`."""
     height, width = states.shape
     if not 0 <= y < height:
         return False
@@ -196,7 +197,7 @@ def fill(s, rgba, cells, states, left, count):
 
 @compiled
 def store(image, y, left, s, count):
-    """Write planes to a row of an image."""
+    """Write the four planes of colour of s to `count` cells of row y of an image, from column `left` on."""
     for j in range(count):
         for c in range(4):
             image[y, left + j, c] = s[c * PITCH + j]

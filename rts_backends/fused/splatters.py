@@ -22,12 +22,12 @@ from rts_backends.fused.image import IMAGE
 
 @dataclass(frozen=True)
 class _Fused(SummingSplatter):
-    """Base of the compiled splatters; each has the settings of one in array code.
+    """Base of the compiled splatters; each has the settings of its `specification`, a splatter in array code.
 
     Attributes:
-        sigma: see `rts.splatting`, as are the others.
-        epsilon: see `sigma`.
-        calibration: see `sigma`.
+        sigma: see `rts.splatting.Single`.
+        epsilon: see `rts.splatting.Single`.
+        calibration: see `rts.splatting.Single`.
     """
 
     kind: ClassVar[str]
@@ -67,7 +67,7 @@ class _Fused(SummingSplatter):
         return self._of(splats)
 
     def _of(self, splats: Splats) -> Array:
-        """The image without the border."""
+        """The image that all cells splat into, those of the border too, with the border cut off."""
         return IMAGE(*self._operands(splats), settings=self._settings_of(splats))
 
     def _operands(self, splats: Splats) -> tuple[Array, ...]:
@@ -87,12 +87,12 @@ class _Fused(SummingSplatter):
 
     @property
     def _own_image(self) -> bool:
-        """True if the image is that of the compiled loops: a subclass may have its own."""
+        """True unless a subclass overrides `image`."""
         return type(self).image is _Fused.image
 
     @property
     def _sweeps(self) -> bool:
-        """True if the compiled loops may compute the normal equations."""
+        """True if compiled loops may compute the normal equations: no subclass overrides `image` or `cropped`."""
         return self._own_image and type(self).cropped is _Fused.cropped
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
@@ -159,10 +159,10 @@ class Visible(_Fused):
     """`rts.splatting.Visible`, compiled; see there for the settings.
 
     Attributes:
-        rims: whether coverage moves as outlines do.
-        crossings: whether lines of crossing move as depths say.
-        facing: whether opposite sides of one sheet are kept from pairing.
-        exits: whether outlines of culled parts move as the middles of their chords.
+        rims: True to have coverage move as outlines do.
+        crossings: True to have lines of crossing move as depths say.
+        facing: True to keep opposite sides of one sheet from pairing.
+        exits: True to have outlines of culled parts move as the middles of their chords.
     """
 
     kind = "visible"

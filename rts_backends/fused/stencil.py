@@ -28,15 +28,17 @@ from rts_backends.fused.rows import (
 from rts_backends.fused.uniform_cells import BUSY, FLAT, SETTLED
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
-"""Planes of a tangent that count, as tuples whose length the compiler knows: all five, or alpha and the weight."""
+"""Planes of a tangent to compute, as tuples whose length the compiler knows: all five, or alpha and the weight."""
 
 X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
-"""Places in a tangent's slot, after five planes D: w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
+"""Where planes X and Y begin in a tangent's slot, after five planes D, and the slot's length.
+
+w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
 
 
 @compiled
 def load_around(sources, loaded, grid, y, first, count):
-    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; return the first row that was not."""
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; return the first of them, or y + 2."""
     start = y + 2
     for v in range(y + 1, y - 2, -1):
         if loaded[(v + 3) % 3] != v:
@@ -48,7 +50,7 @@ def load_around(sources, loaded, grid, y, first, count):
 
 @loop
 def forward(start, stop, grid, states, border, image):
-    """Fill rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
+    """Fill rows [start, stop) of the image (H, W, 4), the cells less a border `border` wide."""
     rgba, row = grid.rgba, grid.row
     layers, (_, width, _) = len(row), image.shape
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
@@ -139,7 +141,7 @@ def _any(planes, count):
 
 @compiled
 def gather(to, s, above, level, below, count):
-    """Sums of w, w u and w v over nine targets' adjoints: for colour the first, and the three along (colour, 1).
+    """Fill `to` with sums over the adjoints a of nine targets: w a; then w, w u and w v times a · (colour, 1).
 
     Source j lies under target j + 1; `s` is its slot from the cell of j = 0.
     """
@@ -214,7 +216,7 @@ def scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
 
 @compiled
 def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope, planes=COLORS):
-    """Fill a tangent's slot beside its source's."""
+    """Fill a tangent's slot, from its source's slot `s` and the tangents of positions and colours."""
     zero, lowest = to.dtype.type(0), 5 - len(planes)
     _, height, width = row.shape
     for j in range(count):
@@ -257,7 +259,7 @@ def change_row(to, tangents, sources, total, layers, y, count, planes=COLORS):
 
 @compiled
 def add_tangent_row(to, s, tangent, v, count, planes=COLORS):
-    """The tangent of `add_row`."""
+    """Add a source row's tangents to the tangents of a buffer's row: the derivative of `add_row`."""
     wy, dv = s[WY + (v + 1) * PITCH :], s.dtype.type(v)
     for j in range(count):
         w0, w1, w2 = s[WX + 2 * PITCH + j] * wy[j], s[WX + PITCH + j + 1] * wy[j + 1], s[WX + j + 2] * wy[j + 2]

@@ -11,8 +11,8 @@ from rts.plugin_api.loops import compiled, loop
 from rts_backends.fused.pairs import BLOCK, mark
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
-"""States of targets: no splat reaches it; `settled` names the sample whose colour it shows; it lies amid splats of one
-colour; all others."""
+"""States of a target: no splat reaches it; `settled` gives the sample whose colour it shows; it lies amid splats of one
+colour; any other."""
 
 
 LISTED = 1 << 9
@@ -55,15 +55,15 @@ def survey(
         rgba: (N, 4).
         row: (K, H, W).
         exits: (H, W), samples where rays leave the part of the front, or no rows.
-        fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
+        fronts: True if front layers alone make a target FLAT; otherwise they must be opaque, to hide those behind.
         reach: the largest offset of a sample from its cell's centre, pixels, at which weights are sure to sum to one.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2, 2) zeros, for the least and the largest depth, and zero, of each row's fronts and hidden layers.
         seen: (N,) bool, zeros, to be marked: samples that a cell refers to.
-        counts: (H,) zeros, for the number of such cells, of `row` and `exits`.
+        counts: (H,) zeros, to be filled with the number of cells of `row` and `exits` that refer to a sample.
         mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows if not wanted.
-        marked: (H,) zeros, to be filled with their number in each row.
+        marked: (H,) zeros, to be filled with the number of targets marked in `mixed` in each row.
         ends: (H, W) uint16, to be filled with directions in which fronts end before nothing, and LISTED; no rows if
             not wanted.
         listed: (H,) zeros, to be filled with the number of targets that are LISTED in each row.
@@ -116,7 +116,7 @@ def survey(
 
 @compiled
 def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins, kinds):
-    """Fill the marks of a row of cells; places are one to the right of the cells', but for `kinds`."""
+    """Fill the marks of a row of cells: those of column x at index x + 1, but in `kinds` at x."""
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0
     for x in range(len(cells)):
@@ -230,7 +230,7 @@ def _mark_partial(partial, above, level, below, fronts):
 
 @compiled
 def _unite(partial, mixed, y):
-    """Mark the mixed targets of a row, too; return the number of marks."""
+    """Add the mixed targets of row y to the marks `partial`; return the number of marks."""
     count = 0
     for x in range(len(partial) if len(mixed) > 0 else 0):
         partial[x] |= mixed[y, x]
@@ -241,7 +241,7 @@ def _unite(partial, mixed, y):
 
 @compiled
 def _fill_ends(ends, partial, above, level, below):
-    """Fill a row of `ends`."""
+    """Fill a row of `ends`, see `survey`."""
     for x in range(len(ends)):
         bits = _empty(above, x, 0) | _empty(above, x + 1, 1) | _empty(above, x + 2, 2)
         bits |= _empty(level, x, 3) | _empty(level, x + 2, 5)
@@ -252,15 +252,15 @@ def _fill_ends(ends, partial, above, level, below):
 
 @compiled
 def _empty(kinds, x, n):
-    """Bit n where a cell is empty."""
+    """Bit n if the cell with index x in `kinds` is empty, else 0."""
     return np.uint16(kinds[x] & NOTHING) << n
 
 
 @loop
 def paint(start, stop, settled, border, colors, images):
-    """Give settled targets of rows [start, stop) of images (T, H, W, 4), without a border, the colours (T, N, 4).
+    """Give settled targets of rows [start, stop) the colours (T, N, 4) of the samples that `settled` names.
 
-    Colours are zero if N is 0.
+    Images (T, H, W, 4) are the targets less the border. Colours are zero if N is 0.
     """
     zero, some = images.dtype.type(0), colors.shape[1] > 0
     for n in range(len(images)):
@@ -287,9 +287,9 @@ def note(start, stop, settled, shown):
 
 @loop
 def collect(start, stop, settled, number, border, g, sums):
-    """Sum the gradient (H, W, 4) of an image without a border over settled targets of rows [start, stop).
+    """Sum the gradient (H, W, 4) of an image, the targets less the border, over settled ones of rows [start, stop).
 
-    The sums (H, S, 4) are by row and by the sample whose colour is shown; `number` (N,) numbers these samples.
+    The sums (H, S, 4) are by row and by the sample whose colour is shown; `number` (N,) gives its index among S.
     """
     width = g.shape[1]
     for y in range(start, stop):
@@ -304,7 +304,7 @@ def collect(start, stop, settled, number, border, g, sums):
 
 @compiled(fastmath={"contract", "reassoc"})
 def _add(to, g):
-    """Add the sums of (n, 4), in an order that suits vector instructions."""
+    """Add the sum of the rows of g (n, 4), in an order that suits vector instructions."""
     a, b, c, d = to[0], to[1], to[2], to[3]
     for x in range(len(g)):
         a += g[x, 0]

@@ -19,7 +19,7 @@ SHORT = 4
 
 
 def summed_by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`f` with its short sums (`_is_short`) computed column by column; arrays to trees of arrays."""
+    """`f`, a function from arrays to a tree of arrays, with its short sums (`_is_short`) computed by columns."""
 
     def call(*arrays: Any) -> Any:
         traced, shapes = jax.make_jaxpr(f, return_shape=True)(*arrays)
@@ -60,7 +60,7 @@ def variables(equations: Sequence[JaxprEqn], more: Sequence[Any] = ()) -> dict[A
 
 
 def _is_call(equation: JaxprEqn) -> bool:
-    """True if an equation calls a function that was compiled by itself."""
+    """True if an equation calls a function under a `jit` inside the program."""
     return equation.primitive.name in ("jit", "pjit")
 
 

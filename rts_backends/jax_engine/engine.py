@@ -1,4 +1,4 @@
-"""jax: eager, `jit`, and every transform, on any device."""
+"""The engine of jax arrays: eager, `jit`, and every transform, on any device."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class JaxEngine(Engine):
         return isinstance(x, jax.Array)
 
     def constant(self, value: Any, like: jax.Array | None = None) -> jax.Array:
-        """`value` as a jax array, floats in the dtype of `like`."""
+        """`value` as a jax array: floats as float64 if `like` is, else as float32; int64 as int32."""
         array = np.asarray(value)
         if np.issubdtype(array.dtype, np.floating):
             array = array.astype(np.float64 if like is not None and like.dtype == np.float64 else np.float32)
@@ -102,22 +102,22 @@ class JaxEngine(Engine):
         return x
 
     def known(self, x: jax.Array) -> np.ndarray | None:
-        """The value, also under an eager `grad` or `jvp`."""
+        """The value of `x`, also under an eager `grad` or `jvp`; None if a trace hides it, as under `jit`."""
         x = jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
         return None if isinstance(x, Tracer) else np.asarray(x)
 
     def on_host(self, *arrays: jax.Array) -> bool:
-        """True if all arrays are on CPUs. The device of a tracer is not known yet, and taken to be one."""
+        """True if all arrays are on CPUs. A tracer's device is not known yet, and taken to be a CPU."""
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
-        """See `Engine.by_host`. A traced program decides once its device is known."""
+        """See `Engine.by_host`. A traced program chooses between `f` and `otherwise` once its device is known."""
         if any(isinstance(x, Tracer) for x in arrays):
             return jax.lax.platform_dependent(*arrays, cpu=f, default=otherwise)
         return super().by_host(f, otherwise, *arrays)
 
     def take_error(self) -> RtsError | None:
-        """The error of the latest host call under a trace, once; jax replaces it by an error of its own."""
+        """The error of the latest host call under a trace, returned once; jax itself raises another in its place."""
         error, self._error = self._error, None
         return error
 
@@ -140,7 +140,7 @@ class JaxEngine(Engine):
         return True
 
     def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
-        """Rows filled by selection, which XLA can fuse with later code; ones where no cell refers to any row."""
+        """See `Engine.fill_unused`: by selection, which XLA can fuse with later code; all ones if no row is in use."""
         used = jnp.max(row) + 1
         index = jnp.arange(x.shape[0]).reshape(-1, *[1] * (x.ndim - 1))
         return jnp.where(index < used, x, jnp.where(used > 0, x[:1], 1))
@@ -148,7 +148,7 @@ class JaxEngine(Engine):
     def by_rows_in_use(
         self, f: Callable[[dict[str, jax.Array]], jax.Array], rows: Mapping[str, jax.Array], row: jax.Array, whole: Any
     ) -> jax.Array:
-        """See `Engine.by_rows_in_use`: a traced program on the CPU goes piece by piece, others take all at once."""
+        """See `Engine.by_rows_in_use`: a traced program on the CPU calls `f` piece by piece; others return `whole`."""
         if not isinstance(row, Tracer) or jax.default_backend() != "cpu":
             return whole
         used = jnp.max(row) + 1
@@ -162,7 +162,7 @@ class JaxEngine(Engine):
         return whole if result is None else result
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
-        """Sums of the rows of `values` that share a segment."""
+        """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
         return jax.ops.segment_sum(values, jnp.asarray(segments), num_segments=count)
 
     def to_numpy(self, x: jax.Array) -> np.ndarray:
@@ -207,7 +207,7 @@ class JaxEngine(Engine):
         return jax.lax.while_loop(on, step, (jnp.int32(0), state))[1]
 
     def block(self, x: Tree) -> Tree:
-        """Wait for the arrays."""
+        """Wait until the arrays of `x` are computed, and return it."""
         return jax.block_until_ready(x)
 
     def value_and_grad(self, f: Callable) -> Callable:

@@ -3,7 +3,7 @@
 `jax.pure_callback` makes jax arrays of the operands first. That takes a copy of each, and never ends where all of XLA's
 threads are already busy with host functions. It serves devices other than CPUs, whose memory the host cannot read.
 
-Shapes in a program are those of the worst case. What is not used of an array is zero.
+Shapes in a program are those of the worst case. Unused rows of an array are zero.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, partial_eval
 
 HostFunction = Callable[..., Sequence[np.ndarray | np.generic]]
-"""NumPy arrays in, which are read-only and lent for the length of the call, and NumPy arrays out."""
+"""Function from NumPy arrays, which are read-only and lent for the length of the call, to NumPy arrays."""
 
 Filler = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
-"""Operands, which are read-only and lent like the results, and the results, to be filled."""
+"""Function of operands, which are read-only, and of results, which it fills; both are lent for the call."""
 
 Shapes = Sequence[jax.ShapeDtypeStruct]
 
@@ -40,9 +40,9 @@ def filled(
     Args:
         function: fills the results.
         shapes: shapes and dtypes of the results.
-        operands: of the function.
-        in_place: the indices of operands that lie where a result is to be, and of these results, alike in shape and
-            dtype. XLA makes copies of such operands where something else reads them later.
+        operands: the function's operands.
+        in_place: index of an operand → index of the result, alike in shape and dtype, that takes over its memory. XLA
+            first copies operands that something else reads later.
     """
 
     def fill(_: Any, results: Sequence[Any], *operands: Any) -> None:
@@ -89,7 +89,7 @@ def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, l
 
 
 def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], Any]:
-    """The call with only the wanted results."""
+    """The call with only the wanted results, a rule for jax's removal of dead code; and marks of operands it reads."""
     if not any(wanted):
         return [False] * len(equation.invars), None
     used = tuple(i for i, wish in zip(equation.params["used"], wanted, strict=True) if wish)
@@ -119,7 +119,7 @@ def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Seque
 
 
 def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:
-    """Copy a value, and zeros where it is shorter than `out`."""
+    """Copy `value` to `out`, with zeros where it is shorter."""
     value = np.asarray(value)
     if value.shape != out.shape:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
@@ -130,7 +130,7 @@ def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:
 
 
 def clear(out: np.ndarray) -> None:
-    """Fill with zeros. Pages of a large array are handed back: the system gives empty ones when they are touched.
+    """Fill `out` with zeros. Pages of a large array are handed back: the system gives empty ones at the next touch.
 
     Tangents in a program are mostly rows that nobody reads: to write them makes a step of Levenberg–Marquardt up to
     half as long again.
@@ -148,7 +148,7 @@ def clear(out: np.ndarray) -> None:
 
 
 _LEAST = 1 << 17
-"""Bytes, below which a call to the system is not worth it."""
+"""The least bytes of an array for which a call to the system takes less time than writing zeros."""
 
 _advise: Callable[[int, int, int], int] | None = None
 if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.

@@ -4,9 +4,9 @@ Three primitives an operation: its value, its pushforward and its pullback. Each
 tangents or the gradients, and the transpose of the other; their derivatives by the operands, which are second
 derivatives of the operation, are taken of its specification. So is everything on devices other than the CPU.
 
-Tangents and gradients have a leading axis T, of as many as one sweep takes. Before that, `vmap` gives those operands
-that differ by item an axis B. After the operands of an operation come two numbers where they are of use: how many rows
-are in use, and a note of what its value has kept for the derivatives.
+Tangents and gradients have a leading axis T: one sweep takes T of them. Under `vmap`, operands that differ from item to
+item have an axis B before that. Two numbers may follow the operands of an operation: how many rows are in use, and a
+note, the number under which its value has kept arrays for the derivatives.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rts_backends.jax_engine.host import clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
-"""Marks of the differentiable operands that have a tangent or want a gradient."""
+"""A mark for each differentiable operand: True if it has a tangent, or its gradient is to be computed."""
 
 MOST_KEPT = 1 << 24
 """The most bytes that values keep for derivatives."""
@@ -46,7 +46,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
         operation: the operation.
         operands: its operands.
         params: its parameters.
-        used: the number of rows of packed operands in use, () int32.
+        used: the number of rows in use of the packed operands, () int32.
     """
     if operation not in _bound:
         _bound[operation] = _Differentiable(operation, _name(operation), params)
@@ -55,7 +55,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
 
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
-    """True if loops may compute the operation, by its dtypes; a traced function cannot know the device of arrays."""
+    """True if compiled loops take the operands' dtypes, outside of `by_specification`. Devices are not looked at."""
     return not _specifying.get() and operation.fits([x.dtype for x in operands])
 
 
@@ -64,7 +64,7 @@ _specifying = contextvars.ContextVar("rts_specifying", default=False)
 
 @contextlib.contextmanager
 def by_specification() -> Iterator[None]:
-    """A context within which no operation `fits`."""
+    """A context within which all operations are computed by their specifications."""
     token = _specifying.set(True)
     try:
         yield
@@ -73,7 +73,7 @@ def by_specification() -> Iterator[None]:
 
 
 class _Kept:
-    """The latest objects that values have left to derivatives, each under a number."""
+    """The latest objects that values have kept for derivatives, each under a number; `MOST_KEPT` bytes in all."""
 
     def __init__(self):
         # Does not count from 0, so that a number from another process names nothing here.
@@ -81,7 +81,7 @@ class _Kept:
         self._lock, self._bytes = threading.Lock(), 0
 
     def add(self, kept: Any) -> int:
-        """Keep an object, and give its number."""
+        """Keep an object, and return its number; beyond `MOST_KEPT` bytes the oldest objects are dropped."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._found[number] = kept
@@ -91,7 +91,7 @@ class _Kept:
         return number
 
     def get(self, number: int) -> Any:
-        """The object of a number, if it is still known, or None."""
+        """The object of a number, or None if it is no longer kept."""
         with self._lock:
             return self._found.get(number)
 
@@ -110,7 +110,7 @@ class _Differentiable:
     Args:
         operation: the operation.
         name: the name of its primitives.
-        params: some parameters; the number of axes of its result does not depend on them.
+        params: any valid parameters, which tell the number of axes of its result, the same for all.
     """
 
     def __init__(self, operation: Operation, name: str, params: Mapping[str, Any]):
@@ -155,13 +155,13 @@ class _Differentiable:
         return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:
-        """The result."""
+        """The operation's result."""
         return self._value(*operands, **params)[0]
 
     # ------------------------------------------------------------------------------------------ by compiled loops
 
     def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
-        """The operands, packed ones without unused rows; the number of rows; and the arrays that the value has kept."""
+        """Operands, packed ones cut to rows in use; the number of these rows; what the value has kept, or None."""
         operands = [read_only(x) for x in given[: self._inputs]]
         operation, used = self.operation, 0
         if operation.packed:
@@ -236,7 +236,7 @@ class _Differentiable:
         return list(jax.vmap(jax.vjp(function, *given)[1])(operands[-1]))
 
     def _among(self, wanted: Wanted, operands: Sequence, params: dict) -> tuple[Callable, list[jax.Array]]:
-        """The specification as a function of the wanted operands, and these."""
+        """The specification as a function of the wanted operands alone, and the list of these operands."""
         n = self.varied
 
         def function(*given: jax.Array) -> jax.Array:
@@ -279,7 +279,7 @@ class _Differentiable:
     def _along_operands(
         self, operation: HostPrimitive, primals: Sequence, tangents: Sequence, params: dict
     ) -> list | None:
-        """Derivatives of an operation's results along tangents of the varied operands, by specification; or None."""
+        """Derivatives of results along tangents of the differentiable operands, by specification; None if all zero."""
         n = self.varied
         _, moved = _present(tangents[:n])
         if not any(moved):
@@ -313,12 +313,12 @@ class _Differentiable:
 
 @functools.cache
 def _whole(operation: HostPrimitive, params: tuple) -> Callable:
-    """The specification of an operation, compiled as a whole: operation by operation, each would be compiled alone."""
+    """`operation.specification` compiled as a whole; eagerly, jax would compile each of its array functions alone."""
     return jax.jit(functools.partial(operation.specification, **dict(params)))
 
 
 def _spread(given: Sequence, wanted: Wanted) -> list:
-    """A list with the items at wanted places, and None elsewhere."""
+    """A list as long as `wanted`: the items of `given`, in order, where it is True, and None elsewhere."""
     it = iter(given)
     return [next(it) if wish else None for wish in wanted]
 
@@ -332,7 +332,10 @@ def _zeros(like: Sequence[jax.Array]) -> list:
 
 
 def _present(tangents: Sequence, wanted: Wanted | None = None) -> tuple[list, Wanted]:
-    """Tangents that are not zeros, and which operands they belong to."""
+    """Tangents that are not zero, and marks of the operands that have them.
+
+    `tangents` are of all operands, or of those that `wanted` marks.
+    """
     places = tangents if wanted is None else _spread(tangents, wanted)
     given = tuple(t is not None and not _is_zero(t) for t in places)
     return [t for t, g in zip(places, given, strict=True) if g], given
@@ -342,11 +345,11 @@ _bound: dict[Operation, _Differentiable] = {}
 
 
 def _name(operation: Operation) -> str:
-    """The name of its primitives: one for each operation, also if several are named alike."""
+    """A name for an operation's primitives, which no other operation has, even if several are named alike."""
     same = sum(1 for other in _bound if other.name == operation.name)
     return f"{operation.name}~{same}" if same else operation.name
 
 
 def _summed(x: jax.Array, rank: int) -> jax.Array:
-    """The sum over items of a batch, for an operand that they share."""
+    """`x`, summed over the items of a batch if it has their axis: for an operand of `rank` axes that they share."""
     return x.sum(0) if x.ndim > rank else x

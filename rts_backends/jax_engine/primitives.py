@@ -22,21 +22,21 @@ _SEEING_OPERANDS = {"cacheable": False} if "cacheable" in inspect.signature(mlir
 
 
 class HostPrimitive:
-    """One of the three functions of an operation as a primitive: for eager arrays, the compiler and `vmap`.
+    """The value, pushforward or pullback of an operation as a primitive: for eager arrays, the compiler and `vmap`.
 
     Args:
         name: the name of the primitive.
-        ranks: the number of axes of its operands, without the axis B.
+        ranks: the number of axes of each of its operands, without the axis B of a batch.
         samples: number of operands before tangents or gradients.
         shapes: gives the shapes of the results, from those of the operands, both without B, and the parameters.
         host: fills the results for one item.
         specified: computes the results by specification.
         even: see `Operation`.
-        noted: True if the last result is a note.
+        noted: True if the last result is a note, () int32 (see `operations.py`).
         some: True if the operands after the samples are only those that a parameter `wanted` marks.
-        in_place: indices of operands whose gradients may take their places; the results are gradients of those of the
-            first operands that the parameter `wanted` says, with an axis before. `host` finds then that they share
-            memory.
+        in_place: indices of operands whose gradients may take over their memory: then `host` gets an operand and a
+            result that share memory. Only for pullbacks, whose results are the gradients (T, ·) that the parameter
+            `wanted` marks.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class HostPrimitive:
         batching.primitive_batchers[primitive] = self._batched
 
     def __call__(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
-        """The results."""
+        """The primitive's results, also of tracers."""
         return self.primitive.bind(*operands, **params)
 
     def specification(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
@@ -76,7 +76,7 @@ class HostPrimitive:
         return (function if not any(a == 0 for a in axes) else jax.vmap(function, axes))(*operands)
 
     def _own_ranks(self, params: dict) -> list[int]:
-        """Ranks of the operands that are present: tangents may be of one alone."""
+        """Ranks of the operands of one call: with `some`, tangents that `wanted` does not mark are left out."""
         samples, rest = self.ranks[: self.samples], self.ranks[self.samples :]
         if self._some:
             rest = (r for r, wish in zip(rest, params["wanted"], strict=True) if wish)
@@ -96,7 +96,7 @@ class HostPrimitive:
         return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
 
     def _on_host(self, operands: Sequence[np.ndarray], results: Sequence[np.ndarray], params: dict) -> None:
-        """Fill the results."""
+        """Fill the results, item by item if operands have the axis B."""
         by_item = self._by_item(operands, params)
         if not any(by_item):
             self._host(operands, results, **params)
@@ -106,7 +106,7 @@ class HostPrimitive:
             self._host(item, [x[b, ...] for x in results], **params)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
-        """The call in a program for the CPU."""
+        """The host call in a program for the CPU; an even operand of equal rows is passed as one row."""
         shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
         values, avals = list(operands), list(ctx.avals_in)
         for i in self._even:
@@ -165,7 +165,7 @@ class HostPrimitive:
     def _over_samples(
         self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
     ) -> tuple[list, list[int]]:
-        """Compute a batch whose items have samples of their own, item by item."""
+        """Compute a batch whose items differ in samples, item by item."""
         inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
         if not inner:
             results = self(*operands, **params)
@@ -181,7 +181,7 @@ class HostPrimitive:
 
 
 def _only_row(value: Any) -> Any:
-    """The first row of an array in a program that is about to be compiled, if it plainly equals all others, or None."""
+    """The first row of an array in a program about to be compiled, if the program shows that all are equal, or None."""
     ir, operation = mlir.ir, value.owner
     name = getattr(operation, "name", "")  # An argument's owner has no name.
     kind = ir.RankedTensorType(value.type)
@@ -199,7 +199,7 @@ def _only_row(value: Any) -> Any:
 
 
 def _read_once(value: Any) -> bool:
-    """True for an array that a program about to be compiled makes, and only one operation reads so far."""
+    """True for an array that a program about to be compiled computes, and that only one operation reads so far."""
     name = getattr(value.owner, "name", "stablehlo.constant")  # An argument's owner has no name.
     return name != "stablehlo.constant" and sum(1 for _ in value.uses) == 1
 

@@ -1,11 +1,11 @@
 """Functions of packed rows, computed on about as many of the allotted rows as are in use.
 
 A compiled program allots rows for the worst case, and learns how many are in use when it runs. Here it takes a piece of
-some thousand rows at a time, in a loop that ends with those in use.
+some thousand rows at a time, in a loop that ends after the last row in use.
 
-There are three primitives, as of operations: the value, its pushforward and its pullback. jax cannot pull back through
+There are three primitives, as for operations: the value, its pushforward and its pullback. jax cannot pull back through
 a loop of a length that it does not know; here derivatives are taken within each piece, for which the value is computed
-once more. Their own derivatives are those of loops over all rows, whose length jax knows.
+once more. Second derivatives are those of loops over all rows, whose length jax knows.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
-    """Split a function into equations that depend on its arguments, and the values of all others.
+    """Compute the part of a function that does not depend on its arguments.
 
-    Returns the function of the former, which takes the latter as its first arguments; and these values.
+    Returns the function of the other equations, and values that it takes as its first arguments.
     """
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
@@ -89,10 +89,10 @@ class _Pieces:
 
     Args:
         jaxpr: the function of a piece: arrays that are the same for all pieces, and arrays (n, ·) → (n, ·).
-        operands: its operands, the latter (N, ·).
+        operands: arrays that are the same for all pieces, then arrays of all rows (N, ·).
         fixed: the number of operands that are the same for all pieces.
-        most: the largest number of rows in use; None to go through all.
-        used: the number of rows in use.
+        most: the largest number of rows in use over the items of a batch; None to go through all rows.
+        used: the number of rows in use of this item.
     """
 
     def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], fixed: int, most: Any, used: Any):
@@ -102,12 +102,15 @@ class _Pieces:
         self._total, self._size = self._rows[0].shape[0], first.shape[0]
 
     def zeros(self) -> jax.Array:
-        """Zeros in the shape of the value."""
+        """Zeros in the shape of the value of all rows, (N, ·)."""
         out: Any = self._jaxpr.outvars[0].aval
         return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
 
     def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
-        """Do `state = step(start, first, state)` for each piece: rows from `start`, new ones from `first` on."""
+        """Do `state = step(start, first, state)` for each piece, and return the last state.
+
+        A piece has the rows from `start` on; those before `first` were in the piece before.
+        """
         size = self._size
 
         def body(i: Any, state: Any) -> Any:
@@ -121,19 +124,19 @@ class _Pieces:
         return state
 
     def cut(self, x: Any, start: Any) -> Any:
-        """The rows of a piece."""
+        """The rows of `x` (N, ·) in the piece that begins at `start`."""
         return jax.lax.dynamic_slice_in_dim(x, start, self._size)
 
     def among(self, x: Any, in_use: jax.Array, other: Any) -> Any:
-        """The rows of a piece that are in use; `other` in place of the rest."""
+        """Rows of `x` that `in_use` (n,) marks; `other` in place of the rest."""
         return jnp.where(in_use.reshape(-1, *[1] * (x.ndim - 1)), x, other)
 
     def index(self, start: Any) -> jax.Array:
-        """The number of each row of a piece."""
+        """Indices, among all N rows, of the rows in the piece that begins at `start`."""
         return start + jnp.arange(self._size)
 
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
-        """The value of a piece as a function of the wanted operands, closed ones and pieces; and these operands."""
+        """The value of a piece as a function of the wanted operands alone, rows cut to it; and these operands."""
         operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
         in_use = self.index(start) < self._used
 
@@ -161,7 +164,7 @@ def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr, fixed: int) ->
 
 
 def _pushed(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The derivative along tangents of the wanted operands; tangents follow the operands."""
+    """The derivative along tangents of the wanted operands. `arrays` are operands, then tangents; see `_Pieces`."""
     operands, tangents = arrays[: len(wanted)], arrays[len(wanted) :]
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
@@ -176,7 +179,7 @@ def _pushed(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted
 
 
 def _pulled(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The gradients of the wanted operands; the gradient of the value follows the operands."""
+    """Gradients of the wanted operands. `arrays` are operands, then the value's gradient; see `_Pieces`."""
     *operands, g = arrays
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
@@ -199,12 +202,12 @@ def _pulled(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted
 
 
 def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
-    """A primitive of one of the functions; its first operands are the numbers of rows in use: at most, and of the item.
+    """A primitive of one of the functions. Its first operands are `most` and `used`, see `_Pieces`.
 
     Args:
-        name: its name.
+        name: the end of its name.
         function: computes it.
-        results: shapes and dtypes of the operands after these, and parameters → those of the results.
+        results: shapes and dtypes of the operands after these two, and parameters → those of the results.
     """
     primitive = Primitive(f"rts_rows_in_use_{name}")
     primitive.multiple_results = True

@@ -21,13 +21,13 @@ class UsedRows:
         self._record: dict[int, tuple[weakref.ref, jax.Array | np.int32]] = {}
 
     def note(self, x: jax.Array, used: jax.Array | np.int32) -> None:
-        """Record the number () int32 of rows in use of a traced array; arrays of known values need no record."""
+        """Record the number () int32 of rows in use of `x`, if `x` is traced; other arrays need no record."""
         if isinstance(x, Tracer):
             key = id(x)
             self._record[key] = weakref.ref(x, lambda _: self._record.pop(key, None)), used
 
     def used(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
-        """The number of rows in use of arrays (N, ·) that belong together; all rows where none has a record."""
+        """The number of rows in use of `packed`, arrays (N, ·) with the same rows in use; N if none has a record."""
         for x in packed:
             known = self._record.get(id(x))
             if known is not None and known[0]() is x:

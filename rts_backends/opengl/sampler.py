@@ -5,8 +5,8 @@ triangle and its quantised depth. The order (depth, triangle) is total, so copla
 snaps vertices to fractions of a pixel; so each hit is then decided in float64 by the edge functions of
 `rts_backends.triangles`, and passed on to the neighbour that truly covers the pixel's centre.
 
-All of this is in float32. It does not do for triangles that are very large beside a pixel, or reach from very near to
-very far, such as a ground from the camera to the horizon: the sampler "raster" draws such views.
+Hardware computes in float32. That is too coarse for triangles that are very large beside a pixel, or reach from very
+near to very far, such as a ground from the camera to the horizon: the sampler "raster" draws such views.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rts_backends.raster.sampler import Raster
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4
-"""Framebuffers kept, one a size."""
+"""Image sizes for which framebuffers are kept."""
 
 DEPTH_STEPS = 2**22
 """Quantised depths; the 24 bits of a depth buffer hold each exactly."""
@@ -69,7 +69,7 @@ void main() { found = ivec2(-1, 0); }
 
 
 class Device:
-    """A proxy's objects in one context; once that is lost they must not be touched in another."""
+    """A proxy's OpenGL objects, and the one context in which they may be used; none may touch those of a lost one."""
 
     context: moderngl.Context | None = None
     objects: tuple[Any, ...] = ()
@@ -125,7 +125,7 @@ class OpenGL(TriangleSampler):
         return fragments
 
     def _warn(self) -> None:
-        """Say once that another sampler draws."""
+        """Warn, once, that the sampler 'raster' draws instead."""
         if not self._warned:
             self._warned = True
             errors.warn(
@@ -137,7 +137,7 @@ class OpenGL(TriangleSampler):
 
 
 def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
-    """Depths between which an object may be seen; the first is not less than the second where it is out of view."""
+    """First and last depth between which an object may be seen; if it is out of view, first ≥ last."""
     near, far = (float(z) for z in camera.depth_range())
     middle = -(camera.view[2, :3] @ prepared.center + camera.view[2, 3])
     reach = 1.01 * prepared.radius * np.linalg.norm(camera.view[2, :3])
@@ -158,7 +158,7 @@ def _ratio(camera: Camera, near: float, far: float) -> float:
 
 
 def _beyond_float32(camera: Camera, prepared: Buffers, size: tuple[int, int]) -> bool:
-    """True where hardware would lose hits of a view, see `MOST_RATIO`."""
+    """True if hardware would lose hits of a view, see `MOST_RATIO`; False for slanted planes, which have no depth."""
     p = camera.projection
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return False
@@ -203,7 +203,7 @@ def _programs(context: moderngl.Context) -> dict[str, Any]:
 
 
 def _upload(context: moderngl.Context, prepared: Buffers) -> Any:
-    """The vertex array of a proxy, made where this context has none."""
+    """The vertex array of a proxy, made first if this context has none."""
     device = prepared.device
     if device.context is not context:
         program, proxy = _programs(context)["peel"], prepared.proxy
@@ -226,7 +226,7 @@ def _release(context: moderngl.Context, objects: Sequence[Any]) -> None:
 
 
 def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any, Any]]:
-    """Two framebuffers of a size, each with its texture, to read one while the other is drawn."""
+    """Two framebuffers of `size`, each with its texture: one is read while the other is drawn."""
     kept = _programs(context)["targets"]
     if size not in kept:
         limit = context.info["GL_MAX_TEXTURE_SIZE"]
@@ -256,7 +256,7 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
 def _peel(
     context: moderngl.Context, prepared: Buffers, clip: np.ndarray, size: tuple[int, int], layers: int, keep: float
 ) -> np.ndarray:
-    """(K, H, W) triangle ids, as the hardware has them."""
+    """(K, H, W) triangle ids, −1 for none, of vertices as hardware rounds them; `exact_hits` corrects them later."""
     parts, array = _programs(context), _upload(context, prepared)
     program, query = parts["peel"], parts["query"]
     targets = _targets(context, size)

@@ -1,4 +1,4 @@
-"""One thread that owns one headless OpenGL context: contexts belong to the thread that made them."""
+"""One thread that owns one headless OpenGL context: only the thread that made a context may use it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _process: int | None = None
 
 
 class Worker:
-    """Runs functions of the context, one at a time. The context is made when first needed and released at exit."""
+    """A thread that runs functions of its context, one at a time. The context is made when needed, released at exit."""
 
     def __init__(self) -> None:
         self._tasks: queue.SimpleQueue[tuple[Callable, tuple, Future] | None] = queue.SimpleQueue()
@@ -66,12 +66,12 @@ class Worker:
         return future.result()
 
     def later(self, function: Callable, *args: Any) -> None:
-        """Run a function in the thread without waiting for it, for clean-up; nothing where the thread has ended."""
+        """Run a function in the thread without waiting for it, for clean-up; do nothing if the thread has ended."""
         if not _forked() and self._thread is not None and self._thread.is_alive():
             self._tasks.put((function, args, Future()))
 
     def close(self) -> None:
-        """Release the context and end the thread; nothing in a forked child, whose context is its parent's."""
+        """Release the context and end the thread; do nothing in a forked child, whose context is its parent's."""
         if _forked():
             return
         with self._start:

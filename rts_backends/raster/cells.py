@@ -16,12 +16,12 @@ ALL = np.uint32(2**SIDE - 1)
 
 
 class Blocks(NamedTuple):
-    """Requested cells, in blocks of the grid.
+    """Requested cells, in Y × X blocks of SIDE × SIDE cells of the grid.
 
     Attributes:
-        table: (Y, X) int32, the number of each block with requested cells, or −1.
-        numbers: (B, SIDE, SIDE) int32, the place in the list of each cell of such a block, or −1.
-        bits: (H, X) uint16, bits of the requested cells in each line of the grid, SIDE to a number.
+        table: (Y, X) int32, the index in `numbers` of each block with requested cells; −1 for other blocks.
+        numbers: (B, SIDE, SIDE) int32, the index of each cell of a block in the list of cells; −1 if not requested.
+        bits: (H, X) uint16, a bit for each cell of a row of the grid, set if it is requested; SIDE bits to a number.
     """
 
     table: np.ndarray
@@ -30,7 +30,7 @@ class Blocks(NamedTuple):
 
     @classmethod
     def of(cls, cells: np.ndarray, size: tuple[int, int]) -> Blocks:
-        """The blocks of cells (L, C), flat indices in a grid of (height, width), or −1.
+        """The blocks of `cells` (L, C): flat indices in a grid of `size` (height, width); −1 is skipped.
 
         Raises:
             InputError: a cell is not in the grid, or listed twice.
@@ -48,14 +48,14 @@ class Blocks(NamedTuple):
 
 
 EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
-"""Stands for all cells: no blocks, and no bits."""
+"""The blocks of a request for all cells: empty arrays, by which loops recognise it."""
 
 
 @loop
 def _fill(cells, width, table, numbers, bits):
-    """Number the blocks with requested cells, and fill in these cells. Returns the number of blocks.
+    """Fill in the arrays of `Blocks`. Returns the number of blocks that have requested cells.
 
-    The second result is −1, or the place of a cell outside of the grid or listed twice, where the loop stops.
+    The second result is the index in `cells` of a cell beyond the grid or listed twice, where the loop stops; else −1.
     """
     count, m, side, size = 0, 0, np.uint32(SIDE), len(bits) * width
     while m < len(cells):
@@ -89,7 +89,7 @@ def _fill(cells, width, table, numbers, bits):
 
 @compiled
 def _following(cells, first):
-    """The number of cells from the first on whose indices follow one another."""
+    """The length of the run `first`, `first` + 1, … with which `cells` begin."""
     same = True
     for n in range(len(cells)):
         same &= cells[n] == first + n
@@ -103,10 +103,10 @@ def _following(cells, first):
 
 @compiled
 def touching(places, box, begin, end, bits):
-    """Move the places of boxes with requested cells to the front. Returns their number.
+    """Move indices of boxes with requested cells to the front of `places`. Returns the number of these boxes.
 
-    Only lines from `begin` to `end` − 1 count. `box` (4, ·) has first and last column, and first and last row. One loop
-    does all, since compiled code counts references to arrays that it passes on.
+    Only rows from `begin` to `end` − 1 are looked at. `box` (4, ·) has first and last column, and first and last row.
+    One loop does all, since compiled code counts references to arrays that it passes on.
     """
     count, side, one, three = 0, np.uint32(SIDE), np.uint32(1), np.uint32(3)
     for h in range(len(places)):
@@ -128,7 +128,7 @@ def touching(places, box, begin, end, bits):
 
 @compiled
 def _some(bits, left, right, top, bottom):
-    """Bits that are not zero if lines of a box hold requested cells."""
+    """A number that is not zero if a box, ends included, holds requested cells."""
     side, one, some = np.uint32(SIDE), np.uint32(1), np.uint32(0)
     first, last = left // side, right // side
     for y in range(top, bottom + one):

@@ -1,8 +1,8 @@
 """Clusters of neighbouring triangles: a cluster out of view, or facing away, is skipped as a whole.
 
-They are made of a mesh that stays (`rts.prepare`). Triangles are sorted along a Morton curve through their middles and
-by direction, and vertices by first use. Each cluster has a box, which bounds its positions, and a cone, which bounds
-its normals.
+Clusters are built once, for a mesh that stays (`rts.prepare`). Triangles are sorted along a Morton curve through their
+middles and by direction, and vertices by first use. Each cluster has a box, which bounds its positions, and a cone,
+which bounds its normals.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIZE = 256
 """Triangles of a cluster, and vertices of a block."""
 
 FRONTS, BACKS = 1, 2
-"""Bits of a cluster: it may hold triangles that face the requested way; it may hold others."""
+"""Bits of a cluster: it may hold triangles whose determinant has the requested sign; or the opposite sign."""
 
 AROUND = 1e-9
 """Rounding error of a sum in float64, as a share of its terms: clusters this near to the view are kept."""
@@ -32,21 +32,21 @@ STEPS = np.float64(2**10 - 1)
 """The largest integer position on an axis of the Morton curve."""
 
 COARSE = 2
-"""Leading bits of a position on an axis: first in a key. The octant of the normal follows, then the other bits."""
+"""Leading bits of the position on each axis that come first in a key; then the normal's octant, then the other bits."""
 
 
 class Clusters(NamedTuple):
-    """A mesh in clusters.
+    """The triangles of a mesh, sorted into clusters.
 
     Attributes:
-        vertices: (V, 3) float32, those that triangles use, in the order of their first use.
+        vertices: (V, 3) float32, the vertices that triangles use, in the order of their first use.
         faces: (T, 3) int32, triangles in the order of clusters, SIZE in each.
         order: (T,) int32, the index of each triangle in the proxy.
         boxes: (6, C) float32, the least and the largest x, y and z of each cluster.
-        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 if
-            unknown, and the least length of (b − a) × (c − a).
+        cones: (5, C) float64 of each cluster: a unit vector (x, y, z); the least cosine between it and a triangle's
+            normal, below 0 if unknown; and the least length of (b − a) × (c − a) over triangles (a, b, c).
         offsets: (C + 1,) int64, where each cluster's blocks of vertices begin in `blocks`.
-        blocks: int32, numbers of the blocks of SIZE vertices that hold its corners.
+        blocks: int32, indices of the blocks of SIZE vertices that hold the corners of each cluster.
     """
 
     vertices: np.ndarray
@@ -59,7 +59,7 @@ class Clusters(NamedTuple):
 
     @classmethod
     def of(cls, proxy: Proxy) -> Clusters:
-        """The clusters of a proxy's triangles."""
+        """Sort a proxy's triangles into clusters."""
         vertices, faces = read_only(proxy.vertices, np.float32), read_only(proxy.faces, np.int32)
         count, clusters = len(faces), -(-len(faces) // SIZE)
         keys = np.empty(count, np.uint64)
@@ -82,15 +82,15 @@ class Clusters(NamedTuple):
         """Clusters and blocks of vertices that may be in view.
 
         Args:
-            matrix: (4, 4) to homogeneous pixels.
+            matrix: (4, 4) to homogeneous pixels, see `pixel_matrix`.
             size: (height, width).
             keep: sign of the determinants of requested triangles; 0 for all.
-            both: True if the other triangles are requested, too.
+            both: True if triangles of the opposite sign are requested, too.
             asked: the blocks of requested cells.
 
         Returns:
-            Numbers of clusters (N,) int32; bits `FRONTS` and `BACKS` of the triangles that they may hold (N,) uint8;
-            and numbers of blocks of vertices, int32.
+            Indices of clusters (N,) int32; bits `FRONTS` and `BACKS` of the triangles that they may hold (N,) uint8;
+            and indices of blocks of vertices, int32.
         """
         height, width = size
         # Positions more than a pixel outside of the image cannot be rounded into it.
@@ -123,7 +123,7 @@ def _extent(vertices):
 
 @loop
 def _keys(start, stop, vertices, faces, low, scale, keys):
-    """Fill in keys of triangles: 33 bits of their place, then the index. Their order is the same on every machine."""
+    """Fill in keys of triangles: 33 bits of position and octant, then 31 of the index, so that all keys differ."""
     for t in range(start, stop):
         key = np.uint64(0)
         for r in range(3):
@@ -144,7 +144,7 @@ def _keys(start, stop, vertices, faces, low, scale, keys):
 
 @loop
 def _renumber(vertices, faces, order, new_vertices, new_faces):
-    """Fill in the triangles in this order, and the vertices by first use. Returns the number of vertices."""
+    """Fill in the triangles as `order` lists them, and vertices by first use. Returns the number of vertices used."""
     numbers, count = np.full(len(vertices), -1, np.int32), 0
     for t in range(len(order)):
         for c in range(3):
@@ -160,7 +160,10 @@ def _renumber(vertices, faces, order, new_vertices, new_faces):
 
 @loop
 def _find_blocks(faces, last, offsets, blocks):
-    """Fill in the blocks of vertices that each cluster uses, and where each cluster's begin. Returns their number."""
+    """Fill `blocks` with the blocks of vertices of each cluster, `offsets` with where they begin; return their number.
+
+    `last` holds, for each block of vertices, the latest cluster that uses it: −1 at first.
+    """
     count = 0
     for t in range(len(faces)):
         cluster = t // SIZE
@@ -176,7 +179,7 @@ def _find_blocks(faces, last, offsets, blocks):
 
 @loop
 def _bound(start, stop, vertices, faces, boxes, cones):
-    """Fill in boxes and cones of clusters."""
+    """Fill in boxes and cones of clusters, see `Clusters`."""
     normals = np.empty((SIZE, 3))
     for cluster in range(start, stop):
         block = faces[cluster * SIZE : (cluster + 1) * SIZE]
@@ -229,17 +232,17 @@ def _same(vertices, i, j):
 
 @loop
 def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
-    """Fill in the clusters that may hold wanted triangles, and bits of these triangles. Returns the number of clusters.
+    """Find clusters in view that may hold wanted triangles, and the bits of each. Returns the number of clusters.
 
     Args:
         boxes: see `Clusters`.
         cones: see `Clusters`.
         planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
         rows: (3, 4) to homogeneous pixels (x, y, w).
-        keep: sign of the determinants of requested triangles; 0 for all.
-        wanted: bits FRONTS and BACKS of the wanted triangles.
-        kept: (C,) int32, to be filled with the clusters.
-        sides: (C,) uint8, to be filled with the bits.
+        keep: sign of the determinants of triangles of the bit FRONTS, the others have BACKS; 0 gives both bits to all.
+        wanted: bits, of which a cluster needs at least one.
+        kept: (C,) int32, to be filled with the indices of the clusters, from the start.
+        sides: (C,) uint8, to be filled with the bits of each of `kept`.
     """
     # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
     q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
@@ -261,7 +264,7 @@ def _minor(rows, i, j, k):
 
 @compiled(inline="always")
 def _test(boxes, cones, planes, towards, rows, sides):
-    """Fill in the bits of each cluster: FRONTS, BACKS; none if it is out of view."""
+    """Fill in the bits FRONTS and BACKS of each cluster; no bits if it is out of view."""
     qx, qy, qz, s = towards
     for cluster in range(len(sides)):
         x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
@@ -288,7 +291,9 @@ def _test(boxes, cones, planes, towards, rows, sides):
 
 @loop
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
-    """Mark the clusters that may touch requested blocks; `there` holds cumulative counts of these blocks.
+    """Mark in `near` which of the clusters `kept` may touch blocks of requested cells.
+
+    `there` (Y + 1, X + 1) holds cumulative counts of these blocks.
 
     A cluster whose box reaches behind the eye is always marked.
     """
@@ -321,7 +326,7 @@ def _touch(start, stop, kept, boxes, rows, height, width, there, near):
 
 @loop
 def _use(kept, offsets, blocks, used):
-    """Fill in the blocks of vertices that some clusters use. Returns their number."""
+    """Fill `used` with the blocks of vertices that the clusters `kept` use. Returns the number of these blocks."""
     every = len(kept) == len(offsets) - 1
     marks = np.full(len(used), every)
     if not every:

@@ -17,17 +17,18 @@ BAND_ROWS = cells.SIDE
 BLOCK = 64
 
 LISTED = 8
-"""Numbers listed for a triangle: its index, its three corners, and its first and last column and row of pixels."""
+"""Numbers listed for a triangle: its index, its three vertices, first and last column, first and last row of pixels."""
 
 NUMBERS = 18
-"""Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
+"""Numbers computed for a triangle: coefficients (x, y, 1) of its three edge functions, positive inside; depths of its
+corners; and their w + z and w − z of clip space."""
 
 
 @loop
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
     """Fill the three fragment arrays (K, H · W), band by band.
 
-    `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `Blocks` for all cells; `size` is (H, W).
+    `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `cells.EVERYTHING`; `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
     layers, (height, width), (table, numbers, bits) = len(triangle_ids), size, asked
@@ -46,9 +47,9 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
 
 @loop
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
-    """`draw` for a list of M cells: fills arrays (K, M), which `clear` has emptied, but no depths.
+    """`draw` for a list of M cells: fills ids, barycentrics and `nearest` (K, M), which `clear` has emptied.
 
-    `asked` are the arrays of `Blocks`. If `narrows` is set, triangles that touch none of these cells are skipped.
+    `asked` are the arrays of the cells' `Blocks`. If `narrows` is set, triangles that touch none of them are skipped.
     """
     triangle_ids, barycentrics, _ = fragments
     table, numbers, bits = asked
@@ -65,7 +66,7 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows
 
 @loop
 def clear(start, stop, nearest, fragments, drawn):
-    """Empty the layers of cells [start, stop) of arrays (K, M), or, if `drawn`, fill in the depths."""
+    """Empty the layers of cells [start, stop) of arrays (K, M), or, if `drawn`, fill in the depths from `nearest`."""
     triangle_ids, barycentrics, depths = fragments
     infinity = nearest.dtype.type(np.inf)
     for k in range(len(nearest)):
@@ -80,7 +81,7 @@ def clear(start, stop, nearest, fragments, drawn):
 
 @compiled
 def _depths(depths, nearest):
-    """Fill in the depths of cells, 0 where they are empty."""
+    """Copy `nearest` to `depths`, with 0 for empty cells, where it is infinite."""
     for i in range(len(depths)):
         depths[i] = nearest[i] if nearest[i] < np.inf else 0.0
 
@@ -89,7 +90,7 @@ def _depths(depths, nearest):
 def _draw(items, given, top, end, width, asked, layered):
     """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
-    `layered` are the number of the first cell in the first array, and the arrays (K, M, ·).
+    `layered` are the index of the band's first cell among M; `nearest`; and ids and barycentrics (K, M, ·).
     """
     rows, vertices, matrix, view_depth, keep = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
@@ -132,7 +133,10 @@ def _draw(items, given, top, end, width, asked, layered):
 
 @compiled
 def _asked(hits, count, top, asked, cells):
-    """Drop hits (n, 2) in cells that are not requested, and number the cells of the rest. Returns their number."""
+    """Drop hits (n, 2) in cells that are not requested; fill `cells` with the numbers of the others' cells.
+
+    Returns the number of hits left.
+    """
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
     if len(bits) == 0:
@@ -167,9 +171,9 @@ def _gather(block, rows, vertices, entries, points):
 
 @compiled(inline="always")
 def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
-    """Compute the numbers (NUMBERS, BLOCK) of triangles, and mark those that may need clipping.
+    """Compute the numbers (NUMBERS, BLOCK) of triangles, and mark in `clips` those that may need clipping.
 
-    Rows are cut to the band; a triangle of no area, or facing away, keeps none.
+    Each triangle's rows of pixels are cut to the band; a triangle of no area, or that is culled, keeps no rows.
     """
     corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
     for c in range(3):
@@ -204,7 +208,7 @@ def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, c
 
 @compiled(inline="always")
 def _cover(count, entries, numbers, covers):
-    """Fill bits of the first 2 × 2 pixels of each triangle's box that it may cover."""
+    """Fill `covers`: for each triangle four bits, set where it may cover a pixel of the first 2 × 2 of its box."""
     for b in range(count):
         bits = 0
         for n in range(4):
@@ -219,7 +223,7 @@ def _cover(count, entries, numbers, covers):
 
 @compiled
 def _insert(hits, met, drawn, layered):
-    """Insert the block's triangles into the layers of cells; hits (n, 2) are triangle and row of the band, column."""
+    """Insert hits into the layers of cells; `hits` (n, 2): triangle in the block · BAND_ROWS + row in band, column."""
     top, width, entries, numbers, clips = drawn
     cells, sure, depths, within = met
     first, nearest, triangle_ids, barycentrics = layered
@@ -235,7 +239,7 @@ def _insert(hits, met, drawn, layered):
 
 @compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill in each hit's depth (n,) and first two barycentrics (2, n), and True for certain hits."""
+    """Fill in each hit's depth (n,) and first two barycentrics (2, n); and `sure`, True if `_covers` is not needed."""
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
@@ -265,7 +269,7 @@ def _covers(b, x, y, numbers, clips):
 
 @compiled(inline="always")
 def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers of a cell, by depth, then by the triangle's index."""
+    """Put a hit into the layers of a cell, sorted by depth, then by the triangle's index; the farthest drops out."""
     moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, place], triangle_ids[k, cell]
@@ -281,7 +285,7 @@ def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
 
 @compiled
 def _outside(numbers, b, ea, eb, ec):
-    """True if the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
+    """True if the point with barycentrics in the ratio ea : eb : ec lies before the near or beyond the far plane."""
     near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]
     far = ea * numbers[15, b] + eb * numbers[16, b] + ec * numbers[17, b]
     return near < 0 or far < 0

@@ -46,7 +46,7 @@ MANY = 1 << 16
 """The least number of triangles that is put in clusters; fewer gain nothing."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
-"""Stands for the order of triangles by index."""
+"""An empty array in place of an order: triangles are in the order of their indices."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """Codes in place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -90,7 +90,7 @@ class Raster(TriangleSampler):
         cull: str,
         cells: np.ndarray,
     ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are skipped."""
+        """See `TriangleSampler.rasterize_cells`: triangles that touch none of `cells` are skipped."""
         blocks = Blocks.of(cells, size)
         with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
             return mesh.draw_cells(mesh.select()[0], layers, cells, blocks)
@@ -98,7 +98,7 @@ class Raster(TriangleSampler):
     def rasterize_exits(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """See `TriangleSampler.rasterize_exits`: one pass over the triangles serves both."""
+        """See `TriangleSampler.rasterize_exits`: one pass lists triangles of both orientations."""
         if not self._draws:
             return super().rasterize_exits(prepared, camera, size, layers, beside)
         with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
@@ -109,7 +109,7 @@ class Raster(TriangleSampler):
 
     @property
     def _draws(self) -> bool:
-        """True unless a subclass draws: it may read the prepared proxy."""
+        """True unless a subclass overrides `rasterize` or `rasterize_cells`, and so may read the prepared proxy."""
         kind = type(self)
         return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
 
@@ -144,10 +144,10 @@ class _List(NamedTuple):
     """Triangles that may cover a pixel's centre, in the form that `draw` takes.
 
     Attributes:
-        keep: sign of the determinants of triangles to draw, or 0.
+        keep: sign of the determinants of triangles to draw; 0 for both signs.
         turns: (bands,), bands of rows, those with most items first, so that threads end together.
         offsets: (bands + 1,), where the items of each band begin.
-        items: uint32, places in `rows`, in the order of the search.
+        items: uint32, indices of triangles in `rows`, in the order of the search.
         rows: (T, LISTED) int32, the numbers listed for each triangle.
     """
 
@@ -159,18 +159,18 @@ class _List(NamedTuple):
 
 
 class _Seen:
-    """A mesh as a camera sees it.
+    """A mesh as a camera sees it: vertices on screen, and the blocks of triangles that may be in view.
 
     Args:
         mesh: the mesh.
         camera: the camera.
         size: (height, width).
-        keep: sign of the determinants of triangles to draw, or 0.
+        keep: sign of the determinants of triangles to draw; 0 for both signs.
         both: True if triangles that face the other way are requested, too.
         asked: the blocks of requested cells.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
-        behind: memory for a list of those that face the other way.
+        behind: (T, LISTED) int32, memory for a list of triangles that face the other way.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class _Seen:
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
     def select(self) -> list[_List]:
-        """Lists of triangles that may cover requested cells: one, or with `both` a second of triangles facing away."""
+        """Lists of triangles that may cover requested cells: one; with `both` a second of the other orientation."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads should not write to neighbouring memory.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
@@ -214,14 +214,14 @@ class _Seen:
         return [fronts, _sorted(-self.keep, self.order, *lists[1])] if self.both else [fronts]
 
     def draw(self, listed: _List, layers: int) -> Fragments:
-        """Fragments (layers, H, W)."""
+        """Fragments (layers, H, W) of the listed triangles."""
         fragments = _empty((layers, *self.size))
         given = self.vertices, self.matrix, self.depth_row, tuple(EVERYTHING), self.size
         parallel(draw, len(listed.turns), listed, *given, _flat(fragments))
         return fragments
 
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
-        """Fragments (layers, L, C) of some cells; `blocks` are theirs."""
+        """Fragments (layers, L, C) of the listed triangles in `cells` (L, C), whose `Blocks` are `blocks`."""
         fragments = _empty((layers, *cells.shape))
         flat, nearest = _flat(fragments), np.empty((layers, cells.size))
         parallel(clear, cells.size, nearest, flat, False, work=nearest.size)
@@ -300,11 +300,11 @@ def _select(
 ):
     """List and count the triangles that may cover a pixel's centre in cells marked by `bits` of `Blocks`.
 
-    The search goes through some blocks of triangles; `sides` are bits FRONTS and BACKS of the triangles in each.
+    The search goes through chunks of `blocks`, the blocks of triangles; `sides` are bits FRONTS and BACKS of each.
 
-    A list consists of the rows of triangles (T, LISTED), the first and last row of each chunk (chunks, 2), and the
-    number of a chunk's triangles that touch a band (chunks, bands). Chunks of one call follow one another. `backs`, if
-    it has room, lists triangles that may face the other way.
+    A list consists of a row for each triangle (T, LISTED), where the rows of each chunk begin and end (chunks, 2), and
+    the number of a chunk's triangles that touch each band (chunks, bands). One call writes its chunks one after
+    another. `backs`, if it has room, lists triangles that may face the other way.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
@@ -329,7 +329,7 @@ def _select(
 
 @compiled(inline="always")
 def _look(count, xy, height, width, step, sign, box, clips, near):
-    """Fill in each triangle's box of pixels, and marks: it needs clipping; it may cover a pixel's centre."""
+    """Fill in each triangle's box of pixels, and marks: `clips`, it needs clipping; `near`, it may cover a centre."""
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
     middle, center = np.float32(width / 2), np.float32(height / 2)
     for b in range(count):
@@ -357,7 +357,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 @compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
-    """List the triangles of a block that are marked `near`, from a place on. Returns the next place."""
+    """List the triangles of a block that are marked `near`, from row `place` on. Returns the next free row."""
     vertices, matrix, height, width, step, bits = given
     listed, _, counts = made
     count = 0
@@ -390,7 +390,7 @@ def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
 
 @compiled
 def _centres(x0, x1, y0, y1, height, width, step):
-    """First and last column and row, in float32, of pixels with centres in a box that is known to half a step."""
+    """First and last column and row, in float32, of pixels with centres in a box, itself exact to half a step."""
     slack, half, zero = np.float32(0.75) * step, np.float32(0.5), np.float32(0)
     i0, i1 = max(np.ceil(x0 - half - slack), zero), min(np.floor(x1 - half + slack), np.float32(width - 1))
     j0, j1 = max(np.ceil(y0 - half - slack), zero), min(np.floor(y1 - half + slack), np.float32(height - 1))
@@ -419,9 +419,9 @@ def _clipped_box(corners, width, height):
 
 @loop
 def _sort(first, last, order, listed, spans, places, items):
-    """Sort the list by bands: write the places of each band's triangles, in order, from `places` (chunks, bands) on.
+    """Sort a list by bands: write the rows of each band's triangles to `items`, from `places` (chunks, bands) on.
 
-    Triangles get their index in the proxy in place of that in `faces`, unless these are the same.
+    In the list, `order` replaces triangles' indices by those of the proxy; if it is empty, they are the same.
     """
     for chunk in range(first, last):
         if len(order) > 0:

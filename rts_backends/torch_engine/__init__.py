@@ -1,1 +1,1 @@
-"""The engine of torch arrays."""
+"""The engine of torch tensors."""

@@ -1,4 +1,4 @@
-"""torch: eager autograd, `torch.func` transforms and `torch.compile`, on any device."""
+"""The engine of torch tensors: eager autograd, `torch.func` transforms and `torch.compile`, on any device."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class TorchEngine(Engine):
         return isinstance(x, torch.Tensor)
 
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
-        """`value` on the device of `like`, floats in its dtype."""
+        """`value` on the device of `like`, floats as float64 if `like` is, else as float32."""
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
         if array.dtype != dtype and array.dtype.kind == "f":
@@ -130,7 +130,7 @@ class TorchEngine(Engine):
         return a.is_cpu and b.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
     def plain(self, x: torch.Tensor) -> bool:
-        """True for a dense tensor of real numbers that has values, and no tangent."""
+        """True for a dense tensor of real numbers that has values, while forward mode is off."""
         return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and torch_internals.forward_level() < 0
 
     def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
@@ -145,7 +145,7 @@ class TorchEngine(Engine):
         return tangent_alike(x) if torch_internals.forward_level() >= 0 else x
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
-        """The value, for all items of a batch; None while `torch.compile` looks on."""
+        """The value of `x`, for all items of a batch; None under `torch.compile`, or for a `foreign` tensor."""
         if torch.compiler.is_compiling() or foreign(x):
             return None
         if not torch_internals.transforms_active():
@@ -160,13 +160,13 @@ class TorchEngine(Engine):
         return torch_internals.maybe_current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
-        """By selection; ones where no cell refers to any row."""
+        """See `Engine.fill_unused`: by selection; all ones if no row is in use."""
         used = row.max() + 1
         index = torch.arange(x.shape[0], device=x.device).reshape(-1, *[1] * (x.ndim - 1))
         return torch.where(index < used, x, torch.where(used > 0, x[:1], torch.ones_like(x[:1])))
 
     def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
-        """Sums of the rows of `values` that share a segment."""
+        """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
         index = _tensor(segments, values.device)
         return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(
             0, index, values
@@ -183,7 +183,7 @@ class TorchEngine(Engine):
         state: Tree,
         most: int,
     ) -> Tree:
-        """A loop of Python's; under `torch.vmap` as long as any item goes on, the others staying as they are."""
+        """A Python loop; under `torch.vmap` it goes on as long as any item does, and finished items stay unchanged."""
         with torch.no_grad():
             return map_leaves(
                 self.stop_gradient, self._repeated(body, going, map_leaves(self.stop_gradient, state), most)
@@ -204,22 +204,22 @@ class TorchEngine(Engine):
         return state
 
     def block(self, x: Tree) -> Tree:
-        """Wait for the devices that hold the tensors."""
+        """Wait for the devices that hold the tensors of `x`, and return it."""
         for device in {leaf.device for leaf in leaves(x) if isinstance(leaf, torch.Tensor)}:
             if device.type == "cuda":
                 torch.cuda.synchronize(device)
         return x
 
     def concurrent(self) -> bool:
-        """True unless a transform or inference mode is on: these belong to one thread."""
+        """True unless a transform or inference mode is on: torch sets these for one thread alone."""
         return not transformed() and not torch.is_inference_mode_enabled()
 
     def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:
-        """By `torch.split`, whose derivative is one array for all pieces."""
+        """See `Engine.split`: by `torch.split`, whose derivative is one array for all pieces."""
         return torch.split(x, list(sizes))
 
     def value_and_grad(self, f: Callable) -> Callable:
-        """By autograd on detached leaves; entries that `f` does not use get a zero gradient."""
+        """See `Engine.value_and_grad`: by autograd on detached leaves; entries that `f` does not use get gradient 0."""
 
         def call(tree: Tree) -> tuple[torch.Tensor, Tree]:
             variables: list[torch.Tensor] = []
@@ -239,24 +239,24 @@ class TorchEngine(Engine):
         return call
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], torch.Tensor]) -> torch.Tensor:
-        """By `torch.utils.checkpoint`, which plain autograd knows; `torch.func` transforms keep everything."""
+        """See `Engine.checkpoint`: by `torch.utils.checkpoint`; under `torch.func` transforms all arrays are kept."""
         if not torch.is_grad_enabled() or transformed():
             return f(make())
         return torch.utils.checkpoint.checkpoint(lambda: f(make()), use_reentrant=False)
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
-        """By forward-mode autodiff."""
+        """See `Engine.jvp`: by forward-mode autodiff."""
         quiet_forward_mode()
         # A third result, with `has_aux` alone, is always in torch's annotation.
         return torch.func.jvp(f, (primal,), (tangent,))  # pyright: ignore[reportReturnType]
 
     def gradient_of_rows(self, f: Callable[[torch.Tensor], torch.Tensor], rows: torch.Tensor) -> torch.Tensor:
-        """By reverse mode: it takes less time, and torch's forward mode is not for several threads at once."""
+        """See `Engine.gradient_of_rows`: by reverse mode, which is faster here, and safe on several threads at once."""
         value, pull = torch.func.vjp(f, rows)[:2]
         return pull(torch.ones_like(value))[0]
 
     def jacobian(self, f: Callable) -> Callable:
-        """By forward-mode autodiff, all unknowns in one vectorised pass."""
+        """See `Engine.jacobian`: by forward-mode autodiff, all unknowns in one vectorised pass."""
 
         def call(vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             quiet_forward_mode()

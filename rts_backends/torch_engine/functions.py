@@ -1,4 +1,4 @@
-"""Functions that the torch binders of operations share."""
+"""Functions that the torch engine and its operations share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rts_backends.torch_engine import torch_internals
 def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
     """Call `function.apply(*args)`, with all arguments given.
 
-    Outside of transforms it spares torch's search for defaults, which takes longer than a small kernel.
+    Outside of transforms it spares torch's search for defaults, which takes longer than a small loop.
     """
     if torch_internals.transforms_active():
         return function.apply(*args)
@@ -56,7 +56,7 @@ def foreign(*tensors: Tensor | None) -> bool:
 
 
 def tangent_alike(x: Tensor) -> Tensor:
-    """A tensor whose tangent is of its own dtype.
+    """`x` with its tangent, if it has one, in the dtype of `x`.
 
     Products and quotients of a scalar tensor in float32 and a number of Python's have tangents in float64, which
     products of matrices refuse.
@@ -81,12 +81,12 @@ _NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
-    """Tangents, zero where there are none."""
+    """`tangents`, with zeros in place of None."""
     return tuple(torch.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True))
 
 
 def along(f: Callable, primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
-    """The directional derivative, by reverse mode twice: torch does not nest its forward mode."""
+    """The derivative of `f` at `primals` along `tangents`, by reverse mode twice: torch cannot nest forward mode."""
     value, pull = torch.func.vjp(f, *primals)[:2]
     zeros = _pytree.tree_map(torch.zeros_like, value)
     return torch.func.vjp(pull, zeros)[1](filled(primals, tangents))[0]

@@ -1,7 +1,7 @@
 """Operations as torch functions: autograd, `torch.func` transforms, forward mode and `torch.compile`.
 
-Three functions: the value, its pullback and its pushforward. Each is the derivative of the one before by compiled code;
-the derivatives of the last two, which are second derivatives of the value, are taken of the specification.
+Three functions: the value, its pullback and its pushforward, each by compiled code. The derivatives of the last two,
+which are second derivatives of the value, are taken of the specification.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, tor
 
 
 def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str, Any]) -> Tensor:
-    """The result of an operation."""
+    """The result of an operation, by compiled code if it takes the operands, else by specification."""
     if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
@@ -32,9 +32,9 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
 
 class _Specifying(threading.local):
-    """True, as `on`, while a specification is differentiated.
+    """A flag `on` for each thread: True while a specification is differentiated.
 
-    Operations in the specification run as array code then, too: torch cannot nest its transforms in such functions.
+    Operations in the specification then run as array code, too: torch cannot nest its transforms in `Function`s.
     """
 
     on = False
@@ -72,11 +72,11 @@ class _Call:
         return _Call(self.operation, self.params)
 
     def split(self, given: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
-        """The operands that have derivatives, and the others."""
+        """The differentiable operands at the head of `given`, and the rest."""
         return given[: self.count], given[self.count :]
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
-        """The specification as a function of the differentiable operands."""
+        """The specification as a function of the differentiable operands; `fixed` are the others."""
 
         def specified(*varied: Tensor) -> Tensor:
             before, _specifying.on = _specifying.on, True
@@ -90,7 +90,7 @@ class _Call:
     def pulled(self, wanted: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., tuple[Tensor, ...]]:
         """The specification's pullback as a function of the differentiable operands and the gradient.
 
-        It is empty where one is not wanted.
+        It returns a gradient for each differentiable operand, empty if not wanted.
         """
 
         def pull(*given: Tensor) -> tuple[Tensor, ...]:
@@ -100,7 +100,7 @@ class _Call:
         return pull
 
     def pushed(self, present: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., Tensor]:
-        """The specification's pushforward as a function of the differentiable operands and their tangents (T, ·)."""
+        """The specification's pushforward as a function of the differentiable operands, and present tangents (T, ·)."""
 
         def push(*given: Tensor) -> Tensor:
             varied, tangents = self.split(given)
@@ -114,7 +114,7 @@ class _Call:
 
 
 def _spread(given: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
-    """The given things in the places that are present, and None in the others."""
+    """A list as long as `present`: the items of `given`, in order, where it is True, and None elsewhere."""
     it = iter(given)
     return [next(it) if there else None for there in present]
 
@@ -124,7 +124,7 @@ def _host(tensors: Sequence[Tensor]) -> list[np.ndarray]:
 
 
 def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
-    """Arguments of each item of a batch."""
+    """Arguments of each item of a `torch.vmap` batch."""
     return [
         tuple(a if d is None else a.select(d, b) for a, d in zip(args, in_dims, strict=True))
         for b in range(info.batch_size)
@@ -132,7 +132,7 @@ def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
 
 
 class _Value(torch.autograd.Function):
-    """The result."""
+    """The value of an operation, by compiled code."""
 
     @staticmethod
     def forward(call, *operands):
@@ -178,7 +178,7 @@ class _Value(torch.autograd.Function):
 
 
 class _Pull(torch.autograd.Function):
-    """Gradients of the differentiable operands from that of the result; empty where not wanted."""
+    """Gradients of the differentiable operands, from the result's gradient; empty where not wanted."""
 
     @staticmethod
     def forward(call, wanted, *given):

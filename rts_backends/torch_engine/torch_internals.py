@@ -1,7 +1,7 @@
 """Private names of torch, where it has no public ones, and substitutes for a torch without them.
 
-Then all goes as if a transform looked on: more slowly, through public names alone. Values inside of `torch.func`
-transforms are not known then.
+With the substitutes, the engine works as if a transform were always active: more slowly, through public names alone.
+Values inside of `torch.func` transforms are then unknown.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ except ImportError:
     untransformed = contextlib.nullcontext
 
     def transforms_active() -> bool:
-        """Stands for the public way of applying functions, which asks torch itself."""
+        """True, so that `applied` calls torch's public `apply`."""
         return True
 
     def maybe_current_level() -> int | None:
-        """Stands for some transform."""
+        """0, as if some transform were active."""
         return 0
 
     def is_wrapped(tensor: Tensor) -> bool:
-        """Stands for a tensor that no transform has wrapped."""
+        """False, as if no transform had wrapped the tensor."""
         return False
 
     def is_legacy_batchedtensor(tensor: Tensor) -> bool:
-        """Stands for a tensor that is no batch of gradients."""
+        """False, as if the tensor were no batch of gradients."""
         return False
 
     def get_unwrapped(tensor: Tensor) -> Tensor:
-        """The tensor as it is."""
+        """`tensor` itself."""
         return tensor
 
     unwrap_if_dead = get_unwrapped
 
 
 is_zero = getattr(Tensor, "_is_zerotensor", lambda x: False)
-"""True for a tensor that stands for zeros, without memory."""
+"""True for a tensor of zeros without memory, as torch's forward mode makes."""
 
 
 def forward_level() -> int:

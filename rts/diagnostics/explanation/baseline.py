@@ -1,4 +1,4 @@
-"""Baseline for a derivative's error: a similar sphere or box, moved alike, whose derivative is well known."""
+"""Baseline for a derivative's error: the error of a similar sphere or box, moved in the same manner."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rts.scene.parts import Part
 SUBDIVISIONS = 4
 """Subdivisions of the sphere."""
 FEWEST = 8
-"""The least pixels of an object that a sphere or a box is fitted to."""
+"""The least number of pixels of an object that a sphere or a box is fitted to."""
 SAMPLES = 8
 """Samples a pixel along each axis, for the baseline's truth."""
 COLOR = (0.9, 0.6, 0.3)
@@ -32,10 +32,10 @@ class Baseline(NamedTuple):
 
     Attributes:
         name: "a sphere" or "a box".
-        pushed: (H, W, 4), as of a `Number`.
-        true: (H, W, 4), as of a `Number`.
+        pushed: (H, W, 4), see `Number`.
+        true: (H, W, 4), see `Number`.
         slope: the derivative of the loss through the splatter.
-        difference: the finite difference.
+        difference: the finite difference of the loss.
     """
 
     name: str
@@ -52,9 +52,9 @@ def nearest(
 
     Args:
         subject: the scene.
-        number: the scalar parameter that moves it.
+        number: the number of the parameters that moves the scene.
         parts: indices of the parts that move; None for all.
-        options: of `rts.render`, in place of those of the subject.
+        options: options of `rts.render`, which replace those of the subject.
     """
     only = variants.alone(range(len(subject.parts)) if parts is None else parts)
     probe = variants.all_of(only, variants.placed)

@@ -28,7 +28,7 @@ LARGE_SHARE = 0.3
 STRONG = 0.1
 """The share of the largest error of a pixel from which a pixel counts as disagreeing."""
 ALIKE = 0.5
-"""The share of the scene's error from which the baseline counts as off, too."""
+"""The least error of the baseline that tells a bias of the library, as a share of the scene's error."""
 SHORTER, DENSE = 0.25, 8
 """For differences of fine colours: the step as a share of the usual one, and samples a pixel along each axis."""
 AGAIN = 4
@@ -39,9 +39,9 @@ class _Error(NamedTuple):
     """The difference between a derivative image and the truth.
 
     Attributes:
-        image: (H, W, 4), through the low-pass of `scores`.
+        image: (H, W, 4), the difference through the low-pass of `smoothing.py`.
         norm: norm of `image`.
-        sharp: (H, W), energy of the difference without the low-pass.
+        sharp: (H, W), energy of the difference without the low-pass: squares, summed over channels.
     """
 
     image: np.ndarray
@@ -61,7 +61,7 @@ class _Error(NamedTuple):
 
     @property
     def energy(self) -> np.ndarray:
-        """Energy (H, W) of each pixel."""
+        """(H, W), squares of `image`, summed over channels."""
         return (self.image**2).sum(axis=-1)
 
 
@@ -71,12 +71,12 @@ class _Case:
     Attributes:
         subject: the scene under test.
         number: the number.
-        options: of `rts.render`, from the experiments that helped.
-        connected: whether arrays that no derivative reaches are differentiated, too.
+        options: options of `rts.render`, from the experiments that helped.
+        connected: True if arrays that no derivative reaches are differentiated, too.
         pushed: the derivative image with `options` and `connected`.
-        error: its error.
+        error: the error of `pushed` in the pixels `left`.
         left: (H, W) bool, the pixels that are not explained.
-        noise: of the truth, in the unit of `error.norm`.
+        noise: the noise of the truth, in the unit of `error.norm`.
         whole: the error before any experiment.
         findings: the findings so far.
     """
@@ -109,7 +109,7 @@ class _Case:
         return derivative * self.number.slope.step
 
     def try_connected(self) -> _Error | None:
-        """`try_out` with derivatives for the arrays that none reaches."""
+        """`try_out` with derivatives for the arrays that no derivative reaches."""
         self.connected = True
         before = self.try_out()
         self.connected = before is not None
@@ -132,7 +132,7 @@ class _Case:
 
 
 def _constants(case: _Case, touched: Touched) -> None:
-    """Name arrays that no derivative reaches, if the number would agree with one."""
+    """Name arrays that no derivative reaches, if the number's derivatives would agree with these differentiated."""
     constants = why_constant(case.subject, touched)
     if not constants:
         return
@@ -277,7 +277,7 @@ def _each(count: int) -> str:
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
-    """Name a reason if pixels around the mask hold much of the remaining error."""
+    """Name the reason `kind` if pixels at most `widen` from the mask hold much of the remaining error."""
     from scipy.ndimage import binary_dilation
 
     if not mask.any():
@@ -333,7 +333,7 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _samples,
     _bias,
 )
-"""Experiments, from the cheap and certain to the dear; each adds findings to the case."""
+"""Experiments, from the cheap and certain to the expensive; each adds findings to the case."""
 
 
 def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
@@ -342,8 +342,8 @@ def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[
     Args:
         subject: the scene under test.
         number: the number.
-        touched: the arrays of the scene that it changes.
-        going: whether there is time for another experiment.
+        touched: the arrays of the scene that the number changes.
+        going: a function that is true while there is time for another experiment.
     """
     case = _Case(subject, number)
     for experiment in EXPERIMENTS:

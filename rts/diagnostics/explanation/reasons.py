@@ -63,8 +63,8 @@ class Finding(NamedTuple):
         kind: a key of `KINDS`.
         because: the cause; a sentence that goes on after "name: ".
         advice: what to do, a sentence; may be empty.
-        mask: (H, W) bool, the pixels; None for none.
-        share: of the disagreement; None where there is none.
+        mask: (H, W) bool, the pixels that show the cause; None for no pixels.
+        share: the share of the disagreement that the cause explains; None if nothing disagrees.
     """
 
     kind: str
@@ -128,7 +128,7 @@ def merged(findings: Sequence[tuple[str, Finding]], size: tuple[int, int]) -> li
 def marked(image: np.ndarray, reasons: Sequence[Reason]) -> np.ndarray:
     """The image (H, W, 4), dark and grey, with the pixels of reasons in their colours: (H, W, 3) linear.
 
-    Where two mark a pixel, the earlier one has it.
+    Where two reasons mark a pixel, it has the colour of the first.
     """
     grey = np.clip(np.nan_to_num(image[..., :3].mean(axis=-1) + 0.15 * image[..., 3]), 0, 1)
     picture = np.repeat((DIM**2 * grey)[..., None], 3, axis=-1)

@@ -33,12 +33,12 @@ def explained(
 
     Args:
         subject: the scene under test.
-        numbers: its numbers.
-        agrees: whether the derivatives of a slope agree.
-        own_loss: whether the loss is the user's, which may be flat where images change.
+        numbers: the numbers of its parameters that were measured.
+        agrees: slope → True if its two derivatives agree.
+        own_loss: True if the loss is the user's, which may be flat where images change.
         turn: count → a function that is true while time is left for one of `count` numbers, which share the rest
             of the budget.
-        phase: of a progress bar.
+        phase: shows a progress bar.
 
     Returns:
         The reasons, and how many numbers were left for want of time.
@@ -62,7 +62,7 @@ def explained(
 
 
 class _Watch:
-    """True while there is time; `refused` records that it ran out."""
+    """A function that is true while there is time; `refused` records that time ran out."""
 
     def __init__(self, going: Callable[[], bool]):
         self.going, self.refused = going, False

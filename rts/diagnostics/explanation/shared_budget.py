@@ -52,9 +52,9 @@ class Looked(NamedTuple):
     """Numbers measured within the budget.
 
     Attributes:
-        numbers: some of each array, measured.
-        planned: how many were to be measured.
-        rough: how many of them have fewer samples than asked for.
+        numbers: some numbers of each array, measured.
+        planned: count of the numbers that were to be measured.
+        rough: count of the `numbers` that have fewer samples than asked for.
     """
 
     numbers: list[Number]
@@ -63,9 +63,9 @@ class Looked(NamedTuple):
 
 
 def looked_at(subject: Subject, entries: int, samples: int, clock: Clock, phase: Phase) -> Looked:
-    """Measure some numbers of each array, first those chosen first in each.
+    """Measure at most `entries` numbers of each array: the first of every array, then the second ones, and so on.
 
-    If time does not suffice for all, each is measured with few samples before any is with more.
+    If time does not suffice for all with `samples`, all are measured with few samples before any is with more.
     """
     engine, parameters = subject.engine, subject.parameters
     gradient = engine.value_and_grad(lambda p: subject.loss(subject.image(p)))(parameters)[1]

@@ -22,7 +22,7 @@ class Slope(NamedTuple):
     """The derivative of a loss in one number of the parameters, by autodiff and by a finite difference.
 
     Attributes:
-        name: where the number is, such as "pose[2]".
+        name: the number's place in the parameters, such as "pose[2]".
         autodiff: the derivative through the splatter.
         difference: the central finite difference of area-sampled hard renders.
         error: bound on the error of `difference`: the disagreement of two sampling grids and two steps, and rounding.
@@ -41,12 +41,12 @@ class Number(NamedTuple):
 
     Attributes:
         slope: its effect on the loss.
-        direction: of the parameters' structure, 1 at the number.
+        direction: a tree of the parameters' structure, 1 at the number and 0 elsewhere.
         pushed: (H, W, 4) float32, the derivative of the image through the splatter, for a step of the slope's length;
             NaN if forward mode fails there.
         true: (H, W, 4) float32, the finite difference over that step.
         noise: half the norm of the low-passed disagreement of two sampling grids.
-        forward: whether forward mode works through the splatter.
+        forward: True if forward mode works through the splatter.
     """
 
     slope: Slope
@@ -62,8 +62,8 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
 
     Args:
         subject: the scene under test.
-        name: of the number.
-        direction: of the parameters' structure, in which the number changes.
+        name: the number's name.
+        direction: a tree of the parameters' structure, along which the number changes.
         slope: the derivative of the loss by reverse mode; None to take it by forward mode.
         samples: samples a pixel along each axis.
     """
@@ -81,7 +81,7 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
 
 
 def differenced(subject: Subject, number: Number, samples: int) -> Number:
-    """The number with a finite difference by `samples`² samples a pixel."""
+    """`number` with finite differences by `samples`² and (`samples` + 1)² samples a pixel filled in."""
     step, direction = number.slope.step, number.direction
     to_numpy = subject.engine.to_numpy
 
@@ -101,7 +101,7 @@ def differenced(subject: Subject, number: Number, samples: int) -> Number:
 
 
 def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
-    """A step that moves hidden parts by a pixel, or arrays that no derivative reaches."""
+    """A step that moves hidden parts by a pixel, or arrays that no derivative reaches; None if neither move."""
     touched = subject.touched(direction, STEP_UNSEEN)
     connect = bool(touched.constant or touched.cut)
     kept = touched.parts
@@ -115,7 +115,7 @@ def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
 
 
 def chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Indices of the largest entries, NaN first, and of some others, fixed by the seed."""
+    """Indices, sorted, of `count` entries: half are the largest or NaN, the others at random, by a fixed seed."""
     if gradient.size <= count:
         return list(range(gradient.size))
     largest = np.argsort(-np.nan_to_num(np.abs(gradient), nan=np.inf), kind="stable")[: (count + 1) // 2]
@@ -125,7 +125,7 @@ def chosen(gradient: np.ndarray, count: int) -> list[int]:
 
 
 def unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
-    """The direction in which one number of one leaf changes."""
+    """The direction along which entry `index` of leaf `number` changes alone: a tree of the parameters' structure."""
     count = iter(range(sum(1 for _ in leaves(parameters))))
 
     def leaf(p: Array) -> Array:

@@ -75,11 +75,11 @@ class Subject:
     """A scene under test: how it is rendered, and its loss.
 
     Attributes:
-        engine: of the parameters.
+        engine: the engine of the parameters.
         scene: parameters → (parts, camera).
         parameters: values that are not traced.
         size: (height, width).
-        options: of `rts.render`.
+        options: options of `rts.render`.
         loss: image → scalar.
     """
 
@@ -98,21 +98,21 @@ class Subject:
         return scene
 
     def drawn(self, scene: tuple[Any, Camera], change: Change | None = None, size: Any = None, **options: Any) -> Array:
-        """The image of parts and a camera; a NumPy one becomes a constant of the engine."""
+        """The image (H, W, 4) of a scene after a change; an image in NumPy becomes a constant of the engine."""
         parts, camera = scene if change is None else change(listed_parts(scene[0]), scene[1])
         image = render(parts, camera, size or self.size, **{**self.options, **options})
         check_colors(image.shape[-1] - 1)
         return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
 
     def image(self, parameters: Tree, change: Change | None = None, **options: Any) -> Array:
-        """The image (H, W, 4) of the changed scene."""
+        """The image (H, W, 4) of the scene at some parameters, after a change."""
         return self.drawn(self.shown(parameters), change, **options)
 
     def require_dependence(self) -> None:
-        """Refuse a scene of NumPy arrays which do not change with the parameters.
+        """Refuse a scene of NumPy arrays that do not change with the parameters.
 
         Raises:
-            InputError: nothing depends on them.
+            InputError: nothing in the scene depends on the parameters.
         """
         scene = self.shown(self.parameters)
         image = render(*scene, self.size, **self.options)
@@ -141,10 +141,10 @@ class Subject:
         """The derivative (H, W, 4) of the image along a direction, by forward mode.
 
         Args:
-            direction: of the parameters.
-            change: of the scene.
-            connect: whether arrays that no derivative reaches move, too.
-            **options: of `rts.render`.
+            direction: a tree of the parameters' structure.
+            change: a change of the scene.
+            connect: True to move arrays that no derivative reaches, too.
+            **options: options of `rts.render`.
         """
         one, unit, at = self._line(direction, connect)
         draw = partial(self.drawn, change=change, **options)
@@ -156,10 +156,10 @@ class Subject:
         """The result of `pixel_step` for a changed scene.
 
         Args:
-            direction: of the parameters.
-            change: of the scene.
-            connect: whether arrays that no derivative reaches move, too.
-            deep: whether hidden layers count, too.
+            direction: a tree of the parameters' structure.
+            change: a change of the scene.
+            connect: True to move arrays that no derivative reaches, too.
+            deep: True to look at hidden layers, too.
             **given: options of `rts.render`.
         """
         one, unit, at = self._line(direction, connect)
@@ -173,7 +173,8 @@ class Subject:
         """A 1, a unit tangent, and t → the scene of the parameters moved by t along a direction.
 
         The scene function is differentiated if possible. Some engines' forward mode fails in functions that read
-        values, as NumPy does. Then the scene's arrays move by differences, but those that no derivative reaches rest.
+        values, as NumPy does. Then the scene's arrays move by differences, but arrays that no derivative reaches do
+        not move, unless `connect` is set.
         """
         xp = self.engine.namespace
         one = self.engine.constant(np.ones(()), next(leaves(self.parameters)))
@@ -241,7 +242,10 @@ class Subject:
 
     @cached_property
     def _gradients(self) -> dict[Place, list[np.ndarray | None]]:
-        """The gradient of a random sum of each array that a derivative reaches; None for leaves where it is 0."""
+        """For each array that a derivative reaches, the gradient of its sum under random weights.
+
+        A list by leaf of the parameters; None for leaves where the gradient is 0.
+        """
         engine, gradients = self.engine, {}
         places, arrays = self._arrays(self.shown(self.parameters))
         for k, (place, x) in enumerate(zip(places, arrays, strict=True)):
@@ -306,7 +310,7 @@ class Subject:
 
     @cached_property
     def supersample(self) -> int:
-        """Samples along each axis of a pixel; with `rts.Adaptive`, of an active one."""
+        """Samples along each axis of a pixel; with `rts.Adaptive`, of an active pixel."""
         return finest(self.options.get("supersample", 1))
 
     @cached_property

@@ -61,7 +61,7 @@ def fineness(sampled: Callable[..., Sampled], size: tuple[int, int], taken: int)
 
 
 def _thinner(part: np.ndarray, across: int) -> np.ndarray:
-    """The cells of parts, or of gaps between them, that no disk fits over which is `across` cells wide."""
+    """Mask of the cells that no disk, `across` cells wide, covers without leaving their part, or their gap."""
     from scipy.ndimage import binary_opening, find_objects
 
     disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5
@@ -77,5 +77,5 @@ def _thinner(part: np.ndarray, across: int) -> np.ndarray:
 
 
 def on_host(x: Any) -> np.ndarray:
-    """An array as NumPy."""
+    """An array of any engine as NumPy."""
     return engine_of(x).to_numpy(x)

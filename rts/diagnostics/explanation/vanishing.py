@@ -18,18 +18,19 @@ from rts.fitting.dependence import directions_in_words
 from rts.sampling.empty_images import out_of_view
 
 QUIET = 1e-4
-"""The change of a pixel by a step up to which it counts as none."""
+"""The largest change of a pixel by a step that counts as none."""
 DISTANCES = (4.0, 16.0, 64.0, -4.0, -16.0)
 """Distances by which a camera is moved back, in units of its near plane's."""
 FLAT, FAR = 1e-3, 0.05
 """A loss is flat if moves of up to two pixels change it by at most FLAT of a far move's change. That change must be
 more than FAR of the loss."""
 STEEP = 0.1
-"""The change near by that still counts as flat, as a share of a parabola's; with more the loss is at its minimum."""
+"""The largest change by moves of up to two pixels that counts as flat, as a share of a parabola's; with more the loss
+is at its minimum."""
 OPEN = 1e-3
-"""The singular value up to which a combination is undetermined, as a share of those of its numbers."""
+"""The largest singular value of an undetermined combination, as a share of its numbers' own."""
 OPEN_TRUE = 0.1
-"""The change of the image by an undetermined combination, at most, as a share of the change by one of its numbers."""
+"""The largest change of the image by an undetermined combination, as a share of the change by one of its numbers."""
 
 
 def is_quiet(derivative: np.ndarray) -> bool:
@@ -140,7 +141,7 @@ def why_constant(subject: Subject, touched: Touched) -> list[Finding]:
 
 
 class _Trial:
-    """Trial of a number: whether it shows in changed scenes."""
+    """Test whether a number changes the images of changed scenes."""
 
     def __init__(self, subject: Subject, number: Number):
         self.subject, self.number = subject, number
@@ -179,7 +180,7 @@ class _Trial:
 
 
 def why_flat(subject: Subject, number: Number, going: Callable[[], bool]) -> list[Finding]:
-    """Find out whether the loss is flat around a number that is seen, though larger moves change it."""
+    """A finding if the loss is flat around a number that changes the image, though larger moves change the loss."""
     engine, step = subject.engine, number.slope.step
     samples = 2
 
@@ -214,7 +215,7 @@ def why_flat(subject: Subject, number: Number, going: Callable[[], bool]) -> lis
 
 
 def _seen_by_blur(subject: Subject, number: Number) -> int | None:
-    """Standard deviation of the Gaussian, pixels, through which the loss of images has a slope."""
+    """Standard deviation, pixels, of a Gaussian that makes the loss of blurred images change; None if none does."""
     from scipy.ndimage import gaussian_filter
 
     engine, like = subject.engine, next(leaves(subject.parameters))
@@ -233,7 +234,7 @@ def _seen_by_blur(subject: Subject, number: Number) -> int | None:
 
 
 def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str, Finding]]:
-    """Combinations of numbers along which the image stays as it is, though each of them changes it."""
+    """Combinations of numbers along which the image does not change, though each number alone changes it."""
     numbers = [n for n in numbers if np.isfinite(n.pushed).all() and not is_quiet(n.pushed)]
     if len(numbers) < 2:
         return []
@@ -259,7 +260,7 @@ def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str,
 
 
 def _stays(subject: Subject, numbers: Sequence[Number], weights: np.ndarray) -> bool:
-    """True if the image stays the same while numbers move together; the fastest moves by its step."""
+    """True if the image stays the same while numbers move together; that of largest weight moves by its step."""
     weights = weights / np.abs(weights).max()
     largest = numbers[int(np.argmax(np.abs(weights)))]
 

@@ -16,21 +16,21 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 CLEAR = 0.5
-"""Alpha of parts made transparent, as a share of their own."""
+"""Factor of the alpha and colours of parts that are made transparent."""
 
 
 def alone(kept: Collection[int]) -> Change:
-    """The scene with some of its parts only."""
+    """A change that leaves only the parts with indices `kept`."""
     return lambda parts, camera: ([p for i, p in enumerate(parts) if i in kept], camera)
 
 
 def unculled(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene with both sides of all triangles."""
+    """The scene with both sides of all triangles shown: cull="none"."""
     return [p.replace(cull="none") for p in parts], camera
 
 
 def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene with transparent parts."""
+    """The scene with all parts made transparent, by the factor `CLEAR`."""
 
     def through(part: Part) -> Callable[..., Array]:
         shader = instance("rts.shaders", part.shader)
@@ -46,12 +46,12 @@ def unbounded(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
 
 
 def wider(size: tuple[int, int], apron: int) -> Change:
-    """The scene through a larger window, for images with `apron` more pixels on every side."""
+    """A change to a larger window, for images with `apron` more pixels on every side."""
     return lambda parts, camera: (parts, camera.with_apron(size, apron))
 
 
 def farther(distance: float) -> Change:
-    """The scene from a camera moved back along its axis; a negative distance moves it ahead."""
+    """A change that moves the camera back along its axis; a negative distance moves it ahead."""
     change = np.eye(4)
     change[2, 3] = -distance
 
@@ -75,7 +75,7 @@ def placed(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
 
 
 def all_of(*changes: Any) -> Change:
-    """One change after another."""
+    """A change that makes several changes, one after another."""
 
     def change(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
         for one in changes:
