@@ -172,7 +172,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _supersample(text: str) -> Any:
-    """The samples a pixel of "4", or of "adaptive:4"."""
+    """The `supersample` written as "4" or "adaptive:4"."""
     from rts.sampling.adaptive import Adaptive
 
     return Adaptive.of_text(text)

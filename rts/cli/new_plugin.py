@@ -14,7 +14,7 @@ from rts.errors import InputError
 from rts.files.paths import output_folder, writing
 
 KINDS = ("surface", "sampler", "shader", "splatter")
-"""The kinds of plugins that there are templates of."""
+"""Kinds of plugins that have templates."""
 TRIANGLES = "surface_of_triangles"
 """The folder of templates of a surface that is sampled by triangles."""
 PLACES = {
@@ -32,8 +32,8 @@ def write_plugin(kind: str, name: str, folder: Any = None, triangles: bool = Fal
 
     Args:
         kind: one of `KINDS`.
-        name: the plugin's, such as "height-field".
-        folder: where to; by default "rts-" and the name, in the current folder.
+        name: the plugin's name, such as "height-field".
+        folder: the new folder; by default "rts-" and the name, in the current folder.
         triangles: whether a surface is to be sampled by triangles, in place of rays.
 
     Returns:
@@ -63,7 +63,7 @@ def write_plugin(kind: str, name: str, folder: Any = None, triangles: bool = Fal
 
 
 def _names(kind: str, name: str) -> dict[str, str]:
-    """The values that templates ask for, of a plugin's kind and name."""
+    """Values for the templates, by their names there, from a plugin's kind and name."""
     module = name.replace("-", "_")
     if not re.fullmatch(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise InputError(

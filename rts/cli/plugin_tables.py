@@ -44,8 +44,8 @@ def print_matrix(console: Console, only: Sequence[str] = ()) -> None:
     """Print every surface with every sampler, tried in every engine: a row as soon as it is known.
 
     Args:
-        console: where to; it is flushed after each row.
-        only: names of surfaces, samplers and engines to try.
+        console: the console to print to; it is flushed after each row.
+        only: names of surfaces, samplers and engines to try; empty for all.
     """
     engines = registry.plugins("rts.engines")
     engines, rows = [e for e in engines if e in only] or engines, pairs(only)

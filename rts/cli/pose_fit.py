@@ -115,7 +115,7 @@ def fit_pose(
         parts: the model, NumPy arrays; its pose as loaded is the start.
         target: (H, W) silhouette.
         camera: the camera of the target, float64 NumPy and perspective, with its ratio of width to height.
-        bounds: the bounds of the model; translations are fitted in units of its radius, to weigh like radians.
+        bounds: the bounds of the model; translations are fitted in units of their radius, to weigh like radians.
         engine: "torch" or "jax"; by default the one installed.
         method: as in `rts.fit`.
         steps: the largest number of steps at each resolution; by default that of `rts.fit`.

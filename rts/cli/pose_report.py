@@ -37,7 +37,7 @@ def write_report(
     Args:
         folder: the folder for the files; made if missing.
         result: the result of `fit_pose`.
-        verdict: the verdict on it.
+        verdict: the verdict on the pose.
         parts: the model.
         target: (H, W) silhouette.
         scenery: further parts of the pictures, which do not move.

@@ -14,7 +14,7 @@ from rts.scene.parts import Part
 GOOD = 0.9
 """Least intersection over union of a good fit."""
 NEITHER = (0.01, 0.9)
-"""Range of linear brightness that no mask has: neither outside nor inside, with noise of compression."""
+"""Range of linear brightness that masks lack: neither outside nor inside, noise of compression allowed for."""
 COLORED = 0.1
 """Least difference of linear channels of a coloured pixel; masks have none."""
 PHOTO = 0.05

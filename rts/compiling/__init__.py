@@ -1,1 +1,1 @@
-"""Loops compiled by numba: how, kept where, run on all cores, and compiled ahead."""
+"""Loops: compiled by numba, kept on disk, run on all cores, and compiled ahead."""

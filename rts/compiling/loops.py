@@ -27,10 +27,10 @@ TOLD_AFTER = 1.0
 """Seconds of compilation after which a message appears on the terminal."""
 
 LOOP = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
-"""numba's options of loops. It makes two wrappers beside a function's code, one for Python and one for C.
+"""numba's options of loops: no interpreter lock, no wrapper that C code could call, no error for a division by zero.
 
-Division by zero raises no error. All loops have these options, since numba compiles its own functions, such as `min`
-and `np.empty`, once for each set of options.
+All loops have these options, since numba compiles its own functions, such as `min` and `np.empty`, once for each set
+of options.
 """
 
 
@@ -56,14 +56,14 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 @contextmanager
 def alone(folder: str, writes: bool = True) -> Iterator[None]:
-    """Hold a folder of loops as the only process that writes, if the system and the file system support locks.
+    """Hold the lock of a folder of loops: one process writes at a time, if the system and the file system have locks.
 
     numba reads a function's index, chooses a name for the code, and writes both, one after the other. Two processes
     that do so at once, for different types, may choose the same name: one type's calls would then run the other's code.
 
     Args:
         folder: the folder of the loops.
-        writes: False to share it with other readers.
+        writes: False to only read, and share the lock with other readers.
     """
     file = _lock_file(folder)
     if fcntl is None or file is None:
@@ -112,7 +112,7 @@ class _Watch(event.Listener):
         self._depth, self._since, self._told, self._paused = 0, 0.0, False, False
 
     def on_start(self, event: Any) -> None:
-        """Note the start of a function, or of one that it calls."""
+        """Note that the compilation of a function starts, or of one that it calls."""
         if self._depth == 0:
             self._since = time.perf_counter()
             self._paused = _is_ours(event) and gc.isenabled()
@@ -121,7 +121,7 @@ class _Watch(event.Listener):
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """Note the end of a function, compiled or refused."""
+        """Note that the compilation of a function ends, in success or not."""
         self._depth -= 1
         if self._depth:
             return

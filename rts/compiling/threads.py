@@ -48,13 +48,13 @@ def cores() -> set[int]:
 
 
 class _Job:
-    """Work offered to a helper. The first to claim it, helper or caller, decides whether the helper joins in.
+    """Work offered to a helper thread, which does it unless the caller claims the job first.
 
     Attributes:
-        work: a function.
+        work: the function to call.
         cores: the cores of the caller's thread, if the system knows them.
-        roams: whether it may run on all of these, the caller's own core included.
-        error: the error that it raised, or None.
+        roams: whether the work may run on all of these, the caller's current core included.
+        error: the error that the work raised, or None.
     """
 
     def __init__(self, work: Callable[[], None], cores: set[int] | None, roams: bool):
@@ -104,7 +104,7 @@ class _Helpers:
         self._placed: set[int] | None = None
 
     def free(self, count: int) -> int:
-        """The number of `count` helpers that are idle or not started yet."""
+        """Of `count` helpers, the number of those that are idle or not started yet."""
         return max(0, count - len(self._under_way))
 
     def start(self, count: int) -> None:
@@ -126,8 +126,8 @@ class _Helpers:
     def keep_off(self, core: int, cores: set[int]) -> None:
         """Have idle helpers run on `cores` without one of them, `core`.
 
-        On two cores Linux often wakes a thread on its waker's core, though the other is idle: it would wait there until
-        the loop is over.
+        On two cores Linux often wakes a thread on its waker's core, though the other is idle. The thread would
+        wait there until the loop is over.
         """
         cores = cores - {core} or cores
         if self._under_way or cores == self._placed:
@@ -169,7 +169,7 @@ class _Helpers:
 
 
 def _place(thread: int, cores: set[int]) -> None:
-    with contextlib.suppress(OSError):  # Without permission, they run anywhere.
+    with contextlib.suppress(OSError):  # Without permission, threads run anywhere.
         os.sched_setaffinity(thread, cores)
 
 
@@ -195,22 +195,22 @@ def thread_count() -> int:
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """A contiguous view, copied only if necessary; always read-only, so that loops are compiled only once."""
+    """A contiguous view of an array, copied only if necessary; read-only, since loops are compiled for such."""
     view = np.asarray(x, dtype, order="C").view()
     view.flags.writeable = False
     return view
 
 
 def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
-    """Call `loop(start, stop, *args)` so that the ranges cover [0, count); it must release the lock.
+    """Call `loop(start, stop, *args)` on all cores, in ranges that cover [0, count).
 
     Args:
-        loop: a function of (start, stop, *args).
+        loop: a function of (start, stop, *args) that releases the interpreter lock.
         count: the end of the range.
         *args: passed on.
-        work: rough nanoseconds on one thread.
-        apart: whether helpers must stay off the caller's core all the time. Functions that they call must not start
-            threads then, which would have to stay off as well.
+        work: rough time on one thread, nanoseconds.
+        apart: whether helpers must stay off the caller's core all the time. The loop must then start no threads, which
+            would have to stay off as well.
     """
     # Inside a task of another loop no helper may be free, and asking takes time.
     if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
@@ -251,9 +251,9 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
 
 
 def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-    """The results of a function for each item, computed on all cores; loops inside of it use idle cores.
+    """The results of a function for each item, computed on all cores; loops that the function calls use idle ones.
 
-    If it fails for several items, the error is that of the first; items after it may be left out.
+    If the function fails for several items, the error is that of the first; items after it may be left out.
 
     Args:
         f: a function that several threads may call at once.

@@ -18,17 +18,17 @@ from rts.errors import InputError, RtsError
 
 FIRST = ("picture",)
 OTHERS = ("least_squares", "gradient_of_vertices", "adaptive", "gradient_of_crossing", "least_squares_of_mask")
-"""Names of calls: what all share comes first, alone, and the longest of the others before the rest."""
+"""Names of calls in `warmup_calls`. The first compiles what all share; the others follow at once, the longest first."""
 
 
 def warmup(processes: int | None = None) -> float:
     """Compile ahead what ordinary renders and fits of meshes use, and keep it on disk.
 
     Loops are otherwise compiled when they are first called, once for each installation: the first render takes long.
-    Where all is compiled it takes seconds. Loops are for float32; those of derivatives need torch or jax.
+    If all loops are compiled already, it takes seconds. Loops are for float32; those of derivatives need torch or jax.
 
     Args:
-        processes: how many to use at once; None for as many as there are cores for this process.
+        processes: number of processes at once; None for as many as there are cores for this process.
 
     Returns:
         Seconds that it took.
@@ -49,7 +49,7 @@ def warmup(processes: int | None = None) -> float:
 
 
 def _call(name: str) -> None:
-    """Make one of the calls in a process of its own, which finds modules and kept loops where this one does."""
+    """Make one of the calls in a process of its own, which finds modules and kept loops where this process does."""
     path = [p or os.getcwd() for p in sys.path if isinstance(p, str)]  # An empty entry is the working directory.
     own = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1"}
     if kept := getattr(getattr(sys.modules.get("numba"), "config", None), "CACHE_DIR", ""):

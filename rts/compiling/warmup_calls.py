@@ -1,4 +1,4 @@
-"""Ordinary calls on small pictures, each made by `python -m rts.compiling.warmup_calls NAME`: loops get compiled."""
+"""Ordinary calls on small pictures, each made by `python -m rts.compiling.warmup_calls NAME` to compile loops."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def least_squares() -> None:
 
 
 def least_squares_of_mask() -> None:
-    """Make such a step for a silhouette, by the splatters of one layer and of two."""
+    """Make a step of Levenberg–Marquardt for a silhouette, by the splatters of one layer and of two."""
     for options in ({}, {"splatter": "single", "layers": 1}):
         _step(octahedra()[1], np.zeros(SIZE, np.float32), **options)
 

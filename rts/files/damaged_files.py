@@ -54,9 +54,9 @@ def is_plain(text: str) -> bool:
 
 @contextlib.contextmanager
 def gathered(path: Path) -> Iterator[list[str]]:
-    """A list that holds one line for each warning of a file in the block, once it is left.
+    """Gather warnings about a file: a list that holds a line for each warning in the block, once the block ends.
 
-    Other libraries warn in their own ways, and some only log: what they say is caught, and led back to the file.
+    Other libraries warn in their own ways, and some only log: their messages are caught, and get the name of the file.
     Threads take turns.
 
     Raises:
@@ -87,7 +87,7 @@ def gathered(path: Path) -> Iterator[list[str]]:
 
 
 class _Lines(logging.Handler):
-    """Notes records logged as warnings or worse, with the errors that led to them."""
+    """Handler that adds lines for records logged as warnings or worse, with the errors that led to them."""
 
     def __init__(self, path: Path, lines: list[str]):
         super().__init__(logging.WARNING)

@@ -39,7 +39,7 @@ BOUNDS_TOLERANCE = 1e-3
 
 
 def count_of(value: Any) -> int:
-    """A whole number of at least zero; a ValueError for anything else."""
+    """The value if it is a whole number of at least zero; else a ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{value!r} is no count")
     return value
@@ -89,7 +89,7 @@ def rows_of(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views:
 def check_attributes(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[str, int]:
-    """Refuse attributes and indices that do not fit. Returns the accessors that have data, by attribute."""
+    """Refuse attributes and indices that do not fit. Returns the index of each accessor with data, by attribute."""
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
     accessors = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}

@@ -1,4 +1,4 @@
-"""Checks of GLB and glTF files before trimesh reads them: promised data are present, and colours are colours."""
+"""Checks of GLB and glTF files before trimesh reads them: promised data are present, and colours are in range."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
     Args:
         path: its path.
         data: its bytes.
-        file: the bytes of a file that it refers to.
+        file: name → bytes of a file that it refers to.
 
     Raises:
         InputError: it is shorter than it promises; accessors reach beyond the data; colours are not finite or far off.
@@ -131,7 +131,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) -> bytes:
-    """A GLB in which these accessors hold colours of 8 bits ("u1"), or the fractions that integers stand for ("f4")."""
+    """A GLB with the accessors of `changes` converted: "u1", to colours of 8 bits; "f4", integers to fractions."""
     blocks = [content + bytes(-len(content) % 4) for content in views]
     descriptions = [dict(view, buffer=0) for view in tree["bufferViews"]]
     for index, kind in sorted(changes.items()):
@@ -275,7 +275,7 @@ def _check_material(
 
 
 def _check_colors(path: Path, name: str, colors: np.ndarray, fail: Any) -> None:
-    """Refuse invalid colours (N, C); warn of colours that trimesh brings into range."""
+    """Refuse invalid colours (N, C); warn of colours that trimesh clips to their range."""
     wrong = ~(np.abs(colors) <= 255).all(axis=1)
     if wrong.any():
         at = int(np.argmax(wrong))

@@ -110,7 +110,7 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
 
 
 def _duration(kind: str, fps: float) -> int:
-    """Milliseconds of a frame, as the format holds them."""
+    """Milliseconds of a frame, rounded as the format needs; 0 for .mp4."""
     step = {".gif": 10, ".png": 1}.get(kind)
     if step is None:
         return 0

@@ -13,7 +13,7 @@ WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "colors": (3, 4)}
 """Numbers in a row of each table."""
 LARGEST = float(np.finfo(np.float32).max)
 SINGULAR = 1e-9
-"""The least volume of a parallelepiped for the product of its edges."""
+"""Least volume of a transform's parallelepiped, as a share of the product of its edges."""
 
 
 class Piece(NamedTuple):

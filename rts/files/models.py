@@ -40,7 +40,7 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say
     that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
 
-    So the number of vertices may be less than the file's. For data of your own, one row for each vertex of the
+    Welding may make vertices fewer than the file's. For data of your own, one row for each vertex of the
     file, load with `weld=False`.
 
     Args:
@@ -49,7 +49,7 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         weld: leave out vertices without faces, and weld those that coincide; False keeps the vertices of the file,
             their number and order. (All parts of an OBJ share one table of vertices; each then holds all of it.)
         surface: the name of a registered surface that reads the file, in a format of its own; "bezier" reads patches
-            (text as Newell's teapot is in, or .npz), "subdivision" the cage in an OBJ. What is said above is of "mesh".
+            (text as Newell's teapot is in, or .npz), "subdivision" the cage in an OBJ. The text above is about "mesh".
 
     Raises:
         InputError: the file is missing, damaged, of unknown kind, empty, holds other than it promises, or refers to
@@ -131,13 +131,13 @@ def _part(path: Path, piece: Piece, weld: bool) -> Part:
 
 
 def _used(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that a table refers to, and the table with the indices of these."""
+    """Rows that a table refers to, and the table with indices into these rows."""
     used, inverse = np.unique(table, return_inverse=True)
     return rows[used], inverse.reshape(table.shape)
 
 
 def _welded(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct rows in order of first occurrence, and for each given row its place among them."""
+    """Distinct rows in order of first occurrence, and for each given row its index among them."""
     _, first, inverse = np.unique(rows + 0.0, axis=0, return_index=True, return_inverse=True)  # −0 + 0 is 0.
     order = np.argsort(first)
     place = np.empty(len(order), np.int64)

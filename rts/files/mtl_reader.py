@@ -25,7 +25,7 @@ class Material(NamedTuple):
 
     Attributes:
         color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd. Without d, alpha is
-            1 − Tr, unless Tr is at least 1 or MeshLab wrote the file: then Tr is what others call d.
+            1 − Tr, unless Tr is at least 1 or MeshLab wrote the file: then Tr is taken for d.
         texture: file of map_Kd, or None. It replaces Kd.
     """
 
@@ -37,7 +37,7 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     """The materials of a library by name. Textures are looked for in the folder.
 
     Raises:
-        InputError: it cannot be read, a number is not finite, or it refers to a file outside the folder.
+        InputError: the library cannot be read, a number is not finite, or it refers to a file outside the folder.
     """
     materials: dict[str, dict[str, Any]] = {}
     current: dict[str, Any] = {}

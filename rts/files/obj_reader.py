@@ -45,7 +45,7 @@ class _Lines:
         self.unknown: dict[str, int] = {}
 
     def read(self) -> _Lines:
-        """Sort the lines of the file."""
+        """Read the file, and sort its statements by kind. Returns itself."""
         material = self.materials.setdefault(None, 0)
         lines = lines_of(contents(self.path))
         plain = is_plain("".join(lines))
@@ -75,7 +75,7 @@ class _Lines:
         return self
 
     def _check_key(self, key: str, rest: str, number: int) -> None:
-        """Refuse a word that may have been the key of a row: one of its letters only, or no word before numbers."""
+        """Refuse an unknown key that may be a damaged one: of letters v, t, n, f only, or no word before numbers."""
         letters = {c for c in key.lower() if "a" <= c <= "z"}
         if letters and letters <= set("vtnf") or not _WORD.fullmatch(key) and _NUMERIC.fullmatch(rest or key):
             raise self.fail(number, f"it begins with {key[:20]!r}; expected v, vt, vn or f, and a space after it")
@@ -112,8 +112,8 @@ class _Lines:
     def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
         """The rows of one kind.
 
-        They have the widest of `widths` that every row has. If some are shorter than all of these, zeros fill them up
-        to the first.
+        The result has the largest of `widths` columns that every row fills. If a row is shorter than all `widths`,
+        there are as many columns as the first says, filled up with zeros.
         """
         split = [row.split() for row in self.rows[key]]
         if not split:
@@ -195,11 +195,11 @@ class Polygons(NamedTuple):
         vertices: (V, 3) float64.
         colors: (V, 3) float64 in [0, 1], linear, or None.
         uv: (A, 2) float64.
-        sizes: (F,) int64, how many corners each face has.
+        sizes: (F,) int64, the number of corners of each face.
         corners: (H, 3) int64, position, uv and normal of the corners of all faces; −1 where one is not given.
         tags: the statements "t", as OpenSubdiv's files have them, each with the number of its line.
         materials: the number of materials of faces.
-        color: (3,) or (4,) in [0, 1], linear, of the only material; None of none, or of several.
+        color: (3,) or (4,) in [0, 1], linear, of the only material; None if there is none, or are several.
         texture: (h, w, 3 or 4) float32 in [0, 1], linear, of that material; or None.
     """
 
@@ -242,7 +242,7 @@ def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _colors(v: np.ndarray) -> np.ndarray | None:
-    """The colours (V, 3) of positions that have some."""
+    """The colours (V, 3) in rows of positions; None if there are none."""
     return v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1) if v.shape[1] == 6 else None
 
 

@@ -22,7 +22,7 @@ _SOLID = re.compile(r"\s*solid\b([^\n]*)\n\s*", re.IGNORECASE | re.ASCII)
 _END = re.compile(r"endsolid\b[^\n]*\n?\s*", re.IGNORECASE | re.ASCII)
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("more", "<u2")])
 TRIANGLE = _RECORD.itemsize
-"""Bytes of a triangle of a binary STL, after 84 of a header that ends in their number."""
+"""Bytes of a triangle of a binary STL. Triangles follow a header of 84 bytes, which ends in their number."""
 
 
 def text_of(path: Path, kind: str, data: bytes) -> str:
@@ -160,8 +160,8 @@ def sound_stl(path: Path, data: bytes) -> bytes:
 def _check_records(path: Path, records: np.ndarray) -> None:
     """Refuse triangles whose bytes are misplaced.
 
-    Their numbers are of any size, then: coordinates are too small or too large to be any, and normals have no length
-    of 1, nor of 0.
+    Numbers read from misplaced bytes are of any size: coordinates are far too small or too large, and the lengths of
+    normals are neither 1 nor 0.
     """
     sizes = np.abs(records["corners"])
     strange = ((sizes > 0) & (sizes < 1e-30)) | (sizes > 1e30)

@@ -75,7 +75,7 @@ def output_folder(path: Any) -> Path:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turns errors while a file, or the folders above it, are written into an InputError of one line."""
+    """Turn errors in the block, which writes a file or the folders above it, into an InputError of one line."""
     try:
         yield
     except (OSError, MemoryError, struct.error, OverflowError) as error:
@@ -92,8 +92,8 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
         referrer: the file that names it.
 
     Raises:
-        InputError: an absolute path, or one that leads out of the folder, symbolic links followed; or what no file can
-            be called.
+        InputError: an absolute path, or one that leads out of the folder, symbolic links followed; or a name that no
+            file can have.
     """
     plain = name.replace("\\", "/")
     absolute = plain.startswith("/") or PureWindowsPath(plain).drive or "\0" in plain
@@ -121,5 +121,5 @@ def cache_folder() -> Path:
 
 @functools.cache
 def own_folder() -> tempfile.TemporaryDirectory:
-    """A folder of this process alone, which is removed at its end."""
+    """A folder of this process alone, which is removed when the process ends."""
     return tempfile.TemporaryDirectory(prefix="rts-")

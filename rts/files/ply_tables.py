@@ -20,7 +20,7 @@ from rts.files.damaged_files import COUNT, is_plain, lines_of, unreadable, warn
 from rts.files.images import is_image
 
 Lists = tuple[np.ndarray, np.ndarray]
-"""Lists of different lengths: how long each one is, and all entries, one list after the other."""
+"""Lists of different lengths: the length of each, and the entries of all, one list after the other."""
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -42,7 +42,7 @@ COLORS = ("red", "green", "blue", "alpha")
 
 
 class Property(NamedTuple):
-    """A column: its name, the type of its entries, and that of the lengths where it is of lists."""
+    """A column: its name, the type of its entries and, if entries are lists, the type of their lengths."""
 
     name: str
     type: str
@@ -82,9 +82,9 @@ def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
     """A PLY of the same mesh that is binary, and of triangles only.
 
     Args:
-        path: its path.
+        path: the path of the file.
         data: its bytes.
-        file: the bytes of a file that it refers to.
+        file: name → bytes of a file that it refers to.
 
     Raises:
         InputError: rows or entries of lists are not as many as promised, or are not numbers; a face has less than 3
@@ -149,7 +149,7 @@ def _face_table(path: Path, mesh: Mesh, fail: Fail) -> tuple[list[str], bytes]:
         fields.append((f"own {name}", "<" + column.dtype.str[1:]))
         columns[f"own {name}"] = column[owner]
     table = np.empty(len(triangles), fields)
-    with np.errstate(over="ignore"):  # What is used is looked at later.
+    with np.errstate(over="ignore"):  # Columns that are used are checked later.
         for name, column in columns.items():
             table[name] = column
     return lines, table.tobytes()
@@ -210,7 +210,7 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
 
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
-    """The header's elements, layout and name of a texture; and the place where the data begin."""
+    """The header's elements, layout and name of a texture; and the byte where the data begin."""
     # Lines of a Macintosh end in CR alone.
     newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", data) else b"\n"
     end = data.find(newline + b"end_header") + 1
@@ -272,7 +272,7 @@ def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) 
 
 
 def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray | list[list[float]]:
-    """The numbers of lines, given with their places in the file: as an array (R, C) where all are as many."""
+    """The numbers in each of `rows` (line number, line): an array (R, C) if lines have equally many, else lists."""
     try:
         lines = [line for _, line in rows]
         if is_plain("".join(lines)):
@@ -322,7 +322,7 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> di
 
 
 def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, int]] | None:
-    """First and last place of each property in a row of numbers; None if the row is too long or too short."""
+    """Start and end of each property's entries in a row of numbers; None if the row is too long or too short."""
     places, at = [], 0
     for p in properties:
         length = 1
@@ -370,7 +370,7 @@ def _binary_tables(elements: list[Element], data: bytes, at: int, order: str, fa
 
 
 def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int] | None:
-    """The table, and where it ends, if all rows have lists as long as the first."""
+    """The table, and the byte where it ends, if all rows have lists as long as the first; else None."""
     fields: list[Any] = []
     place = at
     for p in element.properties:
@@ -403,7 +403,7 @@ def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str
 
 
 def _different(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int]:
-    """The table, and where it ends, row by row; a struct.error where the file ends before."""
+    """The table, read row by row, and the byte where it ends; a struct.error if the file ends before."""
     parts: dict[str, list[tuple[Any, ...]]] = {p.name: [] for p in element.properties}
     steps = [
         (parts[p.name], CODES[p.type], np.dtype(p.type).itemsize, struct.Struct(order + CODES[p.length_type or "u1"]))

@@ -9,20 +9,20 @@ TOLERANCE = 1e-9
 
 
 def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Triangles of polygons, n − 2 for one of n corners, wound like it.
+    """Triangles of polygons, n − 2 for a polygon of n corners, wound like the polygon.
 
     A polygon all of whose corners are seen from its first one, such as any that is convex, becomes the fan about that
-    corner. Others, which are concave, are cut as seen along the axis that their Newell normal is nearest to. What has
-    no area, or crosses itself so that nothing fits, becomes a fan.
+    corner. Others, which are concave, are cut as seen along the axis that their Newell normal is nearest to.
+    Polygons without area, or which cross themselves so that no triangles fit, become fans.
 
     Args:
-        points: (V, 3) float, one unit for all axes; what is not finite does no harm.
+        points: (V, 3) float, one unit for all axes; numbers that are not finite do no harm.
         corners: (C,) int into `points`, the corners of one polygon after those of another.
-        sizes: (F,) int, how many corners each polygon has, at least 3.
+        sizes: (F,) int, the number of corners of each polygon, at least 3.
 
     Returns:
-        (T, 3) int64 into `corners`, ordered by polygon; (T,) int64, the polygon of each triangle; and how many polygons
-        are fans only because nothing else fits.
+        (T, 3) int64 into `corners`, ordered by polygon; (T,) int64, the polygon of each triangle; and the number of
+        polygons that are fans only because nothing else fits.
     """
     sizes = np.asarray(sizes, np.int64)
     ends = np.cumsum(sizes)
@@ -51,7 +51,7 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
 
 
 def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The polygons that have a triangle in their fan that faces away from the polygon."""
+    """Indices of the polygons whose fan has a triangle that faces away from the polygon."""
     several = (sizes > 3)[owner]
     if not several.any():
         return np.zeros(0, np.int64)
@@ -91,10 +91,9 @@ def _areas(corners: np.ndarray) -> np.ndarray:
 
 
 def _with_slivers(triangles: np.ndarray, count: int) -> np.ndarray:
-    """The triangles, and some without area where corners that lie on a line with others were left out.
+    """The triangles of a polygon, and triangles without area for corners on a line, which were left out.
 
-    What is left out leaves edges without a partner, be they of the outline or of triangles. They make loops, which are
-    filled.
+    Around such corners, edges of the outline or of triangles have no partner. These edges make loops, which are filled.
     """
     if len(triangles) == count - 2:
         return triangles

@@ -42,7 +42,7 @@ class View:
     Args:
         camera: the camera, float64 NumPy.
         size: (height, width).
-        image: (H, W, 3 or 4) float32, or a function that gives it whenever it is asked for.
+        image: (H, W, 3 or 4) float32, or a function that returns the image, called at each use.
         name: the picture's name in its file.
         near: the depth at which the scene begins, in the units of the camera; None where that is not known.
         far: the depth at which it ends, or None.
@@ -102,7 +102,7 @@ def load_views(
             as a rule. NeRF is trained on these, composited and averaged as they are.
         background: "white", "black" or a colour (3,), encoded like the images, to put them on: (H, W, 3); None for
             (H, W, 4) premultiplied.
-        pixel_center: where in a pixel of the images that are given its ray passes, in x and in y. The centre is 0.5.
+        pixel_center: place in each returned pixel, in x and in y, through which its ray passes. The centre is 0.5.
             NeRF's rays passed through 0 of the pixels it was trained on; so through (n − 1) / 2n of pixels that are
             means of n × n of those (0.375 for 100² of 400²).
         frame: "file" for the world of the file; "nerf" for that in which NeRF is trained on LLFF scenes: about the mean
@@ -153,7 +153,7 @@ def colour_named(colour: Any) -> np.ndarray:
 
 
 class _Pose(NamedTuple):
-    """A picture's entry in a file: the reduction still to be made, focal length over width, bounds."""
+    """A picture's entry in a file: full size, reduction still to be made, focal length over width, bounds."""
 
     path: Path
     size: tuple[int, int]
@@ -165,7 +165,7 @@ class _Pose(NamedTuple):
 
 
 def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: Any) -> Path:
-    """The file of cameras."""
+    """The file of cameras that the path names, or that its folder holds. Other arguments are checked, too."""
     if not is_count(downscale):
         raise InputError(f"downscale is {quoted(downscale)}; expected an integer of at least 1")
     if not (is_real(pixel_center) and -1 <= pixel_center <= 2):

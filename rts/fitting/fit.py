@@ -91,26 +91,27 @@ def fit(
     Where parameters go astray on the way, so that a loss or derivative is not finite or `residuals` raises an
     InputError, the fit stops, says so in its `reason`, and returns the best parameters met before.
 
-    "lm" takes the numbers of one array to be of like units: one that changes the residuals a million times less than
-    another of its array, in float32, stays as it is. Parameters of very different units belong in arrays of their own.
+    "lm" takes the numbers of one array to be of like units. A number that changes the residuals a million times less
+    than another of its array, in float32, stays as it is. Parameters of very different units belong in arrays
+    of their own.
 
     Args:
         residuals: parameters → array of any shape, of the parameters' engine, such as an image difference; see
-            `ImageResiduals` for one that "lm" takes less time and memory for, and `rts.Residuals` for what makes it so.
+            `ImageResiduals` for residuals with which "lm" needs less time and memory; `rts.Residuals` says why.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt, by
             the forward-mode Jacobian, for up to some hundred unknowns.
         loss: reduces residuals to a scalar; for "lm" an `rts.Loss`, such as `rts.Loss("huber", f_scale=0.1)`. By
-            default that of the residuals (`ImageResiduals(loss=…)`), at each stage its own, which for a function is the
-            mean square.
-        steps: at most so many losses are computed at each stage, the first at its start; default 200, for "lm" 50.
+            default the loss that the residuals declare, at each stage (`ImageResiduals(loss=…)`), or else the mean
+            square.
+        steps: the most losses computed at each stage, that of its start included; default 200, for "lm" 50.
         learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1).
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
         patience: the number of steps that `tolerance` speaks of; not for "lm".
         schedule: stages, one after the other, each from where the one before ended: the resolutions at which images are
             compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or other `rts.Residuals` with `at_stage`.
         callback: called as `callback(step, parameters, loss)`; a true result stops the fit, later stages included.
-        progress: show a progress bar with loss and ms/iteration; default only on a terminal.
+        progress: show a progress bar with loss and ms/iteration; None for only on a terminal.
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
 
     Raises:
@@ -258,7 +259,7 @@ def _residuals(value: Any, what: str) -> Residuals:
 
 
 def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[Callable[[Array], Array], bool]:
-    """The loss at a stage of the residuals `whole`, and True if the stage's own sums are for this loss."""
+    """The loss at a stage of the residuals `whole`, and True if the stage's `normal_equations` are for it."""
     if loss is not None and not overrides(stage, "normal_equations", Residuals):
         return loss, False
     own = _own_loss(stage)
@@ -267,7 +268,7 @@ def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[C
 
 
 def _own_loss(residuals: Residuals) -> Loss | None:
-    """The loss that residuals declare as theirs."""
+    """The loss that residuals declare; None if they declare none."""
     loss = residuals.loss
     if loss is None or isinstance(loss, Loss):
         return loss

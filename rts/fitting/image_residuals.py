@@ -1,4 +1,4 @@
-"""Residuals that know they are an image: their normal equations need no Jacobian of the image's size."""
+"""Residuals of images, whose normal equations need no Jacobian of the image's size."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class ImageResiduals(Residuals):
         channels: C of the image, as the scene's shaders say it. Where it is not 3, Levenberg–Marquardt takes the
             Jacobian.
         loss: the function of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
-            "soft_l1", "huber" or "cauchy", to which large residuals count less: where part of the target is wrong, such
+            "soft_l1", "huber" or "cauchy", to which large residuals count less: for targets that are partly wrong, such
             as a mask with something in front. Or an `rts.Loss`, which has its own `f_scale`.
         f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1,
             which suits images in [0, 1].
@@ -157,7 +157,7 @@ class ImageResiduals(Residuals):
         return self._loss
 
     def _take(self, target: Any, weights: Any) -> None:
-        """Compare with this target (H, W, ·) of one view."""
+        """Set the target (H, W, ·) of one view, and its weights."""
         self._target, self._channels = _checked_target(target, self.size, self._image_channels)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
 
@@ -197,10 +197,10 @@ class ImageResiduals(Residuals):
     def at_stage(self, stage: Stage) -> ImageResiduals:
         """The residuals at another resolution, for the same camera and extent of the image; see `rts.fit`.
 
-        Target and background are box-filtered. Where there are weights, the target's pixels count by their squares: an
-        image that is constant over each coarse pixel has the same sum of squares, but for a constant, as before. That
-        holds for the loss "linear": a robust one is taken of the mean difference over a coarse pixel, times its weight.
-        Differences are blurred with their weights; those take the Jacobian for Levenberg–Marquardt.
+        Target and background are box-filtered, the target's pixels by their squared weights. So an image that is
+        constant over each coarse pixel has the same sum of squares as before, but for a constant. That holds for the
+        loss "linear": a robust one is taken of the mean difference over a coarse pixel, times its weight. With a
+        `sigma`, weighted differences are blurred, and Levenberg–Marquardt takes the Jacobian.
 
         Args:
             stage: the resolution.
@@ -229,7 +229,7 @@ class ImageResiduals(Residuals):
             raise InputError(f"there are {len(cameras)} cameras for targets of {len(self._views)} views")
         cameras = cameras if self._view is None else [cameras[self._view]]
         if self.size != self._full:
-            # Sides are rounded: the ratio of fewer pixels may be another, what they show is the same.
+            # Sides are rounded: the ratio of fewer pixels may differ, but the extent of the image is the same.
             for own in cameras:
                 check_ratio(own, self._full)
             cameras = [own.for_size(self._full).replace(aspect=None) for own in cameras]
@@ -291,7 +291,7 @@ class ImageResiduals(Residuals):
             equations = self._swept_band(splatter, parameters, engine, top, rows)
             if equations is None:
                 return None
-            # Means over a band, made its part in means over the image.
+            # Means over a band become shares of means over the image.
             shares = [x * (rows / self.size[0]) for x in equations]
             total = shares if not total else [a + b for a, b in zip(total, shares, strict=True)]
         value, matrix, gradient = total
@@ -307,7 +307,7 @@ class ImageResiduals(Residuals):
 
         def window(camera: Camera) -> Camera:
             camera = camera.for_size(self.size)
-            # A window is of no ratio of its own.
+            # The ratio of a window is free.
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
         sampled = sample(parts, window(camera), size, sampler=self._sampler, settles=True, **vars(self._settings))
@@ -358,7 +358,7 @@ class ImageResiduals(Residuals):
         return value, matrix, gradient
 
     def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
-        """A tree in the engine of the parameters and of the target, of which either may be NumPy's."""
+        """A tree in the engine of the parameters or of the target, whichever is not NumPy's."""
         own, like = (self._target, self._weights, self._background), exemplar(parameters)
         return constants(tree, engine_of(tree, parameters, own), exemplar(own) if like is None else like)
 
@@ -388,7 +388,7 @@ class _Fields(NamedTuple):
 
 
 def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
-    """Fields for the coarse grid, with zero weights at active pixels, and for the layout of `fine`, zero elsewhere."""
+    """Fields for the coarse grid, weights zero at active pixels, and for the layout of `fine`, zero at all others."""
     xp, engine = namespace(pixel), engine_of(pixel)
     height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
 
@@ -442,7 +442,7 @@ def _are_cameras(value: Any) -> TypeGuard[Cameras]:
 
 
 def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
-    """The number of views of a target; None if it is one view without an axis. There may be `several` cameras."""
+    """The number of views of a target; None if it is one view, without an axis. `several`: of cameras."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape: Any = shape_of(target)
@@ -464,7 +464,7 @@ def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
 
 
 def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[Array, int]:
-    """The target for images of so many channels besides alpha, and its own number of them."""
+    """The target, checked for images of `channels` besides alpha, and its own number of channels."""
     if target is None:
         raise InputError("target is None; expected an array, such as what rts.load_image gives")
     target = from_numbers(target, "target")

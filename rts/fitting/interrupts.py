@@ -11,13 +11,13 @@ from typing import Any
 
 @contextlib.contextmanager
 def interrupts_held_back() -> Iterator[None]:
-    """Have Ctrl-C interrupt once a computation is done; a second one interrupts it at once.
+    """Have Ctrl-C interrupt only after the computation in the block; a second Ctrl-C interrupts at once.
 
-    Python raises KeyboardInterrupt between any two lines, its frameworks' own included. In torch it may leave forward
+    Python raises KeyboardInterrupt between any two lines, also of torch and jax. Raised in torch, it may leave forward
     mode switched on, and all derivatives fail from then on. A compiled program of jax that calls Python cannot pass it
-    on: it fails with an error of jax's, or does not notice. A step is short, and between steps everything is whole.
+    on: the program fails with an error of jax's, or goes on. A step is short, and between steps everything is whole.
 
-    Only the main thread is interrupted. A handler of the user's own decides what an interrupt does, as ever.
+    Only the main thread is interrupted. The interrupt then goes to the signal handler that was set before.
     """
     own = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(own):

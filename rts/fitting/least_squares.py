@@ -20,7 +20,7 @@ FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12
 TINY = 1e-300
 RESOLVED = 10.0
-"""Least gain that counts as one, in roundings of the loss."""
+"""Least predicted gain that must show in the loss, in rounding errors of the loss."""
 
 
 class _Linear(NamedTuple):
@@ -41,12 +41,11 @@ class _Linear(NamedTuple):
 class _Model:
     """The quadratic model of a loss, in the eigenspaces of JᵀJ that stand out of its rounding.
 
-    Unknowns are scaled so that JᵀJ has a diagonal of ones (Marquardt), but an unknown whose column is small beside
-    others of its array, by more than the square root of the rounding, as the largest of them times that: the numbers
-    of an array are taken to be of like units, and a column of rounding errors must not count. No step goes along
-    eigenvectors whose eigenvalue is below the rounding. Which of the steps that differ along these only is taken, the
-    model leaves open: the shortest, in units of each array. Such a direction is the length of a vector that is
-    normalised; were the step the shortest in Marquardt's units, it would run away along it.
+    Unknowns are scaled so that JᵀJ has a diagonal of ones (Marquardt). The column of an unknown is taken to be at least
+    as large as the largest of its array times the square root of the rounding: numbers of an array are of like units,
+    and a column of rounding errors must not be scaled up. No step goes along eigenvectors whose eigenvalue is below the
+    rounding. Of steps that differ along these only, the shortest is taken, in units of each array. Such a direction is
+    the length of a vector that is normalised: a step that is shortest in Marquardt's units would run away along it.
 
     Args:
         linear: the normal equations.
@@ -97,9 +96,9 @@ def levenberg_marquardt(
     With Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004), which is never below the
     rounding of JᵀJ.
 
-    The model of a robust loss has its second derivative where that is positive enough (`Loss.weights`). With ρ' alone
-    (iteratively reweighted least squares) it lies above the loss, but steps are shorter: up to 2.7 times as many are
-    taken (benchmarks/RESULTS.md).
+    The model of a robust loss has the loss's second derivative where that is positive enough (`Loss.weights`). With ρ'
+    alone (iteratively reweighted least squares) the model would lie above the loss, but steps would be shorter: up to
+    2.7 times as many (benchmarks/RESULTS.md).
 
     Args:
         residuals: a checked function of the parameters.
@@ -107,7 +106,7 @@ def levenberg_marquardt(
         engine: the engine of the parameters.
         run: takes note of each step, and says when to stop.
         jit: True to compile.
-        loss: of the residuals.
+        loss: the loss of the residuals.
         own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
         supersample: samples a pixel along each axis, for residuals of an image.
     """
@@ -139,7 +138,7 @@ def levenberg_marquardt(
         damping = max(damping, model.least)
         delta, predicted = model.step(damping)
         trial = vector + engine.constant(delta, vector)
-        # A trial after one that was accepted probably is, too: its normal equations come with its loss.
+        # A trial after an accepted one is probably accepted, too: its normal equations come with its loss.
         at_trial = linearize(trial) if promising and run.left > 1 else None
         trial_value = loss_at(trial) if at_trial is None else at_trial.value
         going = run.record(unflatten(trial), trial_value)
@@ -168,11 +167,11 @@ def _loss_rounding(linear: _Linear, count: int) -> float:
 
 
 def _no_step(jumps: bool, supersample: int | None) -> str:
-    """Why no step lowers the loss.
+    """The reason, in words, that no step lowers the loss.
 
-    Short steps along the gradient gain what it promises where the loss is smooth. Where they gain nothing, though
-    rounding would show it, the loss has jumps: as has that of an image with one sample a pixel, which is constant until
-    an outline passes a sample.
+    Short steps along the gradient gain what it promises where the loss is smooth. If they gain nothing, though the gain
+    would exceed rounding, the loss has jumps. An image with one sample a pixel has: it is constant until an outline
+    passes a sample.
     """
     if not jumps:
         return "no step lowers the loss: a local minimum"
@@ -189,7 +188,7 @@ def _note_open(model: _Model, parameters: Tree, sizes: Sequence[int], run: Run) 
     """Tell the run which directions the residuals do not determine, but for arrays that never mattered at all."""
     names, arrays = zip(*named_leaves(parameters), strict=True)
     mattered = np.concatenate([np.full(n, m) for n, m in zip(sizes, run.mattered, strict=True)])
-    # Without those, columns may depend on each other.
+    # Without those arrays, columns may depend on each other.
     columns, sizes_left, _ = np.linalg.svd(model.open * (model.units * mattered)[:, None], full_matrices=False)
     columns = columns[:, sizes_left > 1e-6 * sizes_left.max(initial=0)] / model.units[:, None]
     if columns.shape[1]:
@@ -254,7 +253,7 @@ def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, 
 
 
 def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
-    """All leaves as one vector, and the function that makes a tree of such a vector again."""
+    """All leaves as one vector, and the function that makes a tree like `parameters` of such a vector."""
     arrays = list(leaves(parameters))
     xp = namespace(*arrays)
 

@@ -15,12 +15,12 @@ from rts.errors import InputError
 
 
 class _Form(NamedTuple):
-    """A loss of residuals r as array code.
+    """A loss of residuals r as array code, of z = (r / s)² with s for `f_scale`.
 
     Attributes:
         cost: (namespace, r, f_scale) → s² ρ(z).
         weight: (namespace, r, f_scale) → ρ'(z).
-        share: (namespace, ρ') → what 1 + 2 z ρ'' / ρ' is there.
+        share: (namespace, ρ'(z)) → 1 + 2 z ρ''(z) / ρ'(z), the curvature over the weight.
     """
 
     cost: Callable[[Any, Array, float], Array]
@@ -29,9 +29,9 @@ class _Form(NamedTuple):
 
 
 FAR = 1e8
-"""Residuals beyond so many scales take the limits of the forms, which z may be too large a number for.
+"""Residuals beyond so many scales take the limits of the forms, since their z may overflow.
 
-They differ from them by less than the rounding of float64.
+The limits differ from the forms by less than the rounding of float64.
 """
 
 
@@ -78,10 +78,10 @@ FORMS = {
         lambda xp, weight: 2 * weight - 1,
     ),
 }
-"""Name → form. Compiled loops know them by their places in this order."""
+"""Name → form. Compiled loops know forms by their index in this order."""
 
 LEAST_SHARE = 0.1
-"""Share of their weight's curvature that residuals beyond the scale keep."""
+"""Least curvature of a residual, as a share of its weight."""
 
 SCALES = 1e-10, 1e10
 """Least and largest scale: with these float32 holds losses of residuals up to 1e20, and their derivatives."""
@@ -98,7 +98,7 @@ class Loss:
     - "huber": ρ(z) = z up to 1, 2 √z − 1 beyond: square for small residuals, linear for large ones.
     - "cauchy": ρ(z) = log(1 + z): large residuals count least, and there may be more local minima.
 
-    It is a function of the residuals, and so may be the `loss` of `rts.fit`.
+    A `Loss` is a function of the residuals, and so may be the `loss` of `rts.fit`.
 
     Attributes:
         name: one of the above.
@@ -135,9 +135,9 @@ class Loss:
     def weights(self, residuals: Array) -> tuple[Array, Array]:
         """Weights W and curvatures S of residuals, for normal equations JᵀSJ and JᵀWr.
 
-        Half the derivative of a residual's loss is W r, where W is ρ', at most 1. S is half its second derivative, but
-        a tenth of W where it is less, or negative: JᵀSJ is positive semidefinite. (Triggs et al. 2000; scipy takes
-        them so, too, with the rounding for a tenth.) Both are zero only where the dtype has no number so small.
+        Half the derivative of a residual's loss is W r, where W is ρ', at most 1. S is half its second derivative, at
+        least a tenth of W, so that JᵀSJ is positive semidefinite. (Triggs et al. 2000; SciPy has the rounding error in
+        place of a tenth.) Both are zero only where the dtype has no number so small.
         """
         residuals = _checked_residuals(residuals)
         xp, form = namespace(residuals), FORMS[self.name]
@@ -151,7 +151,7 @@ class Loss:
 
     @property
     def place(self) -> int:
-        """Its place among the losses; 0 is the square."""
+        """Index of the loss in `FORMS`; 0 is the square."""
         return list(FORMS).index(self.name)
 
 

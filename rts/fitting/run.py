@@ -24,7 +24,7 @@ NO_GRADIENT = (
 
 
 class Astray(Exception):
-    """Parameters became such that the fit cannot go on; the message says how."""
+    """The fit cannot go on from the parameters that it reached; the message says why."""
 
 
 class Run:
@@ -51,7 +51,7 @@ class Run:
         self._last_gain, self._reference = 0, math.inf
 
     def record(self, parameters: Tree, loss: float) -> bool:
-        """Note one step; True to go on."""
+        """Note the parameters and loss of one step. Returns True if the fit goes on."""
         margin = self.tolerance * abs(self._reference) if self.history else 0.0
         self.history.append(loss)
         self.show(loss)
@@ -90,7 +90,7 @@ class Run:
         return self.steps - len(self.history)
 
     def stop(self, reason: str) -> bool:
-        """Note why the fit stops. Always False, which `record` returns then."""
+        """Note why the fit stops. Returns False, which tells the caller of `record` to stop."""
         self.reason = reason
         return False
 
@@ -101,7 +101,7 @@ class Run:
     def attempt(self, engine: Engine, call: Callable, *args: Any) -> Any:
         """The result of `call(*args)`, waited for. After the first step an InputError in it becomes `Astray`.
 
-        Interrupts come after it.
+        Ctrl-C takes effect after the call.
         """
         # jax wraps errors of host functions in one of its own; the engine keeps the original.
         engine.take_error()
@@ -165,7 +165,7 @@ def require(finite: bool, what: str, start: bool) -> None:
 
 @contextlib.contextmanager
 def progress_bar(wanted: bool | None, steps: int, method: str, run: Run) -> Iterator[None]:
-    """A progress bar on standard error."""
+    """A progress bar on standard error, if `wanted`; None for only on a terminal."""
     if wanted is False or (wanted is None and not sys.stderr.isatty()):
         yield
         return

@@ -1,4 +1,4 @@
-"""Schedules: at which resolutions, one after the other, residuals of images are made small."""
+"""Schedules: the resolutions at which residuals of images are made small, one after the other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rts.sampling.adaptive import Adaptive, finest
 COARSEST, BLUR = 16, 1 / 16
 """A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""
 SAMPLES, FEWER_SAMPLES = 4, 2
-"""A pixel along each axis: at the coarsest resolution, where points jump over outlines, and between it and the last."""
+"""Samples a pixel along each axis: at the coarsest stage, whose samples jump over outlines; before the last."""
 
 
 @dataclass(frozen=True)
@@ -57,17 +57,17 @@ class Stage:
 
 
 def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | None = None) -> tuple[Stage, ...]:
-    """The schedule to take where the start is far off: from coarse and blurred images to fine ones.
+    """A schedule for a start that is far off: from coarse and blurred images to fine ones.
 
-    An outline pulls over one pixel only, and at whatever outline is nearest, be it the right one or not. Blurred images
+    An outline is pulled over one pixel only, to whichever outline is nearest, the right one or not. Blurred images
     show where most of an object is. So the first stage is of few pixels, with many samples each, and blurred by a
-    sixteenth of the image; those after double the resolution; the last is the image itself. From how far off poses are
+    sixteenth of the image. Later stages double the resolution; the last is the image itself. From how far off poses are
     found: benchmarks/RESULTS.md, "Basin of convergence".
 
     Args:
         size: (height, width) of the residuals.
         coarsest: the longer side of the first stage has this many pixels, or up to twice as many.
-        largest: the longer side of the last stage has at most so many; None for all.
+        largest: the longer side of the last stage has at most this many pixels; None for all.
 
     Returns:
         Two stages or more.
@@ -122,7 +122,7 @@ def _along_axes(image: Array, down: np.ndarray, across: np.ndarray) -> Array:
 
 
 def _box(few: int, many: int) -> np.ndarray:
-    """(few, many) shares of the pixels of a row in each of fewer ones."""
+    """Weights (few, many) of a row's pixels in each of fewer pixels."""
     edges, cells = np.arange(few + 1) * (many / few), np.arange(many + 1.0)
     shared = np.minimum(edges[1:, None], cells[1:]) - np.maximum(edges[:-1, None], cells[:-1])
     return shared.clip(0) * (few / many)

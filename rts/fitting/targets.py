@@ -10,16 +10,16 @@ from rts.arrays.trees import Array
 from rts.errors import InputError, InputWarning, warn
 
 LARGEST = 2.0
-"""Numbers of pictures from 0 to 1 that were filtered or interpolated are not above this."""
+"""Largest number to expect in a picture from 0 to 1 that was filtered or interpolated."""
 
 
 def check_range(target: Array, count: int, channels: int) -> None:
-    """Refuse alpha from 0 to 255, and warn of such colours; features have any value.
+    """Refuse alpha from 0 to 255, and warn of such colours; channels that are no colours may have any value.
 
     Args:
         target: (H, W) or (H, W, C).
         count: its number of channels.
-        channels: those of the image besides alpha.
+        channels: the number of channels of the image besides alpha.
     """
     alpha = target if count == 1 else target[..., -1:] if count == channels + 1 else None
     most = 0.0 if alpha is None else largest(alpha)
@@ -40,14 +40,14 @@ def largest(values: Array) -> float:
 
 
 def warn_of_gradients(images: Mapping[str, Any]) -> None:
-    """Warn of arrays of torch that are taken for constants, and of which it would have a derivative."""
+    """Warn of torch arrays that require a gradient, but are taken as constants."""
     for name, value in images.items():
         if any(getattr(x, "requires_grad", False) for x in (value if isinstance(value, (list, tuple)) else [value])):
             warn(f"{name} requires a gradient, and is taken as a constant; give {name}.detach()", InputWarning)
 
 
 def refuse_zero(weights: Sequence[Array | None]) -> None:
-    """Refuse weights of all views under which nothing is compared, where they are known."""
+    """Refuse weights that are zero in all views, so that nothing is compared; traced ones pass."""
     known = [None if own is None else value_of(namespace(own).any(own != 0)) for own in weights]
     if not any(own is None or own.any() for own in known):
         raise InputError("weights are all zero, so that nothing is compared; expected some above zero")

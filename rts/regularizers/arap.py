@@ -28,7 +28,7 @@ class ARAP(OfRestShape):
 
     Cotangent weights are ½ (cot α + cot β) of the two angles opposite the edge at rest. Negative ones, between obtuse
     angles, are set to 0, so that the energy is not negative. Where more than two faces share an edge, all of their
-    angles count; at a border the only one. Cotangents are bounded: angles below a twentieth of a degree count as such,
+    angles count; at a border the only one. Cotangents are bounded: angles below a twentieth of a degree count as that,
     and so do triangles without area. Uniform weights are 1.
 
     `residuals` is (2E, 3): √wᵢⱼ ((vᵢ − vⱼ) − Rᵢ (pᵢ − pⱼ)), ordered by i. There are 2E terms.

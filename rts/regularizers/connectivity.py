@@ -22,8 +22,8 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         faces: (T, 3) integers.
 
     Returns:
-        Edges (E, 2) int32, the lower vertex first, in order; and (T, 3), the edge opposite each corner, or −1 where its
-        ends are one vertex.
+        Edges (E, 2) int32, the lower vertex first, in order; and (T, 3), the index of the edge opposite each
+        corner, or −1 where its ends are one vertex.
 
     Raises:
         InputError: there is no edge, since the corners of every face are one vertex.
@@ -40,7 +40,7 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pairs_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of faces that share an edge: two at most edges, all pairs where more meet, none at a border.
+    """Pairs of faces that share an edge: one pair at most edges, all pairs where more faces meet, none at a border.
 
     Args:
         faces: (T, 3) integers.

@@ -25,7 +25,7 @@ class Laplacian(OfRestShape):
     opposite the edge at rest (Pinkall and Polthier 1993). With these δ points along the normal; inside a flat sheet it
     is zero for any linear function, on uneven triangles, too. Cotangent weights may be negative at obtuse angles, hence
     the absolute values. Where more than two faces share an edge, all of their angles count; at a border the only one.
-    Cotangents are bounded: angles below a twentieth of a degree count as such, and so do triangles without area.
+    Cotangents are bounded: angles below a twentieth of a degree count as that, and so do triangles without area.
 
     Without `relative` the energy shrinks and flattens the mesh, and draws borders inwards. With `relative`, shifts cost
     nothing, but rotations do: for large ones take `ARAP`.
@@ -84,8 +84,8 @@ def _table(
 
     Args:
         vertex: (M,) integers, in order.
-        values: (M,) integers, a value of each of these vertices.
-        shares: (M,) float, a share of each.
+        values: (M,) integers, one of the values of each of these vertices.
+        shares: (M,) float, the share of each value.
         count: the number of vertices.
 
     Returns:

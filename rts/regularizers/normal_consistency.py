@@ -21,8 +21,8 @@ class NormalConsistency(Regularizer):
     """Normals of faces that share an edge: E = Σ (1 − cos θ) over the pairs, without unit; θ is 0 on a flat sheet.
 
     PyTorch3D (Ravi et al. 2020) takes the mean of these terms in `mesh_normal_consistency`. Where more than two faces
-    share an edge, all pairs count. Faces of opposite orientation are compared as if oriented alike: only θ counts. A
-    triangle whose height is lost in rounding has no normal, and its pairs count nothing.
+    share an edge, all pairs count. Faces of opposite orientation are compared as if oriented alike. A triangle
+    whose height is lost in rounding has no normal, and its pairs add nothing.
 
     `residuals` is (P, 3): (n₁ − n₂) / √2, of squared length 1 − cos θ. There are P terms, perhaps none.
 

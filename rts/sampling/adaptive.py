@@ -1,4 +1,4 @@
-"""Adaptive sampling: one sample in most pixels, many in those near outlines, which one sample a pixel shows."""
+"""Adaptive sampling: one sample in most pixels, many near outlines. One sample a pixel tells where outlines are."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ MOST = 64
 class Adaptive:
     """A value for `supersample`: s² samples in pixels near outlines, one in every other pixel.
 
-    A pixel with s² samples is called active. One sample a pixel decides: a pixel is active if its front ends towards
-    a neighbour, where nothing or another surface is, or a neighbour's front towards it. Active pixels look as with
+    A pixel with s² samples is called active. In samples of one a pixel, its front ends towards a neighbour that shows
+    nothing or another surface, or a neighbour's front ends towards it. Active pixels look as with
     `supersample=samples`, the others as with `supersample=1`.
 
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
         dilated: True if the eight neighbours of active pixels are active too. Colours that change near outlines need
-            that; None for where some part's shader is not `uniform`.
-        contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
-            four directions: edges of colour on surfaces. Needs colours, which `rts.sample` does not have, nor do
-            compiled programs and derivatives of several directions at once. None for not to look; 0.2 suits.
+            that. None for True if `contrast` is set or some part's shader is not `uniform`.
+        contrast: threshold for the second difference of any colour channel along any of four directions, above which
+            pixels are active too: at edges of colour on surfaces. Needs colours, which are missing in `rts.sample`,
+            compiled programs and derivatives of several directions at once. None to ignore colours; 0.2 suits.
     """
 
     samples: int
@@ -66,10 +66,10 @@ class Adaptive:
 
     @staticmethod
     def of_text(text: str) -> int | Adaptive:
-        """The samples a pixel that a text stands for: "4", "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2".
+        """The `supersample` written as a text: "4", "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2".
 
         Raises:
-            InputError: it stands for none.
+            InputError: the text has none of these forms.
         """
         kind, *rest = (word.strip().lower() for word in text.split(":"))
         number, *further = rest if rest and kind == "adaptive" else [kind]
@@ -96,19 +96,21 @@ def _number(text: str) -> float | None:
 
 
 def finest(supersample: Any) -> Any:
-    """The most samples along a side of a pixel: those of an `Adaptive`, else the argument itself."""
+    """The most samples along a side of a pixel: `samples` of an `Adaptive`, else the argument itself."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 
 
 def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:
-    """Cells (H, W) bool at outlines: a front ends, or may by rounding, towards a neighbour, or the reverse.
+    """Cells (H, W) bool at outlines: their front ends towards a neighbour, or a neighbour's front towards them.
+
+    Cells are included where only rounding could make a front end.
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.
         depth: (K, H, W).
         sizes: the number of rows of each part.
-        settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without, −1 at others;
-            None for none.
+        settled: (H, W) int8, 0 at cells that the only part covers, even where they have no sample, −1 at others;
+            None if no cell is settled.
     """
     from rts.sampling import adaptive_loops
     from rts.splatting.kernel import TIE
@@ -134,9 +136,9 @@ def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
     """Cells (H, W) bool where the front's colour has a second difference above `least` along any of four directions.
 
     Args:
-        row: (H, W), the front of each cell.
+        row: (H, W), the row of each front in `rgba`; −1 in empty cells.
         rgba: (N, 4).
-        least: the second difference, of any channel.
+        least: the threshold, for each channel.
     """
     covered = np.pad(row >= 0, 1)
     color = np.pad(rgba[np.maximum(row, 0)], ((1, 1), (1, 1), (0, 0)))

@@ -1,4 +1,4 @@
-"""Cells beside outlines, by depths alone: the pairing of `rts.splatting.Visible`, compiled."""
+"""Cells beside outlines, found by the pairing of depths of `rts.splatting.Visible`. Compiled."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, ma
         start: first row.
         stop: end of the rows.
         row: (K, H, W) int32.
-        settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without; or no rows.
+        settled: (H, W) int8, 0 at cells that the only part covers, even without a sample, else −1; or no rows.
         depth: (K, H, W).
         firsts: (P − 1,) the first row of each part but the first.
-        beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
-        margin: by how much rounding may change differences of depth.
-        continued: share of the error of plain pairing below which a front continues another.
-        marks: (H, W) uint8, to be filled.
+        beyond: depth for empty layers, at least as far from each layer as any two layers are apart.
+        margin: the most by which rounding may change differences of depth.
+        continued: a front continues another if it is off the other's line by less than this share of the paired depths'
+            difference.
+        marks: (H, W) uint8, to be filled with 0 or 1.
     """
     layers, height, width = row.shape
     # Of three rows of cells, repeated at the ends: the part seen, −1 for none, and whether there is a hidden layer.
@@ -52,7 +53,7 @@ def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, ma
 
 @compiled
 def _differ(marks, above, level, below):
-    """Mark the cells of a row that have a neighbour with another part, or with nothing."""
+    """Mark the cells of a row whose part, −1 for none, differs from a neighbour's."""
     for x in range(len(marks)):
         own = level[x + 1]
         found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
@@ -62,7 +63,7 @@ def _differ(marks, above, level, below):
 
 @compiled
 def _unite(near, above, level, below):
-    """Mark the cells with a mark among the nine around them. Returns True if there are any."""
+    """Mark the cells in `near` whose 3 × 3 window has a mark in the three rows. Returns True if there are any."""
     some = np.uint8(0)
     for x in range(len(near)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
@@ -74,7 +75,7 @@ def _unite(near, above, level, below):
 
 @compiled
 def _ends(row, depth, y, x, beyond, margin, continued):
-    """True if the front of a cell ends towards one of its neighbours, all of which are covered."""
+    """True if the front of a cell ends towards one of its neighbours; all these cells are covered."""
     _, height, width = row.shape
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1
@@ -87,7 +88,7 @@ def _ends(row, depth, y, x, beyond, margin, continued):
 
 @compiled
 def _parted(row, depth, y, x, v, u, beyond, margin, continued):
-    """True if the front of a covered target (y, x) may not pair with that of the source at (y − v, x − u)."""
+    """True unless the front of a covered target (y, x) surely pairs with the front of the source (y − v, x − u)."""
     layers, height, width = row.shape
     py, px = y - v, x - u
     source, target = depth[0, py, px], depth[0, y, x]

@@ -16,7 +16,8 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
 STATIC_FACES = 4_000_000
-"""From so many triangles on, rays at a kept structure are faster than drawing all (benchmarks/speed/samplers.py)."""
+"""Number of triangles from which rays cast into a kept structure are faster than drawing all triangles
+(benchmarks/speed/samplers.py)."""
 
 _log = logging.getLogger("rts")
 
@@ -27,9 +28,9 @@ class Choice(NamedTuple):
     Attributes:
         sampler: the sampler that `sampler="auto"` takes, by name.
         reason: why.
-        samples: the number of samples, for a given size; None where it is not known.
-        fine: the number of fine samples among them, of `rts.Adaptive`; None without.
-        active: the number of pixels of the image with fine samples, for all parts together; None without.
+        samples: the number of samples in an image; None if no image was sampled.
+        fine: the number of fine samples among them, of `rts.Adaptive`; None without it.
+        active: the number of pixels of the image with fine samples, for all parts together; None without it.
         remarks: likely mistakes, a line each: entries of θ that nothing reads, a mesh wound inside out.
     """
 
@@ -42,7 +43,7 @@ class Choice(NamedTuple):
 
 
 def choose(part: Part, *, static: bool) -> Choice:
-    """The sampler for a part whose triangles stay the same from call to call (`static`), or may not."""
+    """The sampler for a part. `static` is True if its triangles stay the same from call to call."""
     surface = part.surface
     if not isinstance(surface, TriangleSurface):
         return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
@@ -62,13 +63,13 @@ def choose(part: Part, *, static: bool) -> Choice:
 
 
 def is_static(part: Part, camera: Camera) -> bool:
-    """True if something is differentiated, but nothing that the surface reads: calls repeat, and triangles stay."""
+    """True if the engine differentiates, but the surface reads constants only: calls repeat, and triangles stay."""
     constant = is_constant([part.theta[name] for name in part.surface.reads(part.theta)])
     return constant and engine_of(part, camera).differentiates
 
 
 class Auto(Sampler):
-    """The sampler that suits each part."""
+    """A sampler that passes each part to the sampler that `choose` names."""
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""

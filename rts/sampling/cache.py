@@ -1,7 +1,7 @@
 """A cache of what samplers build for a surface: structures over triangles, buffers on a device.
 
-Optimisers change arrays in place, so identity proves nothing: what is kept goes by a fingerprint of the bytes that the
-proxy was made of.
+Optimisers change arrays in place, so an array's identity proves nothing: entries are found by a fingerprint of the
+bytes that the proxy was made of.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rts.arrays.trees import Tree, leaves
 from rts.contracts.records import Proxy
 
 KEPT = 2
-"""Entries a surface and sampler: the newest, and the one before it, which is moved when a third is asked for."""
+"""Entries for each surface and sampler. For one more, the least recently used is adapted, or else dropped."""
 
 
 class Entry(NamedTuple):
@@ -28,8 +28,8 @@ class Entry(NamedTuple):
     Attributes:
         proxy: the triangles.
         prepared: the sampler's structure.
-        size: the largest number that the triangles were made of, or a larger one; None if it was not computed.
-        inputs: inputs of the proxy, where samples are refined later.
+        size: the largest absolute coordinate of the proxy's vertices; None if it was not computed.
+        inputs: inputs of the proxy, if the surface refines samples; else None.
     """
 
     proxy: Proxy
@@ -41,7 +41,7 @@ class Entry(NamedTuple):
 class Keeper:
     """The entries of one sampler: bounded in number, released with their surfaces.
 
-    Entries are looked up under its keeper's `lock`, and drawn under it where they may be moved in place.
+    Callers hold `lock` while they look up an entry, and while they draw one that may be adapted in place.
     """
 
     def __init__(self) -> None:
@@ -58,10 +58,10 @@ class Keeper:
         """The entry of a surface under a key.
 
         Args:
-            surface: the surface; entries are dropped when it is.
-            key: a key of the proxy's inputs.
+            surface: the surface; its entries are released with it.
+            key: `fingerprint` of the proxy's inputs, and more if it depends on the view.
             build: makes the entry.
-            follow: makes it of an older one, in place, or gives None where it cannot.
+            follow: adapts an older entry in place, or returns None where it cannot.
         """
         try:
             entries = self._entries.setdefault(surface, OrderedDict())
@@ -76,7 +76,7 @@ class Keeper:
 
 
 def same_faces(a: Proxy, b: Proxy) -> bool:
-    """True if two proxies differ at most in the positions of their vertices."""
+    """True if two proxies have the same faces and as many vertices."""
     same_count = len(a.vertices) == len(b.vertices)
     return same_count and (a.faces is b.faces or np.array_equal(a.faces, b.faces))
 

@@ -1,4 +1,4 @@
-"""Why nothing is seen in an image: words for a warning."""
+"""Reasons why nothing is seen in an image, in words for a warning."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rts.scene.camera import Camera
 
 
 def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:
-    """The likely cause, for each part, that an image has no sample, or none that is not transparent."""
+    """The likely cause, for each part, of an image without samples, or with transparent ones only."""
     causes = [_cause(part, camera) for part in parts]
     if len(parts) == 1:
         return causes[0].format("the part")
@@ -74,7 +74,7 @@ def _outside(proxy: Proxy, local: Camera) -> str | None:
 
 
 def known_tree(tree: Tree) -> Tree | None:
-    """A tree of NumPy arrays; None if an array is traced or batched."""
+    """The tree as NumPy arrays; None if an array is traced or batched."""
     is_known = []
 
     def value(x: object) -> object:

@@ -25,15 +25,15 @@ class Exits(NamedTuple):
 
     @classmethod
     def of(cls, fragments: Fragments, cells: np.ndarray, backs: Fragments) -> Exits:
-        """The exits among backs (1, 1, M): backs that do not lie before the fronts of fragments (K, H, W)."""
+        """The exits among `backs` (1, 1, M), triangles seen from behind: those not nearer than their cell's front."""
         front = fragments.depth[0].reshape(-1)[cells]
         return cls(cells, backs, (backs.triangle_ids >= 0) & (backs.depth >= front))
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:
-    """Cells (1, M) int32 whose front may end beside them, and neighbours of such cells, as flat indices.
+    """Cells (1, M) int32 whose front may end towards a neighbour, and covered cells beside these, as flat indices.
 
-    Fronts end before nothing, and where hidden layers are in play.
+    A front may end where the 3 × 3 cells around it include an empty cell or a kept hidden sample.
 
     Args:
         kept: (K, H, W) bool, the samples that splatters need.

@@ -1,4 +1,4 @@
-"""Cells beside outlines, compiled."""
+"""Covered cells beside outlines, compiled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BLOCK = 32
 
 @loop
 def find(kept, cells):
-    """Fill `cells` (H · W,) with the places that `exits.beside_outlines` returns. Returns their number."""
+    """Fill `cells` (H · W,) with the indices that `exits.beside_outlines` returns. Returns their number."""
     layers, height, width = kept.shape
     # With one more cell at each side, the cells of all rows follow on each other: loops over all are quick.
     pitch = width + 2
@@ -36,7 +36,7 @@ def find(kept, cells):
 
 @compiled
 def _list(cells, count, first, marks):
-    """List the marks of a row, whose first cell has a number, from a place on. Returns the next place."""
+    """Append the indices of a row's marked cells, which start at `first`, to `cells`. Returns the new count."""
     for start in range(0, len(marks), BLOCK):
         if _any(marks[start : start + BLOCK]):
             for x in range(start, min(start + BLOCK, len(marks))):

@@ -1,4 +1,4 @@
-"""The side of a surface that each layer shows, by which splatters do not pair a front with a back."""
+"""The side of a surface that each layer shows. By it splatters avoid pairing a front with a back."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ ALTERNATING = np.array([1, -1, 1, -1])
 def facing(
     fragments: Fragments, kept: np.ndarray, proxy: Proxy, pieces: np.ndarray, camera: Camera, listed: bool
 ) -> np.ndarray:
-    """The piece that each fragment shows, and its side: (K, H, W) int16, see `rts.contracts.records.Samples`.
+    """The piece that each fragment shows, and its side: (K, H, W) int16, see `Cells.facing`.
 
-    Splatters compare it in cells that have hidden layers, and beside them; elsewhere it is 0. The last layer of
-    fragments is marked by `MORE_BEHIND`.
+    Splatters compare sides in cells that have hidden layers, and beside such cells; elsewhere they are 0. The last
+    layer of fragments is marked by `MORE_BEHIND`.
 
     Args:
         fragments: the fragments of all layers.
         kept: (K, H, W) bool, the fragments that are samples.
         proxy: the triangles.
-        pieces: (T,) int16, the number of each triangle's piece; or (1,), of all.
+        pieces: (T,) int16, the number of each triangle's piece; or (1,), one for all triangles.
         camera: host matrices.
         listed: True for the cells of a list: neighbours in the list may not be neighbours in the image.
     """

@@ -12,7 +12,7 @@ from rts.sampling.windows_loops import add, spread
 def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, columns, listed, more, found):
     """Fill lines [start, stop) of `found` (K, H, W) int16; see `rts.sampling.facing`.
 
-    `eyes` (B, 4) are those of views of so many rows and columns of cells, which lie side by side, line after line.
+    Views of `rows` × `columns` cells lie side by side, line after line; `eyes` (B, 4) has the eye of each.
     """
     layers, height, width = kept.shape
     across = width // columns
@@ -44,7 +44,7 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
 
 @compiled
 def _side(t, vertices, faces, pieces, eye, more):
-    """The number of a triangle's piece, if it has one, and so many more; negative where its back is seen."""
+    """The number of a triangle's piece plus `more`, or 0 without a piece; negative where its back is seen."""
     piece = pieces[t] if len(pieces) > 1 else pieces[0]
     if piece > 0:
         piece += more

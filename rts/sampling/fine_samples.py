@@ -1,4 +1,4 @@
-"""Fine samples of the pixels that the coarse samples say are active."""
+"""Fine samples of active pixels. Coarse samples tell which pixels are active."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Where(NamedTuple):
     Attributes:
         adaptive: the user's settings.
         dilates: True if the neighbours of active pixels are active, too.
-        colors: (N, 4) of the coarse samples, to measure contrast; or None.
+        colors: (N, 4) of the coarse samples, to measure contrast; None to ignore it.
     """
 
     adaptive: Adaptive
@@ -41,7 +41,7 @@ def active(
     apron: int,
     where: Where,
 ) -> np.ndarray:
-    """Active pixels (H, W) bool of coarse samples (K, ·, ·) with an apron; see `outlines`."""
+    """Active pixels (H, W) bool of the image, from coarse samples (K, ·, ·) with an apron; see `outlines`."""
     pixels = outlines(row, depth, sizes, settled)
     if where.colors is not None and where.adaptive.contrast is not None:
         pixels |= contrasts(row[0], where.colors, where.adaptive.contrast)
@@ -68,8 +68,8 @@ def fine_samples(
         take: samples the fine grid: a number of layers, a rule for hidden samples, cells and capacity → `Sampled`.
         hidden: the rule for hidden samples of an image; None to keep all.
         layers: K, or "auto".
-        capacity: rows to allot, or None for as many as there are, or could be.
-        flat: True if pixels that are not active show fronts of one colour alone, where any cell is `settled`.
+        capacity: rows to allot; None for as many as there are, or could be if coarse samples are traced.
+        flat: True if inactive pixels show one colour alone. If none lacks room, the result is marked `Fine.flat`.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
     most, coarse_arrays = (

@@ -29,7 +29,7 @@ LAYER_LIMIT = 16
 
 
 def planned(layers: int | Literal["auto"]) -> int:
-    """Layers to count with before they are known."""
+    """The number of layers to plan memory for: K, or 4 while "auto" has not found a number."""
     return 4 if layers == "auto" else int(layers)
 
 
@@ -39,8 +39,8 @@ def hidden_by(
     """The rule that drops hidden samples of a scene; None to keep all.
 
     A hidden sample has no effect only behind samples of opaque parts that lie on cells' centres, and if no number of
-    the scene is so large that rounding reorders depths. Where these numbers are traced, and so not known, the sampler
-    looks at the triangles, unless samples are refined.
+    the scene is so large that rounding reorders depths. Where these numbers are traced, those of the triangles serve;
+    all samples are kept if there are no triangles, or if samples are refined.
 
     Args:
         splatter: the splatter.
@@ -62,7 +62,7 @@ def hidden_by(
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
-    """The largest number that surfaces read; None if one is traced."""
+    """The largest absolute value that surfaces read; None if a value is traced."""
     size = 0.0
     for part, known in zip(parts, sizes, strict=True):
         read = {name: part.theta[name] for name in part.surface.reads(part.theta)}
@@ -84,8 +84,8 @@ class HiddenBySplatter:
 
     Attributes:
         splatter: the splatter.
-        size: of the largest number that surfaces read; 0 where it is not known.
-        settles: True if all samples have one colour, and the splatter makes use of it.
+        size: the largest absolute value that surfaces read; 0 where it is not known.
+        settles: True to mark settled cells: all samples have one colour, and the splatter fills interiors.
     """
 
     splatter: Splatter
@@ -97,7 +97,7 @@ class HiddenBySplatter:
         return replace(self, size=0.0)
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
-        """The samples that can reach the image, or its cells (H, W) that are `wanted`."""
+        """Decide which samples to keep: those that can reach the image, or its `wanted` cells (H, W); None for all."""
         covered, depth, size, _ = question
         too_rough = (self.settles or len(covered) > 1) and too_far(max(size, self.size), depth)
         needed = covered if too_rough or len(covered) == 1 else self._needed(covered, depth)
@@ -170,7 +170,7 @@ HiddenRule = HiddenBySplatter | HiddenBehindOpaque
 
 
 def numbers_of(settled: np.ndarray) -> np.ndarray:
-    """`Cells.settled` (H, W) int8 of a scene of one part, from marks (H, W) bool: 0, the first sample, or −1."""
+    """`Cells.settled` (H, W) int8 of a scene of one part, from marks (H, W) bool: 0, the first sample, or else −1."""
     return settled.view(np.int8) - np.int8(1)
 
 
@@ -257,7 +257,7 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:
-    """Some of the rows of the samples of a part."""
+    """The samples of a part with the rows of `index` only, and the cells' new `row`."""
     xp = namespace(index)
     gbuffer = samples.gbuffer
     tables = samples.tables.items()

@@ -21,7 +21,7 @@ class Numbering:
         self._numbers, self._index = (np.empty(self._firsts[-1], np.int32) for _ in range(2))
 
     def use(self, row: np.ndarray, kept: np.ndarray) -> None:
-        """Use the rows that cells (K, H, W) name, counted over all parts, where these are kept; −1 names none."""
+        """Mark as used the rows, counted over all parts, that kept cells (K, H, W) name; −1 names none."""
         row, kept = (read_only(x, kind).reshape(-1, x.shape[-1]) for x, kind in ((row, np.int32), (kept, bool)))
         parallel(_mark, len(row), row, kept, self._used, work=row.size)
 
@@ -34,11 +34,11 @@ class Numbering:
         return [self._index[first : first + n] for first, n in zip(self._firsts, counts, strict=False)]
 
     def renumbered(self, row: np.ndarray, part: int | None = None) -> np.ndarray:
-        """Cells (…, W) with the new number of each row within its part, −1 where it is not used; after `indices`.
+        """Cells (…, W) with the new number of each row within its part, −1 where it is not used. Call `indices` first.
 
         Args:
             row: rows counted over all parts, or of one part; −1 for none.
-            part: the part whose rows they are; None for rows of all parts.
+            part: the part whose rows `row` names; None for rows counted over all parts.
         """
         given = read_only(row, np.int32).reshape(-1, row.shape[-1])
         found, first = np.empty(given.shape, np.int32), self._firsts[part or 0]

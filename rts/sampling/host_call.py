@@ -28,7 +28,7 @@ class Shape(NamedTuple):
 
     Attributes:
         layers: K.
-        size: lines and columns of the samples: of the grid, or of the list of its cells.
+        size: lines and columns of the cells to sample: of the grid, or of a list (L, C) of its cells.
         capacity: rows to allot, or None for as many as there are.
         view: (height, width) of the grid.
     """
@@ -73,7 +73,7 @@ class HostCall:
     Args:
         part: the part.
         surface: its surface.
-        cameras: through which it is seen, in its local space, without derivatives.
+        cameras: cameras in the part's local space, without derivatives.
         shape: bounds on the number of samples.
         entry: the part's prepared entry, if known; the inputs of its proxy are then not read.
     """
@@ -106,7 +106,7 @@ class HostCall:
         """Samples and further arrays that `find` computes, by one call to the host.
 
         Args:
-            find: computes them on the host.
+            find: computes samples and further results on the host; see `Find`.
             beside: specs of the further results, by name.
             tables: specs of `Samples.tables`.
             arrays: further operands of `find`, after cameras and inputs.
@@ -156,7 +156,7 @@ class HostCall:
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:
-    """`ON_RAYS` of samples in a view, or in some of its cells; a row without a cell repeats the first."""
+    """The table `ON_RAYS` of samples in a view, or in listed cells of it; rows without a cell repeat the first."""
     rays, covered = rays_of(samples, camera, view, cells), samples.row >= 0
     depth, used = np.ones(len(samples.ids)), np.zeros(len(samples.ids), bool)
     depth[samples.row[covered]], used[samples.row[covered]] = samples.depth[covered], True
@@ -177,7 +177,7 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
 def _attribute_specs(
     surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
 ) -> dict[str, ArraySpec]:
-    """Specs of the attributes of a constant surface that its shader reads; the host evaluates these."""
+    """Specs of the attributes that the host evaluates, those that the shader reads; none unless θ is constant."""
     if host_theta is None:
         return {}
     real = np.float64 if like is not None and floating_bits(like) == 64 else np.float32

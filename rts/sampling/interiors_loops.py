@@ -1,4 +1,4 @@
-"""Cells amid one colour, whose image no movement changes: they need no samples, nor do samples seen only there."""
+"""Cells amid one colour, which no movement changes. Samples that affect only such cells are dropped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rts.compiling.threads import parallel
 from rts.sampling.windows_loops import add, unite
 
 LONG = 2
-"""Nanoseconds that a cell of a layer takes."""
+"""Nanoseconds of work for each cell of each layer."""
 
 
 def settle(
@@ -20,17 +20,17 @@ def settle(
     reach: int,
     wanted: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Mark cells (H, W) bool amid nine fronts without a hidden sample that is kept; drop the samples only they need.
+    """Cells (H, W) bool whose 3 × 3 window is all fronts, without kept hidden samples. Drop samples only they need.
 
     Samples within reach of any other wanted cell stay. So do the nearest and the farthest front, since splatters
-    measure differences of depth by these.
+    measure differences of depth relative to these two.
 
     Args:
         covered: (K, H, W) bool.
         depth: (K, H, W) float, of one dtype.
         kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
         reach: cells.
-        wanted: (H, W) bool, the cells that are shown; None for all, and those beyond the border.
+        wanted: (H, W) bool, the cells that are shown; None for all, and for cells beyond the edges of the grid.
     """
     layers, height, width = covered.shape
     wanted = np.empty((0, width), np.bool_) if wanted is None else np.ascontiguousarray(wanted)
@@ -47,7 +47,7 @@ def settle(
 
 @loop
 def _settle(start, stop, covered, kept, wanted, reach, found, near):
-    """Fill rows [start, stop) of `found`, cells amid one colour, and of `near`, cells within reach of any other."""
+    """Fill rows [start, stop) of `found`, cells amid one colour, and of `near`, cells within reach of other cells."""
     layers, height, width = covered.shape
     around = reach + 1
     rows = stop - start + 2 * around
@@ -87,7 +87,7 @@ def _settle(start, stop, covered, kept, wanted, reach, found, near):
 
 @loop
 def _drop(start, stop, near, kept):
-    """Drop samples of cells that are not near."""
+    """Clear `kept` in cells that are not near."""
     for k in range(len(kept)):
         for y in range(start, stop):
             _mask(kept[k, y], near[y])

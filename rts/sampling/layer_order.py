@@ -19,7 +19,7 @@ from rts.scene.camera import Camera
 from rts.scene.rays import Rays
 
 SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6
-"""Layers whose depths differ by less, in widths of a pixel and relative to the depth, are one root found twice."""
+"""Least difference of the depths of two roots: widths of a pixel, plus a share of the depth."""
 
 
 def on_surface(
@@ -35,8 +35,8 @@ def on_surface(
 ) -> Samples:
     """Samples on a surface where rays meet its nearest triangles: refined, and in order.
 
-    Where triangles stand before the surface but rays miss it, and fewer layers are left than were asked for, more are
-    taken from behind: as many as `fragments` has.
+    Rays that meet triangles may miss the surface. Cells that are left with fewer than `layers` layers get more from
+    the fragments behind these.
 
     Args:
         surface: the surface.
@@ -45,7 +45,7 @@ def on_surface(
         proxy: the triangles.
         camera: host matrices.
         layers: K.
-        tables: what the surface's `table_specs` allots.
+        tables: the result of the surface's `table_specs`.
         size: (height, width) of the grid of cells.
         cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
     """
@@ -58,7 +58,7 @@ def on_surface(
     if not len(places[0]):
         return settled
     indices = np.ravel_multi_index(places, size) if cells is None else cells[places]
-    # The cells where some are missing, as the only line of an image.
+    # The cells where layers are missing, as the only line of an image.
     behind = Fragments(*(np.ascontiguousarray(x[layers:, *places])[:, None] for x in fragments))
     more, _ = refined(surface, inputs, lift(behind, proxy), camera, tables, size, indices[None])
     added = np.where(more.row >= 0, more.row + np.int32(len(settled.ids)), -1)
@@ -88,7 +88,7 @@ def refined(
         inputs: the result of its `proxy_inputs`, on the host.
         lifted: the samples, a row for each covered cell.
         camera: host matrices.
-        tables: what the surface's `table_specs` allots.
+        tables: the result of the surface's `table_specs`.
         size: (height, width) of the grid of cells; None for that of the samples.
         cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
     """
@@ -104,7 +104,7 @@ def refined(
 
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
-    """The rays of packed samples (N, 3). A single row that no cell refers to gets the ray of the first pixel."""
+    """The rays of packed samples (N, 3). A single row that no cell refers to gets the ray of the first cell."""
     from rts.sampling import layer_order_loops
 
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
@@ -132,7 +132,7 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
         spread: the `spread` of `Rays`, local units.
 
     Returns:
-        Samples with another `row` and `depth`; those before the near or beyond the far plane are dropped.
+        Samples with a new `row` and `depth`; samples before the near or beyond the far plane are dropped.
     """
     from rts.sampling import layer_order_loops
 

@@ -59,7 +59,7 @@ def _ray(x, y, p, inverse, origin, direction):
 
 @loop
 def rays_of(start, stop, row, size, projection, inverse, origins, directions):
-    """Fill the rays of samples as `rts.Camera.rays` gives them; for lines `start` to `stop` of all layers.
+    """Fill the rays of samples in lines [start, stop), counted over layers, as `rts.Camera.rays` gives them.
 
     Args:
         start: the first line.
@@ -68,7 +68,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
         size: (H, W).
         projection: (4, 4) float64.
         inverse: (4, 4) float64, of the view.
-        origins: (N, 3) float64, to be filled where there is a cell.
+        origins: (N, 3) float64, to be filled for samples in these lines.
         directions: (N, 3) float64, likewise.
     """
     height, width = size
@@ -82,7 +82,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
 
 @loop
 def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
-    """Fill the rays of samples in some cells: row (K, M), in lines (M,) and columns (M,)."""
+    """Fill the rays of the samples `row` (K, M) of M cells, which are at `lines` (M,) and `columns` (M,)."""
     height, width = size
     for k in range(len(row)):
         for m in range(len(lines)):

@@ -14,7 +14,7 @@ from rts.errors import InputError
 
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
-    """Interleave the layers of several parts by depth and keep the nearest; equal depths go to the earlier part."""
+    """Interleave the layers of several parts by depth and keep the nearest; at ties the earlier part is first."""
     overflow = samples[0].overflow
     for s in samples[1:]:
         overflow = overflow + s.overflow
@@ -44,7 +44,7 @@ def _nothing_told(row: Array) -> Array:
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
     """Part, row within the part, depth and facing (K, H, W), merged from row, depth and facing of each part.
 
-    The last are missing where they are not given.
+    Facing is missing if `tables` are without it.
     """
     xp, count = namespace(tables[0]), len(sizes)
     rows, facing = tables[:count], tables[2 * count :]
@@ -61,7 +61,7 @@ def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Arr
 
 
 def _of_part(facing: Array, part: int, count: int) -> Array:
-    """The numbers of a part's pieces among those of all parts; 0 where they would be too large."""
+    """The `facing` of a part, its pieces numbered among those of all parts; 0 where numbers would be too large."""
     xp = namespace(facing)
     size = xp.abs(facing)
     more = xp.where(size >= Cells.MORE_BEHIND, Cells.MORE_BEHIND, 0)

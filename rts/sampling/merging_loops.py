@@ -17,7 +17,7 @@ def interleave(
 ) -> tuple[np.ndarray, ...]:
     """The nearest layers of several parts: part, row within it (−1 in empty layers), and depth, (K, H, W) each.
 
-    If parts have `facing`, the last result is that of the merged layers; otherwise it has no layers.
+    If parts have `facing`, that of the merged layers is a fourth result.
 
     Args:
         rows: `row` of each part, (L, H, W) int32, front to back.
@@ -63,7 +63,7 @@ def _merge(
     merged_depth,
     merged_facing,
 ):
-    """Merge a part into those merged before it. If `part` has no layers, only the first part came before."""
+    """Merge a part into the parts before it, merged already. If `part` is empty, only one part came before."""
     before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(facing) > 0
     for y in range(start, stop):
         for x in range(row.shape[2]):

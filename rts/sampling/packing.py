@@ -17,7 +17,7 @@ less than splatters allow for."""
 
 
 EVERY = 16
-"""Every so many rows of depths, one is looked at first: where anything is in view, it often suffices."""
+"""Step between the rows of depths that are looked at first: where anything is in view, these often suffice."""
 
 
 def too_far(size: float, depth: np.ndarray) -> bool:
@@ -47,10 +47,10 @@ def lift(
 ) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
-    Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
-    that later steps stay connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool marks the
-    `covered_cells` to take, None for all. `exits` come last, as many as there is room for: rows number at most
-    cells times layers.
+    Samples are numbered layer by layer, and line by line in each. There is always at least one row, so that later
+    steps stay connected to θ; a row that no cell refers to has no effect. `capacity` is the number of rows to allot.
+    `kept` (K, H, W) bool marks the `covered_cells` to take, None for all. `exits` get the last rows, as many as there
+    is room for: rows number at most cells times layers. `views` counts the views in the grid, down and across.
     """
     from rts.sampling import packing_loops
 

@@ -24,12 +24,12 @@ def pack(
 
     Args:
         fragments: the fragments of all layers.
-        kept: (K, H, W) bool, which of them to take; covered ones.
+        kept: (K, H, W) bool, the fragments to take; all of them name triangles.
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
-        capacity: rows to allot, or 0 for as many as are covered, at least one.
-        *more: further fragments, and which of them to take, for rows behind all others, at most K · H · W in all. Their
-            row is returned last; they do not count in how many there are.
+        capacity: rows to allot, or 0 for as many as are taken, at least one.
+        *more: further fragments, and the ones to take, for rows behind all others, at most K · H · W in all. Their
+            `row` is returned last; the number of samples does not include them.
         views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
     grids = [_Lines.of(fragments, kept, views), *(_Lines.of(*given) for given in more)]
@@ -39,7 +39,7 @@ def pack(
     make = np.zeros if rows > found else np.empty
     ids = make((rows, table.shape[1]), np.int32)
     params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
-    # Without any, the barycentrics themselves are taken.
+    # Without corner parameters, the barycentrics themselves are taken.
     corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
     first, places = 0, []
     for grid in grids:
@@ -83,7 +83,7 @@ class _Lines(NamedTuple):
 
 
 def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
-    """The number of cells (K, H, W) bool that are taken in each view of a grid of views, so many down and across."""
+    """The number of kept cells, of (K, H, W) bool, in each view of a grid of `views` (down, across)."""
     layers, height, width = kept.shape
     lines, counts = kept.reshape(-1, width // views[1]), np.zeros(layers * height * views[1], np.int64)
     parallel(_count, len(lines), np.ascontiguousarray(lines), counts, work=kept.size // 8)

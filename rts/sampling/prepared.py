@@ -1,4 +1,4 @@
-"""A scene's triangles handed to a sampler once, for loops that want no check of them at all."""
+"""A scene's triangles handed to samplers once, so that later renders need not check them for changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Prepared:
         parts: the parts.
         samplers: the sampler of each.
         entries: the sampler's entry for each part, or None where it builds nothing.
-        sizes: for each part the largest number that its surface read when it was built, or None where nothing was.
+        sizes: for each part the largest number that its surface read when it was built; None if nothing was built.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Prepared:
     def of(
         cls, parts: Part | Sequence[Part], sampler: Any, camera: Camera | None, size: tuple[int, int] | None
     ) -> Self:
-        """Prepared parts, with what their samplers build; arguments as in `rts.prepare`."""
+        """The parts, with the structures that their samplers build now; arguments as in `rts.prepare`."""
         identity = Camera.look_at((0, 0, 1), (0, 0, 0))
         checked, _ = check_scene(parts, identity if camera is None else camera)
         size = None if size is None else check_pixels(size)
@@ -53,7 +53,7 @@ class Prepared:
         return {**self.__dict__, "entries": kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Build it again."""
+        """Build the samplers' structures again."""
         pairs = zip(state["samplers"], state["entries"], strict=True)
         entries = tuple(_built(sampler, kept) if isinstance(kept, Entry) else kept for sampler, kept in pairs)
         self.__dict__.update(state, entries=entries)
@@ -71,6 +71,6 @@ def _built(sampler: Any, kept: Entry) -> Entry:
 
 
 def _size(part: Part) -> float:
-    """The largest floating number that a part's surface reads."""
+    """The largest absolute value in the floating-point arrays that a part's surface reads."""
     read = [value_of(x) for name in part.surface.reads(part.theta) for x in leaves(part.theta[name])]
     return max([0.0, *(largest(x) for x in read if x is not None and np.issubdtype(x.dtype, np.floating))])

@@ -1,4 +1,4 @@
-"""Checks of cameras, proxies, fragments, samples and refined samples, on the host."""
+"""Checks of cameras, proxies, fragments, samples and refined samples, on the host. To refuse is an InputError."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def check_faces(proxy: Proxy, surface: Any = None) -> None:
 
 
 def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
-    """A table of a proxy, contiguous and of this dtype, refused where it has another number of columns or kind."""
+    """A table of a proxy, contiguous and of this dtype; refused unless (rows, *widths), −1 for any, of like kind."""
     try:
         array = np.asarray(table)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -105,7 +105,7 @@ def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
 
 
 def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samples:
-    """A sampler's samples of a part, refused where they do not fit its cells, or one another.
+    """A sampler's samples of a part, refused where their arrays do not fit the grid, or one another.
 
     Args:
         samples: the samples; traced values are not checked.
@@ -158,7 +158,7 @@ WELL_CONDITIONED = 1e-6
 def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     """The camera of host matrices, refused where it makes no image.
 
-    They must be finite and invertible, the view affine and the projection such that depth is read off the view.
+    They must be finite and invertible, the last row of the view 0, 0, 0, 1, and that of the projection 0, 0, c ≤ 0, d.
 
     Args:
         camera: float64; its view is that of the camera times the part's transform.
@@ -202,7 +202,7 @@ ROUNDING = 1e-6
 
 
 def _spread(m: np.ndarray) -> float:
-    """The square of a (3, 3) determinant over that of the rows' lengths: 1 for orthogonal rows, 0 for dependent."""
+    """The squared determinant of a (3, 3) matrix over the product of its rows' squared lengths: 1 if orthogonal."""
     a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
     square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
     return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
@@ -210,14 +210,14 @@ def _spread(m: np.ndarray) -> float:
 
 @functools.lru_cache(maxsize=64)
 def _spread_of_projection(data: bytes) -> float:
-    """The `_spread` of a (4, 4) float64 matrix, given as bytes; kept, since it is often that of the last call."""
+    """The `_spread` of a (4, 4) float64 matrix, given as bytes; cached, since calls often repeat it."""
     matrix = np.frombuffer(data).reshape(4, 4)
     square = float((matrix * matrix).sum(axis=1).prod())
     return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
 
 
 def _check_invertible(camera: Camera) -> None:
-    # A view that flattens has no inverse, whatever its lengths; a projection is none the worse for its own.
+    # A view must not flatten, at whatever scale; the rows of a projection may differ in scale.
     singular = np.linalg.svd(camera.view[:3, :3], compute_uv=False)
     sound = {"view": singular[-1] > 1e-12 * singular[0], "projection": is_invertible(camera.projection)}
     for name in (name for name, ok in sound.items() if not ok):

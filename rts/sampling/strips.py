@@ -1,9 +1,9 @@
 """Strips: the fine cells that active pixels need, laid out side by side as one picture that any splatter can take.
 
-The image is cut into strips of a few lines of pixels. Where a strip has active pixels it has runs of columns, with an
-apron of fine cells around each, so that no splat crosses from one run to another. Runs are laid side by side, and fill
-lines of the layout. Cells that no active pixel needs are empty. A cell that two runs show is sampled, evaluated and
-shaded once.
+The image is cut into strips of a few lines of pixels. The columns of a strip that hold active pixels form runs, with an
+apron of fine cells around each, so that no splat crosses from one run to another. Runs are laid side by side in lines
+of the layout, each as high as a strip and its apron. Cells that no active pixel needs are empty. A cell that two runs
+show is sampled, evaluated and shaded once.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from rts.contracts.records import ArraySpec, Cells, Decision, Fine, Question, Sa
 from rts.sampling.hidden import HiddenRule, numbers_of
 
 STRIP = 16
-"""Approximate lines of fine cells in a strip without its apron: fewer mean more aprons, more mean more empty cells."""
+"""Approximate height of a strip in fine cells, without its apron. Lower strips have more aprons, higher ones more empty
+cells."""
 
 LINE = 256
-"""Fine cells in a line of the list of those to sample."""
+"""Fine cells in each line (row of an array) of the list of cells to sample."""
 
 FILLED = 1 / 3
-"""Approximate share of needed cells in a strip, if shapes have to be known beforehand."""
+"""Assumed share of needed cells in a strip, where shapes have to be known beforehand."""
 
 
 class FineGrid(NamedTuple):
@@ -58,7 +59,7 @@ class FineGrid(NamedTuple):
 
     @property
     def strips(self) -> int:
-        """Strips that make the image."""
+        """Number of strips in the image."""
         return -(-self.size[0] // self.high)
 
     @property
@@ -72,7 +73,7 @@ class FineGrid(NamedTuple):
         return self.high + self.gap
 
     def room(self, capacity: int | None, layers: int) -> Room:
-        """Room for the worst case, or for `capacity` rows."""
+        """Room for the worst case, or for `capacity` rows in so many layers."""
         cells, columns = self.fine[0] * self.fine[1], self.strips * (self.size[1] + self.gap)
         if capacity is None:
             return Room(columns, cells)
@@ -93,7 +94,7 @@ class Room(NamedTuple):
 
 
 def rounded(count: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few shapes, so that compiled programs serve again."""
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few shapes, so that compiled programs are reused."""
     size = 16
     while size < count:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
@@ -108,9 +109,9 @@ class Layout(NamedTuple):
         place: (h, w) int32, the index in `cells` that each place of the layout shows, or −1.
         kinds: (h, w) uint8, bits of `strips_loops`.
         wanted: (h, w) bool, the cells of active pixels.
-        pixel: (H, W) int32, the place of an active pixel in the layout, in pixels; −1 for other pixels.
-        coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
-        dropped: () int32, the number of pixels without room.
+        pixel: (H, W) int32, flat index of an active pixel in the layout, in pixels without the apron; −1 for others.
+        coarse: (H', W') bool, the coarse cells, apron included, whose pixels are not active.
+        dropped: () int32, the number of active pixels without room.
     """
 
     cells: Array
@@ -123,7 +124,7 @@ class Layout(NamedTuple):
 
     @staticmethod
     def specs(grid: FineGrid, room: Room) -> tuple[ArraySpec, ...]:
-        """Shapes and dtypes of the arrays."""
+        """Shapes and dtypes of the fields."""
         place = _shape(grid, *_lines(grid, room.columns))
         lines = -(-room.cells // LINE), LINE
         coarse = tuple(n + 2 * grid.apron for n in grid.size)
@@ -133,14 +134,14 @@ class Layout(NamedTuple):
 
 
 def _lines(grid: FineGrid, columns: int) -> tuple[int, int]:
-    """Lines and columns of a roughly square layout with room for runs of `columns` columns in all."""
+    """Lines and columns of a roughly square layout for runs of `columns` columns in total; a line may cut a run."""
     # At the end of a line up to `gap` columns stay empty, and a run that is cut needs its aprons twice.
     across = max(math.isqrt(columns * grid.pitch), 3 * grid.gap + 1)
     return -(-columns // (across - 2 * grid.gap)), across
 
 
 def _shape(grid: FineGrid, lines: int, across: int) -> tuple[int, int]:
-    """Height and width of a layout."""
+    """Height and width of a layout, in fine cells."""
     pixels = (lines - 1) * grid.pitch + grid.high, across - grid.gap
     return pixels[0] * grid.side + 2 * grid.apron, pixels[1] * grid.side + 2 * grid.apron
 
@@ -148,10 +149,10 @@ def _shape(grid: FineGrid, lines: int, across: int) -> tuple[int, int]:
 def lay_out(
     active: np.ndarray, grid: FineGrid, room: Room | None = None, sizes_of: Callable[[int], int] | None = None
 ) -> Layout:
-    """Lay out the fine cells that active pixels (H, W) bool need in strips, as far as there is room.
+    """Lay out in strips the fine cells that active pixels need, as far as there is room.
 
     Args:
-        active: the active pixels.
+        active: (H, W) bool, the active pixels.
         grid: the sizes.
         room: the room; None for as much as needed.
         sizes_of: needed number of columns, or of lines of cells → the number to allot. None if shapes follow from
@@ -187,7 +188,7 @@ def lay_out(
 
 
 def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """The first pieces, as many as there is room for; and the number of their cells in each line."""
+    """The first pieces, with at most `most` cells; and the number of their cells in each line of the grid."""
     from rts.sampling import strips_loops
 
     def counted(n: int) -> np.ndarray:
@@ -207,7 +208,7 @@ def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | 
 
 
 def _firsts(pieces: np.ndarray, grid: FineGrid) -> np.ndarray:
-    """The first piece of each strip, and the end of the last strip's."""
+    """(S + 1,) the index of the first piece of each strip, then the number of pieces."""
     return np.searchsorted(pieces[:, 0], np.arange(grid.strips + 1))
 
 
@@ -272,7 +273,7 @@ class HiddenInStrips:
 
 
 def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
-    """Samples of listed cells (K, L, LINE), put into the places of the layout that show these cells."""
+    """Samples of listed cells (K, L, LINE), put into the layout wherever it shows these cells."""
     sizes = [s.ids.shape[-2] for s in sampled.samples]
     engine, layers = engine_of(sampled), sampled.row.shape[0]
     laid = layers, *layout.place.shape
@@ -342,7 +343,7 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     """The samples of listed cells, selected from those of all cells, for samplers that do not follow lists.
 
     Args:
-        whole: of the whole grid.
+        whole: samples of the whole grid.
         cells: (L, LINE) int32, flat indices in the grid, or −1.
         capacity: rows to allot, or None for as many as there are.
     """

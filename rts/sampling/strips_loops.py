@@ -1,8 +1,8 @@
 """Fine cells of active pixels laid out in strips, and samples put into them. Compiled.
 
 A piece is a run of a strip's columns, or a part of one that has its own place in the layout: (strip, first column,
-number of columns, line, place in the line), of pixels. Its apron on the left begins at its place; it is as wide as that
-on the right, and both together, in whole pixels, are the `gap`.
+number of columns, line, place in the line), in pixels. The place is where its left apron begins. The right apron is as
+wide; both together, rounded up to whole pixels, are the `gap`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ WANTED, NEAR = 1, 2
 
 @loop
 def find(active, high, gap):
-    """Runs (R, 3) int32 of columns of strips: strip, first column, number; those that aprons would join are one.
+    """Runs (R, 3) int32 of columns of strips: strip, first column, number. Runs that aprons would join are one.
 
     Args:
         active: (H, W) uint8.
@@ -50,7 +50,7 @@ def _unite(some, active):
 
 @loop
 def split(runs, gap, lines, across):
-    """Pieces (P, 5) int32 of runs that fit into so many lines of so many columns; runs without room are left out."""
+    """Pieces (P, 5) int32 of runs, cut to fit `lines` lines of `across` columns; runs without room are left out."""
     pieces = np.empty((len(runs) + lines, 5), np.int32)
     found, line, at = 0, 0, 0
     for r in range(len(runs)):
@@ -70,7 +70,7 @@ def split(runs, gap, lines, across):
 
 @loop
 def number(active, pieces, high, pitch, across, pixel):
-    """Fill in the places of active pixels in the layout, in pixels: `across` a line, lines of pieces `pitch` apart."""
+    """Fill `pixel` with indices of active pixels in the layout: `across` a line, lines of pieces `pitch` apart."""
     height, _ = active.shape
     for strip, first, columns, line, at in pieces:
         for y in range(strip * high, min(height, (strip + 1) * high)):
@@ -82,7 +82,7 @@ def number(active, pieces, high, pitch, across, pixel):
 
 @compiled
 def _needs(needs, active, line, strip, first, columns, side, apron, high):
-    """Mark the columns of a piece that need a line of cells of the grid. Returns True if there are any."""
+    """Mark the columns of a piece whose active pixels need a line of cells of the grid. True if there are any."""
     needs[:columns] = 0
     top, bottom = strip * high, min(len(active), (strip + 1) * high)
     begin, end = _pixels(line, side, apron)
@@ -96,13 +96,13 @@ def _needs(needs, active, line, strip, first, columns, side, apron, high):
 
 @compiled
 def _pixels(line, side, apron):
-    """First and end of the lines of pixels that have a line of cells of the grid, their aprons included."""
+    """First and end of the lines of pixels that hold a line of cells of the grid in themselves or their aprons."""
     return (line - 2 * apron) // side, line // side + 1
 
 
 @compiled
 def _begin(marks, first):
-    """Where the first run of marks begins that is not before `first`; the number of marks without one."""
+    """Start of the first run of marks at `first` or later; the number of marks if there is no run."""
     while first < len(marks) and not marks[first]:
         first += 1
     return first
@@ -171,9 +171,9 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
         apron: cells around active pixels that are needed.
         high: pixels from top to bottom of a strip.
         gap: pixels that aprons take.
-        offsets: (H',), how many cells the lines before each have.
-        cells: (M,) int32, to be filled: flat index of each cell in the grid, which has the apron, too.
-        place: (h, w) int32, −1, to be filled: which of the cells each place of the layout holds.
+        offsets: (H',), the number of cells in the lines before each.
+        cells: (M,) int32, to be filled with the flat index of each cell in the grid, apron included.
+        place: (h, w) int32 of −1, to be filled with the index in `cells` that each place of the layout shows.
         kinds: (h, w) uint8 zeros, to be filled with bits.
     """
     width = active.shape[1] * side + 2 * apron
@@ -270,7 +270,7 @@ def _tell(kinds, active, near, strip, first, columns, side, apron, high):
 
 @loop
 def count_samples(start, stop, row, place, counts):
-    """Count the samples of lines [start, stop) of a layout, counted over layers: counts (K · h,)."""
+    """Count the samples of lines [start, stop) of a layout, of K · h lines in all layers: counts (K · h,)."""
     height = len(place)
     for line in range(start, stop):
         k, found = line // height, 0
@@ -281,7 +281,7 @@ def count_samples(start, stop, row, place, counts):
 
 @loop
 def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, index, shift, laid, part, shown):
-    """Put samples into lines [start, stop) of a layout, counted over layers.
+    """Put samples into lines [start, stop) of a layout, of K · h lines in all layers.
 
     Args:
         start: first line.
@@ -296,7 +296,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         index: (N,) int32, to be filled: the sample of each splat.
         shift: (N, 3) float32, to be filled: from the grid to the layout.
         laid: (K, h, w) int32, to be filled: the splat of each place.
-        part: (K, h, w) int32, to be filled: its part.
+        part: (K, h, w) int32, to be filled: the part of that splat.
         shown: (h, w) int8, to be filled: `settled` of each place; no rows if there is none.
     """
     height, across = len(place), np.uint32(width)
@@ -322,7 +322,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
 
 @loop
 def gather(start, stop, covered, depth, place, laid, deep):
-    """Copy cover and depth of cells (K, M) into lines [start, stop) of a layout, counted over layers."""
+    """Copy cover and depth of cells (K, M) into lines [start, stop) of a layout, of K · h lines in all layers."""
     height = len(place)
     for line in range(start, stop):
         k, y = line // height, line % height
@@ -334,9 +334,9 @@ def gather(start, stop, covered, depth, place, laid, deep):
 
 @loop
 def scatter(start, stop, kept, kinds, place, found):
-    """Mark the (K, M) cells that are kept (K, h, w), in lines [start, stop) of a layout, counted over layers.
+    """Mark in `found` (K, M) the cells kept in lines [start, stop) of a layout, of K · h lines in all layers.
 
-    With kinds, marks that are not near wanted cells are cleared.
+    With `kinds`, `kept` is first cleared where it is not near wanted cells.
     """
     height = len(place)
     for line in range(start, stop):

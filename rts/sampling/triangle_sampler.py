@@ -34,8 +34,8 @@ NOTHING_ELSE = Request()
 """A request for all samples, and nothing else."""
 
 LEAST_LAYERS = 3
-"""The least layers of triangles for a surface that refines its samples; if more are requested, one more than these.
-At an outline both sides of a fold of triangles may lie beside the surface."""
+"""Fewest layers of triangles to draw for a surface that moves its samples; for K layers, K + 1 if that is more. At an
+outline both sides of a fold of triangles may lie beside the surface."""
 
 
 class TriangleSampler(Sampler):
@@ -130,7 +130,7 @@ class TriangleSampler(Sampler):
         layers: int,
         beside: Callable[[Fragments], np.ndarray],
     ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """`rasterize` with cull="back", and the triangles seen from behind in some cells.
+        """`rasterize` with cull="back", and the triangles seen from behind in the cells that `beside` names.
 
         The default calls `rasterize` and `rasterize_cells`, each of which goes through all triangles.
 
@@ -178,7 +178,7 @@ class TriangleSampler(Sampler):
         return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None, largest(proxy.vertices))
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
-        """The entry by `_built`, kept from call to call if that saves time."""
+        """The surface's entry; kept from call to call unless its proxy is cheap and `prepare` the default."""
         if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
@@ -247,7 +247,7 @@ class TriangleSampler(Sampler):
 
         Args:
             surface: the surface.
-            inputs: of its proxy, on the host.
+            inputs: the result of its `proxy_inputs`, on the host.
             camera: the camera.
             view: (height, width) of the grid of cells.
             entry: the prepared entry, if known.
@@ -277,8 +277,8 @@ class _Search:
     Attributes:
         sampler: draws the triangles.
         surface: the surface.
-        cull: the part's.
-        inputs: of the surface's proxy.
+        cull: the part's `cull`.
+        inputs: the result of the surface's `proxy_inputs`, on the host.
         camera: host matrices.
         shape: bounds on the number of samples.
         tables: the result of the surface's `table_specs`.
@@ -380,7 +380,7 @@ class _Search:
         return self.hidden.decide(Question(covered, fragments.depth, self._size(known)))
 
     def _size(self, known: Entry) -> float:
-        """The absolute value of the triangles' largest coordinate; 0 if the rule knows it already."""
+        """The triangles' largest absolute coordinate; 0 if the rule for hidden samples has it already."""
         if known.size is not None or self.hidden is None:
             return known.size or 0.0
         # The rule knows the size of vertices that are themselves in θ.
@@ -389,7 +389,7 @@ class _Search:
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:
-    """The surface, refused if it has no triangles."""
+    """The surface; an InputError refuses one without triangles."""
     if not isinstance(surface, TriangleSurface):
         raise InputError(
             f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"

@@ -16,7 +16,7 @@ from rts.sampling.empty_images import known_tree
 from rts.scene.camera import Camera
 
 FLAT = 1e-6
-"""A mesh whose volume is below this share of that of a cube of its area has no inside."""
+"""A mesh has no inside if its volume is below this share of area ** 1.5."""
 
 _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -67,7 +67,7 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
 
 
 def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
-    """The surface of a part, if the user chose its winding and its triangles cost nothing; else None."""
+    """The surface of a part, if its triangles are cheap and the same from every view; else None."""
     surface = part.surface
     if isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view:
         return surface

@@ -14,7 +14,7 @@ GROUP = 3
 
 
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
-    """The image (h, w, C + 1) of splats without their border.
+    """The image (h, w, C + 1) of splats, the border cut off.
 
     Channels depend on alpha, but not on one another. So the splatter makes one image of every three channels and alpha,
     filled up with zeros. The alpha of the first image is returned.
@@ -41,7 +41,7 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
 
 
 def _cropped(splatter: Splatter, splats: Splats) -> Array:
-    """The image (h, w, 4) of splats (N, 4) without their border."""
+    """The image (h, w, 4) of splats with colours (N, 4), the border cut off."""
     image = splatter.cropped(splats)
     expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), GROUP + 1
     if shape_of(image) != expected:

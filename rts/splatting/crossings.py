@@ -1,4 +1,4 @@
-"""Motion of the lines where two surfaces pass through one another: the derivative follows their depths.
+"""Motion of lines where two surfaces pass through one another, with a derivative that follows the surfaces' depths.
 
 On such a line the depths of two sheets a and b are equal: g = z_a − z_b = 0. Let ġ be the difference of the rates at
 which their depths change at a fixed pixel. The line then moves as
@@ -12,8 +12,8 @@ of the eight steps to its neighbours and p = q + m. Both have two layers z0 and 
     D = |z0(q − m) − 2 z0(q) + z0(p)| + |z1(q − m) − 2 z1(q) + z1(p)| + ...
 
 are the changes of slope if the line runs between q and p (R), and if it does not (D). If one side lacks two layers, the
-terms of the other count twice. (q, p) is a pair where R < D / 2, R < (h(q) + h(p)) / 2, and R / (h(q) + h(p)) is least
-along m. On planes R is zero.
+terms of the other side count twice. (q, p) is a pair where R < D / 2, R < (h(q) + h(p)) / 2, and R / (h(q) + h(p)) is
+least along m. On planes R is zero.
 
 Let q be a covered target of a pair. A source belongs to b if it forms a pair with q. Otherwise it belongs to a if it is
 paired front to front with q. ∇z_a and ∇z_b are differences over q's neighbours in its row and column. Any other source
@@ -48,7 +48,7 @@ DIRECT = 0.5
 FIT = 0.5
 """Largest distance of a source from the planes of both sheets, relative to the change of g on the way."""
 KEPT = 2
-"""Cells around a possible pair in which the first two layers are kept."""
+"""Number of cells around a possible pair within which the first two layers are kept."""
 SLACK = 0.01
 """Allowance for rounding of depths, relative to the least sum of gaps of a pair."""
 
@@ -57,7 +57,7 @@ HALF = [(1, 0), (0, 1), (1, 1), (1, -1)]
 
 
 class Lines(NamedTuple):
-    """Targets whose derivative in positions follows a line, with the sheets of their sources.
+    """Targets whose derivative in positions follows a line of crossing, with the sheets of their sources.
 
     Attributes:
         target: (H, W) bool, true for these targets.
@@ -106,11 +106,11 @@ def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
 
 
 def targets(layers: Layers, shift: dict[Steps, Array], crosses: dict[Steps, Array]) -> Lines:
-    """The targets whose derivative in positions follows a line.
+    """The targets whose derivative in positions follows a line of crossing.
 
     Args:
         layers: the samples, of at least two layers.
-        shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
+        shift: for each offset (u, v) from source to target, the number s of `Multi` at each target; 0 at empty targets.
         crosses: see `pairs`.
     """
     xp, (z, two) = layers.xp, _depths(layers)
@@ -186,7 +186,7 @@ def sheets(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def ahead(cells: Array, steps: Steps, value: float) -> Array:
-    """For each cell of (H, W), the cell some steps (x, y) farther on; `value` outside of the array."""
+    """For each cell of (H, W), the value of the cell at `steps` (x, y) from it; `value` outside of the array."""
     xp = namespace(cells)
     for axis, step in ((1, steps[0]), (0, steps[1])):
         if step:
@@ -226,7 +226,7 @@ class _Step(NamedTuple):
 
 
 def _step(z0: Array, z1: Array, two: Array, m: Steps) -> _Step:
-    """The record of all cells q and the cells p = q + m."""
+    """The `_Step` of all cells q and the cells p = q + m."""
     xp, back, twice = namespace(two, z0), opposite(m), (2 * m[0], 2 * m[1])
     (b0, b1), (p0, p1), (f0, f1) = ((ahead(z0, n, 0.0), ahead(z1, n, 0.0)) for n in (back, m, twice))
     gap = z1 - z0
@@ -281,7 +281,7 @@ def _candidates(z0: np.ndarray, z1: np.ndarray, two: np.ndarray, least: float, m
 def _slope(
     first: Array, second: Array, m: Steps, two: Array, same: dict[Steps, Array], swapped: dict[Steps, Array]
 ) -> tuple[Array, Array]:
-    """Slope along a step, of a sheet that is `first` at the target and `second` beyond the line; and a mask of slopes.
+    """Slope along a step, of a sheet that is `first` at the target and `second` beyond the line; and its mask.
 
     The slope is the mean of the differences on both sides, or the one that exists.
     """

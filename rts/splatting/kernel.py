@@ -70,7 +70,7 @@ class Kernel(Splatter):
 
     @staticmethod
     def check(row: Array, count: int, settled: Array | None = None, exits: Array | None = None) -> None:
-        """Refuse fields of `Splats` that name no sample below `count`, before compiled loops read there."""
+        """Refuse fields of `Splats` that name a sample not below `count`, before compiled loops read there."""
         check_rows(row, count)
         if exits is not None:
             check_rows(exits, count)
@@ -94,7 +94,7 @@ class Kernel(Splatter):
 
     @abc.abstractmethod
     def plain(self, depths: Depths, margin: float) -> Array:
-        """Targets (H, W) at which only front layers count, for any rounding of depths within a margin."""
+        """Targets (H, W) bool that only front layers affect, for any rounding of depths within a margin."""
 
     @functools.cached_property
     def gamma(self) -> float:

@@ -48,11 +48,12 @@ def check_settled(settled: Array, shape: tuple[int, ...], count: int) -> None:
 
 
 class Depths:
-    """Depths of an image with a border of one empty cell, by target; (u, v) leads from source to target."""
+    """Depths of the cells around each target of an image; (u, v) leads from source to target."""
 
     def __init__(self, depth: list[Array], covered: Array, facing: list[Array] | None = None):
-        """Depths of each layer (h, w), finite, a mask of covered ones (K, h, w), and `Splats.facing`, with the border.
+        """Take depths of each layer (h, w), finite, a mask of covered cells (K, h, w), and `Splats.facing`.
 
+        All have a border of one empty cell around the image (H, W).
         Without `facing`, any two layers may pair. `extent` is the range of the fronts' depths, since hidden samples may
         have been left out.
         """
@@ -65,11 +66,11 @@ class Depths:
         self.target = self.source(0, 0)
 
     def behind(self, depth: Array) -> Array:
-        """Distance of depths (h, w), with the border, behind the fronts."""
+        """Distances behind the fronts, of depths (h, w), with the border."""
         return depth - self._depth[0]
 
     def front(self, u: int, v: int) -> tuple[Array, Array]:
-        """Depth, and a mask, of the fronts at offset (u, v) from each target; up to two cells away."""
+        """Depth of the sources' fronts and a mask of covered ones, (H, W) both; |u| and |v| up to 2."""
         depth, covered = (self.at(x, u, v, border=2) for x in self._front)
         return depth, covered
 
@@ -86,10 +87,10 @@ class Depths:
         return self.at(self.covered[0], u, v)
 
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
-        """The number s of `Multi`, and the distance of the paired depths, (H, W) both.
+        """The number s of `Multi`, and the difference of the paired depths, (H, W) both.
 
-        A hidden layer does not pair with a front that is the other side of its piece. The last of K layers may stand
-        for unknown layers behind it, but only towards fronts that lie behind it.
+        A hidden layer does not pair with a front that is the other side of its piece. The last of K layers may have
+        unknown layers behind it, which may pair with fronts that lie behind it.
         """
         source, xp = self.source(u, v), self.xp
         ahead, below = [xp.abs(z - self.target[0]) for z in source], [xp.abs(z - source[0]) for z in self.target]
@@ -104,7 +105,7 @@ class Depths:
         return xp.where(best_b < best_a, -b, a), xp.minimum(best_a, best_b)
 
     def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
-        """True where the fronts are nearer, by a margin, than a front and a hidden layer; also the least distance."""
+        """True where fronts are nearer, by a margin, than a front and a hidden layer; and the least distance."""
         source, xp = self.source(u, v), self.xp
         front, hidden = xp.abs(source[0] - self.target[0]), xp.full_like(source[0], xp.inf)
         for p, q in zip(source[1:], self.target[1:], strict=True):
@@ -203,13 +204,13 @@ def bordered(cells: Array, value: int = -1) -> Array:
 
 
 def _weighted(rgba: Array, covered: Array) -> Array:
-    """(h, w, 5): colour, and 1 to count the weights; zero where not covered."""
+    """(h, w, 5): colour, and 1 to sum the weights; zero where not covered."""
     xp = namespace(rgba)
     return xp.where(covered, xp.concat([rgba, xp.ones_like(rgba[..., :1])], axis=-1), 0.0)
 
 
 def normalised(total: Array, xp: Any) -> Array:
-    """Accumulated colours over their weights, or over one where weights are less (paper eq. 3)."""
+    """Accumulated colours over the sum of their weights, or over one where it is less (paper eq. 3)."""
     return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
 
 
@@ -238,7 +239,7 @@ def opposite(n: Steps) -> Steps:
 
 
 def dilated(cells: np.ndarray) -> np.ndarray:
-    """Cells (H, W), bool or uint8, and the eight cells around each."""
+    """The marks (H, W), bool or uint8, spread to the eight cells around each."""
     wide = np.pad(cells, ((1, 1), (0, 0)))
     wide = np.pad(wide[:-2] | wide[1:-1] | wide[2:], ((0, 0), (1, 1)))
     return wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
@@ -255,7 +256,7 @@ def fronts(covered: np.ndarray) -> np.ndarray:
 
 
 def opposite_sides(hidden: Array, front: Array, behind: Array) -> Array:
-    """True where a hidden layer is the other side of a front's piece, and stands for no unknown layers behind it."""
+    """True where a hidden layer is the other side of a front's piece, so that the two do not pair."""
     xp, bit = namespace(front), Cells.MORE_BEHIND
     other = (front != 0) & (hidden == -front)
     return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, bit, -bit)))

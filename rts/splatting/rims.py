@@ -1,4 +1,4 @@
-"""Motion of outlines: coverage moves by itself, extrapolated from samples to the outline beside them.
+"""Motion of outlines: coverage moves with the outline, whose motion is extrapolated from the samples beside it.
 
 A sample lies up to a pixel or two inside of the outline that its weights represent. Where the surface turns, the sample
 moves faster than the outline: on a rim of radius R pixels, a sample δ pixels inside is nearer by √(2Rδ). So coverage
@@ -8,8 +8,8 @@ moves as
 
 in x and y, where β and the partner of each cell p are decisions without a derivative. Directions n lead from a cell to
 its eight neighbours. A direction is off if p + n is empty or not paired front to front with p. It is usable if n is
-off, −n is not, and p₁ = p − n is covered. It is deep if p₂ = p − 2n continues the surface, too, and the depths of all
-three fall off as on a smooth rim. The first rule that applies decides:
+off, −n is not, and p₁ = p − n is covered. It is deep if it is usable, p₂ = p − 2n continues the surface, too, and the
+depths of all three fall off as on a smooth rim. The first rule that applies gives β and the partner:
 
 - Chord: p has an exit, where the ray leaves the closed part that it met, or else a second layer of the same part; and
   the square of the gap behind its front runs to zero along a usable direction. The partner is that exit or layer,
@@ -33,7 +33,7 @@ from rts.splatting.kernel import Kernel
 from rts.splatting.layers import AROUND, Layers, Steps, bordered, dilated, opposite
 
 LEAST, LARGEST = 1.23, 2.5
-"""The least ratio r of depths on a smooth rim, 1.5 pixels away; and the bound of β."""
+"""The least ratio r of depths beside a smooth rim, 1.5 pixels away; and the largest β."""
 FLAT = 1e-5
 """Differences of depth below this share of the farthest depth are rounding."""
 CONVERGING = 1.5
@@ -45,7 +45,7 @@ HALF = 0.5
 def gains(
     kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array | None, crossed: Array | None = None
 ) -> tuple[Array, Array]:
-    """Changes of coverage as outlines move differently from their samples: zeros with derivatives (H, W).
+    """Changes of coverage where outlines move otherwise than their samples: zeros (H, W) with derivatives.
 
     Fronts of sources move as their own outlines. At the surface of a covered target, fronts of its part move as the
     target's outline. Beside a line of crossing so do fronts of other parts; otherwise a gap may open.
@@ -53,12 +53,12 @@ def gains(
     Args:
         kernel: the splatter.
         layers: the samples.
-        shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
+        shift: for each offset (u, v) from source to target, the number s of `Multi` at each target; 0 at empty targets.
         part: (K, H, W), the part of each sample, or None where all may be of one.
         crossed: (H, W) bool, true for cells beside lines where surfaces cross; None if unknown.
 
     Returns:
-        The gains in front, and at the surface.
+        The changes in front of the targets' surfaces, and at them.
     """
     xp, motion = layers.xp, _motion(layers, layers.position[0], layers.covered[0])
     outline = outline_motion(layers, shift, part, motion)
@@ -81,7 +81,7 @@ def gains(
 
 
 def spread(total: Array, gain: Array) -> Array:
-    """The change of a buffer (H, W, 5) with its coverage: its mean, where it does not fill the target.
+    """The change of a buffer (H, W, 5) with its coverage: its mean, unless it fills the target.
 
     Args:
         total: the buffer's sums (H, W, 5), colours and weight.
@@ -109,7 +109,7 @@ class Back(NamedTuple):
 
 
 def outline_motion(layers: Layers, shift: dict[Steps, Array], part: Array | None, motion: Array) -> Array:
-    """P̂ without its value (H, W, 2): zeros, with the derivative of the outline beside each cell.
+    """Motion of the outline beside each cell, P̂ without its value: zeros (H, W, 2) with derivatives.
 
     Args:
         layers: the samples.

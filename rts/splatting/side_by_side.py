@@ -69,7 +69,7 @@ class Picture(NamedTuple):
         return np.stack([across * self.view[1], down * self.view[0]], axis=1)
 
     def inside(self, border: int) -> np.ndarray:
-        """(height, width) bool, true for the cells of views inside of a border."""
+        """(height, width) bool, true for the cells of views but for a border in each."""
         (height, width), inside = self.view, np.zeros((self.down, self.view[0], self.across, self.view[1]), bool)
         inside[:, border : height - border, :, border : width - border] = True
         for y, x in list(np.ndindex(self.down, self.across))[self.views :]:
@@ -77,7 +77,7 @@ class Picture(NamedTuple):
         return inside.reshape(self.size)
 
     def laid_out(self, views: Array, empty: int | bool) -> Array:
-        """The picture (K, height, width) of arrays (B, K, h, w) of the views; `empty` fills places without a view."""
+        """The picture (K, height, width) of the views' arrays (B, K, h, w); `empty` fills places without a view."""
         xp, (height, width), nowhere = namespace(views), self.view, self.down * self.across - self.views
         if nowhere:
             views = xp.concat([views, *[xp.full_like(views[:1, ...], empty)] * nowhere])
@@ -85,7 +85,7 @@ class Picture(NamedTuple):
         return xp.reshape(xp.permute_dims(grid, (2, 0, 3, 1, 4)), (-1, *self.size))
 
     def apart(self, image: Array, border: int) -> Array:
-        """The views (B, h, w, C) of an image (height, width, C) of the picture, without their borders."""
+        """The views (B, h, w, C), borders cut off, of an image (height, width, C) of the picture."""
         xp, (height, width) = namespace(image), self.view
         grid = xp.reshape(image, (self.down, height, self.across, width, image.shape[-1]))
         inner = grid[:, border : height - border, :, border : width - border, :]
@@ -96,7 +96,7 @@ class Picture(NamedTuple):
 def depth_scales(largest: np.ndarray) -> np.ndarray:
     """(B,) float32 factors that scale the largest depth (B,) of each view to between 1 and 2.
 
-    All are one where the views need the same factor.
+    All factors are one if the views would need the same factor.
     """
     usable = np.isfinite(largest) & (largest > 0)
     powers = np.frexp(np.where(usable, largest, 1.0))[1]

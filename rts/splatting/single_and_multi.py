@@ -50,7 +50,7 @@ class Plain(Splatter):
 
 @dataclass(frozen=True)
 class Single(Kernel):
-    """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
+    """Splatting of one layer (paper eq. 1–3): only the front layer of `row`, as if nothing hid anything."""
 
     layers = 1
 
@@ -76,8 +76,8 @@ class Multi(Kernel):
 
     Layers of the source p and the target q are paired on linear depth z: with A_l = |z_p[l] − z_q[0]| and
     B_l = |z_q[l] − z_p[0]|, s = −argmin B where min B < min A, else argmin A. Layer l of p is in front where l < s, at
-    the surface where l = s, behind where l > s. The B test catches a source whose front layer continues a hidden layer
-    of the target. Back faces of a closed surface pair with layers behind them: cull them (`Part.cull`).
+    the surface where l = s, behind where l > s. B finds sources whose front layer continues a hidden layer of the
+    target. Back faces of a closed surface pair with layers behind them: cull them (`Part.cull`).
     """
 
     def accumulate(self, splats: Splats) -> Array:
