@@ -108,7 +108,7 @@ def box_filtered(image: Array, size: tuple[int, int]) -> Array:
 
 
 def blurred(image: Array, sigma: float) -> Array:
-    """An image (H, W, C) blurred by a Gaussian; it is zero beyond its border."""
+    """An image (H, W, C) blurred by a Gaussian, as if it were zero beyond its edges; `sigma` is in pixels."""
     return _along_axes(image, *(_gaussian(n, sigma) for n in image.shape[:2]))
 
 
