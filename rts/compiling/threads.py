@@ -187,7 +187,7 @@ if sys.platform != "win32":
 
 
 def thread_count() -> int:
-    """Threads to use: the variable RTS_NUM_THREADS, or the cores this process may run on."""
+    """Number of threads to use: RTS_NUM_THREADS of the environment, or else of the cores this process may run on."""
     wanted = os.environ.get("RTS_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
@@ -195,7 +195,7 @@ def thread_count() -> int:
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """A contiguous view of an array, copied only if necessary; read-only, since loops are compiled for such."""
+    """A contiguous, read-only view, copied only if necessary. Loops are compiled for read-only arrays."""
     view = np.asarray(x, dtype, order="C").view()
     view.flags.writeable = False
     return view

@@ -19,7 +19,7 @@ def camera() -> rts.Camera:
 
 
 def octahedra() -> list[rts.Part]:
-    """Two octahedra that pass through one another, shaded and dark."""
+    """Two octahedra that pass through one another; one is shaded, the other a silhouette."""
     corners = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
     faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
     surface = rts.Mesh(np.array(faces))

@@ -26,7 +26,7 @@ TRIANGLE = _RECORD.itemsize
 
 
 def text_of(path: Path, kind: str, data: bytes) -> str:
-    """A file's text; an InputError if the bytes are no text."""
+    """A file's text; an InputError if the bytes are no UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -122,10 +122,10 @@ def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.n
 
 
 def sound_stl(path: Path, data: bytes) -> bytes:
-    """A binary STL as it is, if its length is right; an STL in text rewritten as solids and vertices only.
+    """A binary STL as it is, if its length is right; an STL in text with numbers in place of the names of solids.
 
     Raises:
-        InputError: it is longer or shorter, or the text departs from the format.
+        InputError: the file is longer or shorter than its header says, or its text departs from the format.
     """
     if len(data) >= 84 and len(data) == 84 + TRIANGLE * struct.unpack_from("<I", data, 80)[0]:
         _check_records(path, np.frombuffer(data, _RECORD, offset=84))

@@ -91,7 +91,7 @@ def _areas(corners: np.ndarray) -> np.ndarray:
 
 
 def _with_slivers(triangles: np.ndarray, count: int) -> np.ndarray:
-    """The triangles of a polygon, and triangles without area for corners on a line, which were left out.
+    """The triangles of a polygon, and triangles without area for corners on a line that were left out.
 
     Around such corners, edges of the outline or of triangles have no partner. These edges make loops, which are filled.
     """

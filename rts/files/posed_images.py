@@ -41,7 +41,7 @@ class View:
 
     Args:
         camera: the camera, float64 NumPy.
-        size: (height, width).
+        size: (height, width) of the image, pixels.
         image: (H, W, 3 or 4) float32, or a function that returns the image, called at each use.
         name: the picture's name in its file.
         near: the depth at which the scene begins, in the units of the camera; None where that is not known.
@@ -371,7 +371,7 @@ def _llff(path: Path, downscale: int, frame: str) -> list[_Pose]:
 
 
 def _nerf_frame(poses: list[_Pose]) -> list[_Pose]:
-    """The poses about their mean, the nearest bound at 1 / 0.75."""
+    """The poses relative to their mean, scaled so that the nearest bound is 1 / 0.75."""
     scale = 1 / (SCALE_OF_NEAREST * min(pose.near or math.inf for pose in poses))
     matrices = np.stack([pose.camera_to_world for pose in poses])
     matrices[:, :3, 3] *= scale

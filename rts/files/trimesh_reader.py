@@ -23,7 +23,7 @@ LINEAR_COLORS = {"glb", "gltf"}
 
 
 class _Folder:
-    """Resolves names for trimesh in the model's folder; keeps the errors, which trimesh only logs."""
+    """Resolver of file names for trimesh, in the model's folder; keeps the errors, which trimesh only logs."""
 
     def __init__(self, path: Path):
         self.path, self.problem = path, None

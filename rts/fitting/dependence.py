@@ -92,8 +92,8 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
     Args:
         basis: (U, k), linearly independent columns that span the directions, in numbers of the parameters.
         units: (U,), positive factors that make changes of different arrays comparable.
-        names: of the arrays.
-        shapes: of the arrays.
+        names: the names of the arrays of the parameters, in order.
+        shapes: the shapes of these arrays.
 
     Returns:
         Text such as "light.direction along (0.32, 0.53, 0.78), gain"; at most a few directions.

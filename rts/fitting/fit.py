@@ -35,7 +35,7 @@ class Fit(NamedTuple):
 
     Attributes:
         parameters: the parameters with the lowest loss met.
-        loss: that loss.
+        loss: the loss of these parameters.
         history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
             With a schedule those of all stages, one after the other.
         steps: number of losses computed, the one at the start included.

@@ -388,7 +388,7 @@ class _Fields(NamedTuple):
 
 
 def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
-    """Fields for the coarse grid, weights zero at active pixels, and for the layout of `fine`, zero at all others."""
+    """Fields for the coarse grid, weights zero at active pixels; and for the layout of `fine`, zero elsewhere in it."""
     xp, engine = namespace(pixel), engine_of(pixel)
     height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
 
@@ -442,7 +442,7 @@ def _are_cameras(value: Any) -> TypeGuard[Cameras]:
 
 
 def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
-    """The number of views of a target; None if it is one view, without an axis. `several`: of cameras."""
+    """The number of views of a target; None for one view, without an axis. `several` is True for several cameras."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape: Any = shape_of(target)

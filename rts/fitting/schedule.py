@@ -19,7 +19,8 @@ from rts.sampling.adaptive import Adaptive, finest
 COARSEST, BLUR = 16, 1 / 16
 """A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""
 SAMPLES, FEWER_SAMPLES = 4, 2
-"""Samples a pixel along each axis: at the coarsest stage, whose samples jump over outlines; before the last."""
+"""Samples a pixel along each axis: at the coarsest stage, where outlines jump over samples; and at stages
+between it and the last."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def box_filtered(image: Array, size: tuple[int, int]) -> Array:
 
 
 def blurred(image: Array, sigma: float) -> Array:
-    """An image (H, W, C) blurred by a Gaussian; it is zero beyond its border."""
+    """An image (H, W, C) blurred by a Gaussian, as if it were zero beyond its edges; `sigma` is in pixels."""
     return _along_axes(image, *(_gaussian(n, sigma) for n in image.shape[:2]))
 
 

@@ -14,7 +14,7 @@ LARGEST = 2.0
 
 
 def check_range(target: Array, count: int, channels: int) -> None:
-    """Refuse alpha from 0 to 255, and warn of such colours; channels that are no colours may have any value.
+    """Refuse alpha far above 1, and warn of such colours; channels that are no colours may have any value.
 
     Args:
         target: (H, W) or (H, W, C).

@@ -107,7 +107,7 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.
-        depth: (K, H, W).
+        depth: (K, H, W), 0 in empty cells.
         sizes: the number of rows of each part.
         settled: (H, W) int8, 0 at cells that the only part covers, even where they have no sample, −1 at others;
             None if no cell is settled.

@@ -36,7 +36,7 @@ def find(kept, cells):
 
 @compiled
 def _list(cells, count, first, marks):
-    """Append the indices of a row's marked cells, which start at `first`, to `cells`. Returns the new count."""
+    """Append the indices of a row's marked cells to `cells`; the first cell has index `first`. Returns the count."""
     for start in range(0, len(marks), BLOCK):
         if _any(marks[start : start + BLOCK]):
             for x in range(start, min(start + BLOCK, len(marks))):

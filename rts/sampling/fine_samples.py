@@ -63,7 +63,7 @@ def fine_samples(
 
     Args:
         coarse: one sample a pixel.
-        grid: the sizes.
+        grid: the sizes of the image and of its fine cells.
         where: the rule by which pixels are active.
         take: samples the fine grid: a number of layers, a rule for hidden samples, cells and capacity → `Sampled`.
         hidden: the rule for hidden samples of an image; None to keep all.

@@ -170,7 +170,7 @@ HiddenRule = HiddenBySplatter | HiddenBehindOpaque
 
 
 def numbers_of(settled: np.ndarray) -> np.ndarray:
-    """`Cells.settled` (H, W) int8 of a scene of one part, from marks (H, W) bool: 0, the first sample, or else −1."""
+    """`Cells.settled` (H, W) int8 for one part: 0, the first sample, where `settled` (H, W) bool is True; else −1."""
     return settled.view(np.int8) - np.int8(1)
 
 

@@ -29,7 +29,7 @@ def settle(
         covered: (K, H, W) bool.
         depth: (K, H, W) float, of one dtype.
         kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
-        reach: cells.
+        reach: of the splatter, in cells.
         wanted: (H, W) bool, the cells that are shown; None for all, and for cells beyond the edges of the grid.
     """
     layers, height, width = covered.shape

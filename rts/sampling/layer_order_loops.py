@@ -65,7 +65,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
         start: the first line.
         stop: the line after the last.
         row: (K H, W) int32, the sample in each cell, or −1.
-        size: (H, W).
+        size: (H, W) of the grid.
         projection: (4, 4) float64.
         inverse: (4, 4) float64, of the view.
         origins: (N, 3) float64, to be filled for samples in these lines.

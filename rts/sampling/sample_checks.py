@@ -74,7 +74,7 @@ def check_faces(proxy: Proxy, surface: Any = None) -> None:
 
 
 def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
-    """A table of a proxy, contiguous and of this dtype; refused unless (rows, *widths), −1 for any, of like kind."""
+    """A table of a proxy, contiguous, of this dtype; refused unless of its kind and (rows, *widths), −1 for any."""
     try:
         array = np.asarray(table)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -202,7 +202,10 @@ ROUNDING = 1e-6
 
 
 def _spread(m: np.ndarray) -> float:
-    """The squared determinant of a (3, 3) matrix over the product of its rows' squared lengths: 1 if orthogonal."""
+    """The squared determinant of a (3, 3) matrix over the product of its rows' squared lengths.
+
+    It is 1 for orthogonal rows, 0 for dependent rows.
+    """
     a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
     square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
     return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0

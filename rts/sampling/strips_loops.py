@@ -22,7 +22,7 @@ def find(active, high, gap):
     Args:
         active: (H, W) uint8.
         high: pixels from top to bottom of a strip.
-        gap: pixels that aprons take.
+        gap: pixels that aprons on two opposite sides take.
     """
     height, width = active.shape
     strips, found = (height + high - 1) // high, 0
@@ -130,7 +130,7 @@ def count(start, stop, active, pieces, firsts, side, apron, high, width, counts)
         side: s, cells along each side of a pixel.
         apron: cells around active pixels that are needed.
         high: pixels from top to bottom of a strip.
-        width: of the grid.
+        width: cells in a line of the grid.
         counts: to be filled.
     """
     needs, seen = np.empty(active.shape[1], np.uint8), np.zeros(width, np.uint8)
@@ -170,7 +170,7 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
         side: s, cells along each side of a pixel.
         apron: cells around active pixels that are needed.
         high: pixels from top to bottom of a strip.
-        gap: pixels that aprons take.
+        gap: pixels that aprons on two opposite sides take.
         offsets: (H',), the number of cells in the lines before each.
         cells: (M,) int32, to be filled with the flat index of each cell in the grid, apron included.
         place: (h, w) int32 of −1, to be filled with the index in `cells` that each place of the layout shows.
@@ -289,9 +289,9 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         row: (K, M) int32, the sample of each cell.
         place: (h, w).
         cells: (M,), the flat index of each cell in the grid.
-        settled: (M,) int8, 0 or −1, or nothing.
+        settled: (M,) int8, 0 or −1, see `Cells.settled`; empty if there is none.
         firsts: (P − 1,) the first row of each part but the first.
-        width: of the grid.
+        width: cells in a line of the grid.
         offsets: (K · h,), the number of the first splat of each line.
         index: (N,) int32, to be filled: the sample of each splat.
         shift: (N, 3) float32, to be filled: from the grid to the layout.

@@ -79,7 +79,7 @@ class Kernel(Splatter):
 
     @abc.abstractmethod
     def accumulate(self, splats: Splats) -> Array:
-        """The image of all cells (H, W, 4), if there is at least one sample."""
+        """The image (H, W, 4) of all cells, those of the border too; there is at least one sample."""
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""

@@ -155,7 +155,7 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
 
 
 def chords(covered: np.ndarray) -> np.ndarray:
-    """The second layers (K, H, W) beside outlines of fronts with nothing behind them."""
+    """Second layers (K, H, W) bool, in or beside covered cells that have an empty neighbour."""
     ring = covered[0] & dilated(~covered[0])
     return covered & dilated(ring) & (np.arange(len(covered)) == 1)[:, None, None]
 
