@@ -96,7 +96,7 @@ def fine_samples(
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
         known = None if hidden is None else HiddenInStrips(hidden, host)
-        flat = flat and bool(values[-1].any()) and not host.dropped
+        flat = flat and bool((values[-1] >= 0).any()) and not host.dropped
     taken = partial(take, listed=layout.cells, capacity=allotted)
     sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known)
     return replace(arranged(sampled, layout, grid), flat=flat)
