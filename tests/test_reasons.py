@@ -111,10 +111,11 @@ def opaque_layers(mended):
 
 
 def transparent(mended):
-    """A pane behind a pane, of which `single` shows the front alone."""
-    panes = [card(-9.2, 8.3, -8.4, 8.1, 5, BLUE), card(-5.3, 4.2, -4.4, 4.1, 0, RED)]
-    panes = [p.replace(shader=glass) for p in panes]
-    return lambda p: ([panes[0], moved(panes[1], p)], CAMERA), ZERO, {} if mended else {"splatter": "single"}
+    """Three panes behind each other, of which `multi` averages the last two."""
+    sides = (-9.2, 8.3, -8.4, 8.1, 5, BLUE), (-8.1, 9.2, -8.2, 9.3, 0, BLUE), (-5.3, 4.2, -4.4, 4.1, -5, RED)
+    panes = [card(*side).replace(shader=glass) for side in sides]
+    options = {"layers": 4} if mended else {"layers": 4, "splatter": "multi"}
+    return lambda p: ([*panes[:2], moved(panes[2], p)], CAMERA), ZERO, options
 
 
 def outlines(mended):

@@ -104,7 +104,7 @@ class _Helpers:
         self._placed: set[int] | None = None
 
     def free(self, count: int) -> int:
-        """Of `count` helpers, the number of those that are idle or not started yet."""
+        """The number of helpers, out of `count`, that are idle or not started yet."""
         return max(0, count - len(self._under_way))
 
     def start(self, count: int) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -134,7 +134,11 @@ class HiddenBehindOpaque:
 
     rule: HiddenBySplatter
     opaque: np.ndarray
-    settles: ClassVar[bool] = False
+
+    @property
+    def settles(self) -> bool:
+        """See `Hidden`: False, since light may shine through any cell."""
+        return False
 
     @property
     def size(self) -> float:

@@ -54,7 +54,7 @@ class Fronts:
 
     def decide(self, question: Question) -> Decision:
         """See `rts.contracts.records.Hidden`."""
-        covered, depth, _ = question
+        covered, depth = question.covered, question.depth
         claim(covered.dtype == bool and covered.shape == depth.shape, "decide is not asked with (K, H, W) arrays")
         kept = covered & (np.arange(len(covered)) == 0)[:, None, None]
         return Decision(kept, None, kept)

@@ -73,8 +73,8 @@ class Choices(NamedTuple):
         listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: largest less least depth of the fronts, the camera's 0 included.
-        stacks: where layers are translucent, the plans of these targets.
-        straight: where layers are translucent, the targets that need no plan; they are not listed above.
+        stacks: where layers are translucent, the plans of these targets, and the targets that need no plan; the latter
+            are not listed above.
     """
 
     mixed: np.ndarray
@@ -87,8 +87,7 @@ class Choices(NamedTuple):
     listed: np.ndarray
     repeated: bool
     extent: float
-    stacks: Stacks | None = None
-    straight: Straight | None = None
+    stacks: tuple[Stacks, Straight] | None = None
 
 
 class Cells:
@@ -251,12 +250,12 @@ class Cells:
             continued = kind.type(Visible.CONTINUED)
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             parallel(listing.choose, height, self.grid, *given, work=500 * len(columns))
-        stacks = None
+        layered_targets = None
         if straight is not None:
             stacks = Stacks.of(len(columns), layers, kind)
-            given = self.facing, beyond, offsets, columns, ranges, stacks
+            layered_targets, given = (stacks, straight), (self.facing, beyond, offsets, columns, ranges, stacks)
             parallel(layered.fill, height, self.grid, *given, work=400 * layers * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, stacks, straight)
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, layered_targets)
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -285,9 +284,10 @@ class Cells:
             given = self.grid, *decide, *listed, ends
             parallel(outlines.fill, height, *given, result, work=90 * len(result.columns))
             if choices.stacks is not None:
-                own = result.offsets, result.columns, choices.offsets, choices.columns, choices.stacks
+                stacks, straight = choices.stacks
+                own = result.offsets, result.columns, choices.offsets, choices.columns, stacks
                 parallel(layered.recolor, height, *own, result.changes, work=20 * len(result.columns))
-                own = result.offsets, result.columns, choices.straight
+                own = result.offsets, result.columns, straight
                 parallel(straight_stacks.recolor, height, *own, result.changes, work=20 * len(result.columns))
             if self._crossed:
                 self.crossings.still(result.offsets, result.columns, result.changes)
@@ -322,9 +322,9 @@ class Cells:
             given = self.plain_grid, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if self.choices.stacks is not None:
-                given = self.choices.offsets, self.choices.columns, self.choices.stacks.images, self.border
+                stacks, regular = self.choices.stacks
+                given = self.choices.offsets, self.choices.columns, stacks.images, self.border
                 parallel(layered.forward, len(out), *given, out, work=self._mixed_work // 10)
-                regular = self.choices.straight
                 given = regular.offsets, regular.columns, regular.images, self.border
                 parallel(layered.forward, len(out), *given, out, work=10 * len(regular.columns))
             elif len(self.choices.columns):
@@ -382,7 +382,7 @@ class Cells:
         """Add mixed targets' shares to the gradients; a gradient of no rows gets none."""
         count, height = len(self.choices.columns), self.row.shape[1]
         if self.choices.stacks is not None:
-            self._pull_stacks(self.choices.stacks, self.choices.straight, g, g_positions, g_rgba)
+            self._pull_stacks(*self.choices.stacks, g, g_positions, g_rgba)
             return
         if not (count and (len(g_positions) or len(g_rgba))):
             return
@@ -420,11 +420,12 @@ class Cells:
         )
         parallel(stencil.push, out.shape[1], self.plain_grid, *tangents, self.choices.states, self.border, out)
         if self.choices.stacks is not None:
-            given = self.grid, self.choices.offsets, self.choices.columns, self.choices.stacks, tangents, self.border
+            stacks, straight = self.choices.stacks
+            given = self.grid, self.choices.offsets, self.choices.columns, stacks, tangents, self.border
             work = len(self.row) * self._mixed_work * len(out)
             parallel(layered.push, out.shape[1], *given, out, work=work)
-            given = self.grid, self.choices.straight, tangents, self.border
-            work = 100 * len(self.row) * len(self.choices.straight.columns) * len(out)
+            given = self.grid, straight, tangents, self.border
+            work = 100 * len(self.row) * len(straight.columns) * len(out)
             parallel(straight_stacks.push, out.shape[1], *given, out, work=work)
         elif len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border

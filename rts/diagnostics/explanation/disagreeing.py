@@ -164,8 +164,6 @@ def _transparent(case: _Case, touched: Touched) -> None:
     if case.subject.opaque or case.subject.splats_as("visible"):
         return
     before, advice = case.try_out(splatter="visible"), "Say splatter='visible'."
-    if before is None:
-        before, advice = case.try_out(splatter="visible", layers=DEEP), f"Say splatter='visible', layers={DEEP}."
     if before is not None:
         because = "shaders are not opaque, but the splatter loses what shines through layers"
         case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
@@ -324,8 +322,8 @@ def _off(pushed: np.ndarray, true: np.ndarray) -> float:
 
 EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _constants,
-    _outlines,
     _transparent,
+    _outlines,
     _layers,
     _crossing,
     _bounded,
