@@ -6,7 +6,8 @@ OLDEST ?= .venv-oldest
 BIN := $(VENV)/bin
 # Each takes up to 5 GB, most of it compiled jax programs.
 WORKERS ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+# Files keep their order: otherwise those of few tests, which take long, come last, and one worker waits for the other.
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example

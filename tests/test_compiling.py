@@ -137,17 +137,8 @@ def test_helpers_may_print_and_raise_errors_with_values(tmp_path):
         assert done.stdout.splitlines() == ["('below zero', -3.0)", "checked 3.0", "6.0"]
 
 
-@pytest.mark.thorough
-def test_warmup_makes_the_calls_and_says_what_failed(monkeypatch, tmp_path):
-    """Kept loops are in a folder of its own, and a second time all are there."""
-    monkeypatch.setattr(warmup, "OTHERS", ("picture",))
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-    assert rts.warmup(2) < 300
-    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nbc")}
-    assert 8 <= len(kept) <= 20
-    rts.warmup(1)
-    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nbc")} == kept
-    monkeypatch.setattr(warmup, "OTHERS", ("nothing",))
+def test_warmup_says_what_failed(monkeypatch):
+    monkeypatch.setattr(warmup, "FIRST", ("nothing",))
     with pytest.raises(rts.RtsError, match="could not compile loops: KeyError: 'nothing'"):
         rts.warmup(1)
 
