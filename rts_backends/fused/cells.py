@@ -24,7 +24,6 @@ from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.rows import Grid
 from rts_backends.fused.stacks import Stacks
-from rts_backends.fused.straight_stacks import Straight
 from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
@@ -73,8 +72,8 @@ class Choices(NamedTuple):
         listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: largest less least depth of the fronts, the camera's 0 included.
-        stacks: where layers are translucent, the plans of these targets, and the targets that need no plan; the latter
-            are not listed above.
+        stacks: where layers are translucent, the plans of these targets, and the targets that need no plan, which are
+            not listed above.
     """
 
     mixed: np.ndarray
@@ -87,7 +86,7 @@ class Choices(NamedTuple):
     listed: np.ndarray
     repeated: bool
     extent: float
-    stacks: tuple[Stacks, Straight] | None = None
+    stacks: Stacks | None = None
 
 
 class Cells:
@@ -181,6 +180,11 @@ class Cells:
         return 4 * self.row.shape[1] * self.row.shape[2]
 
     @property
+    def _layers_work(self) -> int:
+        """Nanoseconds that stencils of all layers take at least."""
+        return len(self.row) * self._plain_work
+
+    @property
     def _mixed_work(self) -> int:
         """Nanoseconds that the mixed targets take: nine sources of several numbers each."""
         return 160 * len(self.choices.columns)
@@ -226,18 +230,15 @@ class Cells:
         if layers > 1 and self._wanted is not None:
             before, marks = marks, np.empty_like(marks)
             parallel(listing.narrow, height, before, self._wanted, marks, marked, work=self.row[0].size)
-        straight = None
+        straight = np.zeros((0, width), np.uint8)
         if self.translucent:
             # Any target that some layer reaches; `narrow` comes before, since outlines look farther.
             marks = layered.reached(self.row[0] >= 0)
             marks = marks & self._wanted if self._wanted is not None else marks
             marks = marks & ~amid if len(amid) else marks
-            levels = (self.row >= 0).sum(axis=0, dtype=np.int32)
-            regular, both = np.empty_like(marks), np.empty((height, 2), np.int64)
-            parallel(straight_stacks.find, height, self.grid, levels, marks, regular, both, work=self.row.size * 9)
-            marked, straight = both[:, 0], Straight.of(both[:, 1], layers, kind)
-            given = self.grid, levels, regular, states, EMPTY, straight
-            parallel(straight_stacks.fill, height, *given, work=100 * layers * len(straight.columns))
+            straight, given = np.empty_like(marks), (self.positions, self.row, ends, marks)
+            parallel(straight_stacks.find, height, *given, straight, marked, work=20 * self.row.size)
+            states[straight > 0] = EMPTY
         if len(amid) and not self.visible:
             marks &= ~amid
             marked = marks.sum(axis=1, dtype=np.int64)
@@ -250,12 +251,12 @@ class Cells:
             continued = kind.type(Visible.CONTINUED)
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             parallel(listing.choose, height, self.grid, *given, work=500 * len(columns))
-        layered_targets = None
-        if straight is not None:
-            stacks = Stacks.of(len(columns), layers, kind)
-            layered_targets, given = (stacks, straight), (self.facing, beyond, offsets, columns, ranges, stacks)
+        stacks = None
+        if self.translucent:
+            stacks = Stacks.of(len(columns), layers, kind, straight)
+            given = self.facing, beyond, offsets, columns, ranges, stacks
             parallel(layered.fill, height, self.grid, *given, work=400 * layers * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, layered_targets)
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, stacks)
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -284,11 +285,8 @@ class Cells:
             given = self.grid, *decide, *listed, ends
             parallel(outlines.fill, height, *given, result, work=90 * len(result.columns))
             if choices.stacks is not None:
-                stacks, straight = choices.stacks
-                own = result.offsets, result.columns, choices.offsets, choices.columns, stacks
+                own = result.offsets, result.columns, choices.offsets, choices.columns, choices.stacks
                 parallel(layered.recolor, height, *own, result.changes, work=20 * len(result.columns))
-                own = result.offsets, result.columns, straight
-                parallel(straight_stacks.recolor, height, *own, result.changes, work=20 * len(result.columns))
             if self._crossed:
                 self.crossings.still(result.offsets, result.columns, result.changes)
         return result
@@ -322,11 +320,11 @@ class Cells:
             given = self.plain_grid, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if self.choices.stacks is not None:
-                stacks, regular = self.choices.stacks
+                stacks = self.choices.stacks
                 given = self.choices.offsets, self.choices.columns, stacks.images, self.border
                 parallel(layered.forward, len(out), *given, out, work=self._mixed_work // 10)
-                given = regular.offsets, regular.columns, regular.images, self.border
-                parallel(layered.forward, len(out), *given, out, work=10 * len(regular.columns))
+                given = self.grid, stacks.straight, self.border
+                parallel(straight_stacks.forward, len(out), *given, out, work=self._layers_work)
             elif len(self.choices.columns):
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
@@ -382,7 +380,7 @@ class Cells:
         """Add mixed targets' shares to the gradients; a gradient of no rows gets none."""
         count, height = len(self.choices.columns), self.row.shape[1]
         if self.choices.stacks is not None:
-            self._pull_stacks(*self.choices.stacks, g, g_positions, g_rgba)
+            self._pull_stacks(self.choices.stacks, g, g_positions, g_rgba)
             return
         if not (count and (len(g_positions) or len(g_rgba))):
             return
@@ -397,14 +395,10 @@ class Cells:
         if len(g_positions) or len(g_rgba):
             parallel(mixed_targets.pull, *given, g_positions, g_rgba, work=work)
 
-    def _pull_stacks(
-        self, stacks: Stacks, straight: Straight, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray
-    ) -> None:
+    def _pull_stacks(self, stacks: Stacks, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
         """`_pull_mixed` of translucent layers."""
-        adjoints, work = np.empty(straight.sums.shape, g.dtype), 100 * len(self.row) * len(straight.columns)
-        parallel(straight_stacks.adjoint, self.row.shape[1], straight, self.border, g, adjoints, work=work // 5)
-        given = self.grid, straight, adjoints, g_positions, g_rgba
-        parallel(straight_stacks.pull, self.row.shape[1], *given, work=work)
+        given = self.grid, stacks.straight, self.border, g, g_positions, g_rgba
+        parallel(straight_stacks.pull, self.row.shape[1], *given, work=3 * self._layers_work)
         height, adjoints = self.row.shape[1], np.empty(stacks.sums.shape, g.dtype)
         given, work = (self.choices.offsets, self.choices.columns, stacks), len(self.row) * self._mixed_work
         parallel(layered.adjoint, height, *given, self.border, g, adjoints, work=work // 5)
@@ -420,13 +414,11 @@ class Cells:
         )
         parallel(stencil.push, out.shape[1], self.plain_grid, *tangents, self.choices.states, self.border, out)
         if self.choices.stacks is not None:
-            stacks, straight = self.choices.stacks
+            stacks = self.choices.stacks
             given = self.grid, self.choices.offsets, self.choices.columns, stacks, tangents, self.border
-            work = len(self.row) * self._mixed_work * len(out)
-            parallel(layered.push, out.shape[1], *given, out, work=work)
-            given = self.grid, straight, tangents, self.border
-            work = 100 * len(self.row) * len(straight.columns) * len(out)
-            parallel(straight_stacks.push, out.shape[1], *given, out, work=work)
+            parallel(layered.push, out.shape[1], *given, out, work=len(self.row) * self._mixed_work * len(out))
+            given = self.grid, *tangents, stacks.straight, self.border
+            parallel(straight_stacks.push, out.shape[1], *given, out, work=3 * self._layers_work * len(out))
         elif len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed_targets.push, out.shape[1], *given, out, work=self._mixed_work * len(out))

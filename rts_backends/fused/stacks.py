@@ -26,6 +26,7 @@ class Stacks(NamedTuple):
         least: (M, K), the least weight that fills a buffer.
         sums: (M, K, 3, 5), of each buffer the colours over the weight, taken as at least `least`, and the weight.
         images: (M, K + 1, 4), the image from each level on.
+        straight: (H, W) uint8, 1 at further targets, which need no plan (`straight_stacks.py`).
     """
 
     levels: np.ndarray
@@ -34,10 +35,11 @@ class Stacks(NamedTuple):
     least: np.ndarray
     sums: np.ndarray
     images: np.ndarray
+    straight: np.ndarray
 
     @classmethod
-    def of(cls, count: int, layers: int, kind: np.dtype) -> Stacks:
-        """Room for `count` targets."""
+    def of(cls, count: int, layers: int, kind: np.dtype, straight: np.ndarray) -> Stacks:
+        """Room for `count` targets with plans."""
         return cls(
             np.zeros(count, np.int32),
             np.empty((count, layers, 9, 3), np.int16),
@@ -45,6 +47,7 @@ class Stacks(NamedTuple):
             np.empty((count, layers), kind),
             np.empty((count, layers, 3, 5), kind),
             np.empty((count, layers + 1, 4), kind),
+            straight,
         )
 
 
