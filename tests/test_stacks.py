@@ -61,6 +61,32 @@ def sorted_over(colors):
     return image
 
 
+# ---------------------------------------------------------------------------------------- nothing dropped in silence
+
+
+@pytest.mark.parametrize("name", ["single", "multi"])
+@pytest.mark.parametrize("target", ALL)
+def test_splatters_for_opaque_layers_warn_of_translucent_ones(name, target):
+    parts = [card(0.5, (1, 0, 0), 0.25), card(-0.5, (0, 0, 1), 1)]
+    parts = [part.replace(theta=arrays(target, part.theta)) for part in parts]
+    with pytest.warns(rts.errors.LayersWarning, match=r"alpha of 0\.25.*use splatter='visible'"):
+        rts.render(parts, CAMERA, (8, 8), splatter=name)
+
+
+@pytest.mark.parametrize("name", ["none", "visible"])
+def test_splatters_of_stacks_do_not_warn(name, recwarn):
+    rts.render([card(0.5, (1, 0, 0), 0.25), card(-0.5, (0, 0, 1), 1)], CAMERA, (8, 8), splatter=name)
+    assert not recwarn
+
+
+def test_a_function_that_gives_alpha_one_needs_no_promise(recwarn):
+    part = card(0.5, (1, 0, 0), 1).replace(
+        shader=lambda theta, gbuffer, camera: theta["colors"][:1].repeat(len(gbuffer["position"]), 0)
+    )
+    rts.render(part, CAMERA, (8, 8), splatter="multi")
+    assert not recwarn
+
+
 # ------------------------------------------------------------------------------------------------------ order
 
 

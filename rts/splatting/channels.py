@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from rts.arrays.array_functions import described, shape_of
-from rts.arrays.engines import namespace
+from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
-from rts.errors import InputError
+from rts.errors import InputError, LayersWarning, warn
+from rts.plugin_base import promised
 
 GROUP = 3
 """Number of channels, besides alpha, in one call of a splatter."""
+
+ALMOST = 1e-5
+"""Samples with an alpha above one less this share count as opaque."""
 
 
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
@@ -27,6 +31,8 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
         InputError: the splatter returned an image of another shape.
     """
     rgba = splats.rgba
+    if not (splats.opaque or promised(splatter, "translucent")):
+        _warn_of_translucent(splatter, rgba)
     count = shape_of(rgba)[1] - 1
     if count == GROUP:
         return _cropped(splatter, splats)
@@ -38,6 +44,17 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     left = count - GROUP * (len(images) - 1)
     alpha = images[0][..., GROUP:]
     return xp.concat([*(image[..., :GROUP] for image in images[:-1]), images[-1][..., :left], alpha], axis=-1)
+
+
+def _warn_of_translucent(splatter: Splatter, rgba: Array) -> None:
+    """Warn if samples are translucent, under a splatter that takes them to be opaque."""
+    alpha = value_of(rgba[:, -1])
+    if alpha is not None and len(alpha) and alpha.min() < 1 - ALMOST:
+        warn(
+            f"samples have an alpha of {alpha.min():.3g}, and {splatter!r} leaves out some of the light that passes "
+            f"through them; use splatter='visible'",
+            LayersWarning,
+        )
 
 
 def _cropped(splatter: Splatter, splats: Splats) -> Array:

@@ -64,6 +64,7 @@ class Visible(Kernel):
     CONTINUED: ClassVar[float] = CONTINUED
     RIMS: ClassVar[tuple[float, ...]] = RIMS
     CROSSINGS: ClassVar[tuple[float, ...]] = CROSSINGS
+    translucent = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     @functools.cached_property

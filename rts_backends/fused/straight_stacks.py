@@ -174,7 +174,11 @@ def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
     layers, _, width = grid.row.shape
     sources, loaded = np.empty(3 * layers * SOURCE, g.dtype), np.empty(3, np.int64)
     total, images = np.empty(layers * SUM, g.dtype), np.empty((layers + 1) * IMAGE, g.dtype)
-    adjoints, own, gathered = np.empty(3 * layers * SUM, g.dtype), np.empty(IMAGE, g.dtype), np.empty(8 * PITCH, g.dtype)
+    adjoints, own, gathered = (
+        np.empty(3 * layers * SUM, g.dtype),
+        np.empty(IMAGE, g.dtype),
+        np.empty(8 * PITCH, g.dtype),
+    )
     active, slope = np.empty(3, np.bool_), g.dtype.type(2) * grid.scale * grid.gamma
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
