@@ -26,7 +26,7 @@ class Stacks(NamedTuple):
         least: (M, K), the least weight that fills a buffer.
         sums: (M, K, 3, 5), of each buffer the colours over the weight, taken as at least `least`, and the weight.
         images: (M, K + 1, 4), the image from each level on.
-        straight: (H, W) uint8, 1 at further targets, which need no plan (`straight_stacks.py`).
+        straight: (H, W) uint8, the number of layers of further targets, which need no plan (`straight_stacks.py`).
     """
 
     levels: np.ndarray
@@ -49,6 +49,54 @@ class Stacks(NamedTuple):
             np.empty((count, layers + 1, 4), kind),
             straight,
         )
+
+
+class Sources(NamedTuple):
+    """The layers of the nine sources of a target; working memory.
+
+    Attributes:
+        weights: (9, K), 0 where there is no sample.
+        offsets: (9, K, 2), from samples to the target.
+        colors: (9, K, 4).
+        counts: (9,) int64, the number of layers.
+    """
+
+    weights: np.ndarray
+    offsets: np.ndarray
+    colors: np.ndarray
+    counts: np.ndarray
+
+
+@compiled
+def _sources(layers, kind):
+    return Sources(
+        np.empty((9, layers), kind),
+        np.empty((9, layers, 2), kind),
+        np.empty((9, layers, 4), kind),
+        np.empty(9, np.int64),
+    )
+
+
+@compiled
+def _load_source(sources, n, grid, y, x):
+    """Fill the layers of the n-th source of a target."""
+    rgba, row = grid.rgba, grid.row
+    weights, offsets, colors, zero = sources.weights, sources.offsets, sources.colors, rgba.dtype.type(0)
+    layers, height, width = row.shape
+    v, u = n // 3 - 1, n % 3 - 1
+    py, px = y - v, x - u
+    sources.counts[n] = 0
+    if not (0 <= py < height and 0 <= px < width):
+        return
+    for k in range(layers):
+        i = row[k, py, px]
+        if i < 0:
+            weights[n, k] = colors[n, k, 0] = colors[n, k, 1] = colors[n, k, 2] = colors[n, k, 3] = zero
+            continue
+        weights[n, k], offsets[n, k, 0], offsets[n, k, 1] = splat(grid, i, py, px, u, v)
+        for c in range(4):
+            colors[n, k, c] = rgba[i, c]
+        sources.counts[n] = k + 1
 
 
 # ---------------------------------------------------------------------------------------------------------- plans
@@ -79,12 +127,8 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
     row, kind = grid.row, grid.positions.dtype.type
     layers = len(row)
     depths, sides = np.empty((9, layers), grid.positions.dtype), np.zeros((9, layers), np.int64)
-    counts, first, joins, shift = (
-        np.empty(9, np.int64),
-        np.empty(9, np.int64),
-        np.empty(9, np.int64),
-        np.empty(9, np.int64),
-    )
+    sources = _sources(layers, grid.positions.dtype)
+    counts, first, joins, shift = sources.counts, np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9, np.int64)
     nominal = np.empty(9, grid.positions.dtype)
     for n in range(9):
         u, v = kind(n % 3 - 1), kind(n // 3 - 1)
@@ -94,7 +138,9 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
         nominal[n] /= whole
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
-            _load(depths, sides, counts, grid, facing, beyond, y, columns[d])
+            for n in range(9):
+                _load_source(sources, n, grid, y, columns[d])
+            _load_depths(depths, sides, grid, facing, beyond, y, columns[d])
             first[:], joins[:] = 0, 0
             stacks.levels[d] = layers
             for t in range(layers):
@@ -105,7 +151,7 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
                 _shift(shift, t, d, ranges, depths, sides, len(facing) > 0, counts, first, joins)
                 _plan(stacks, d, t, depths, counts, first, joins, shift)
                 stacks.least[d, t] = kind(1) if t == 0 else share
-                _sum(stacks, d, t, grid, counts, y, columns[d], t == layers - 1)
+                _sum(stacks, d, t, sources, t == layers - 1)
                 _advance(t, layers, counts, first, joins, shift)
             _composite(stacks, d, stacks.levels[d])
 
@@ -134,18 +180,15 @@ def _shift(shift, t, d, ranges, depths, sides, told, counts, first, joins):
 
 
 @compiled
-def _load(depths, sides, counts, grid, facing, beyond, y, x):
-    """Depths, sides and numbers of layers of the nine sources of a target."""
+def _load_depths(depths, sides, grid, facing, beyond, y, x):
+    """Depths and sides of the layers of the nine sources of a target."""
     row = grid.row
     layers, height, width = row.shape
     for n in range(9):
         py, px = y - (n // 3 - 1), x - (n % 3 - 1)
-        counts[n] = 0
         for k in range(layers):
             i = row[k, py, px] if 0 <= py < height and 0 <= px < width else -1
             depths[n, k] = grid.positions[i, 2] if i >= 0 else beyond
-            if i >= 0:
-                counts[n] += 1
             if len(facing) > 0:
                 sides[n, k] = facing[k, py, px] if i >= 0 else 0
 
@@ -225,33 +268,26 @@ def _last(plans, ends, d, t, n, b, whole):
 
 
 @compiled
-def _sum(stacks, d, t, grid, counts, y, x, whole):
+def _sum(stacks, d, t, sources, whole):
     """Fill the sums of a level; `whole` if layers behind it count at once."""
-    plans, ends, total = stacks.plans, stacks.ends, stacks.sums[d, t]
-    rgba, row = grid.rgba, grid.row
-    one = total.dtype.type(1)
-    total[:] = total.dtype.type(0)
-    for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        py, px = y - v, x - u
-        for b in range(3):
-            first = plans[d, t, n, b]
+    plans, ends, total = stacks.plans, stacks.ends, stacks.sums
+    weights, _, colors, counts = sources
+    zero, one = total.dtype.type(0), total.dtype.type(1)
+    for b in range(3):
+        red, green, blue, alpha, weight = zero, zero, zero, zero, zero
+        for n in range(9):
+            first, through = plans[d, t, n, b], one
             if first < 0:
                 continue
-            through = one
+            weight += weights[n, first]
             for k in range(first, min(_last(plans, ends, d, t, n, b, whole), counts[n])):
-                i = row[k, py, px]
-                w, _, _ = splat(grid, i, py, px, u, v)
-                if k == first:
-                    total[b, 4] += w
-                w *= through
-                for c in range(4):
-                    total[b, c] += w * rgba[i, c]
-                through *= one - rgba[i, 3]
-    for b in range(3):
-        over = one / max(total[b, 4], stacks.least[d, t])
-        for c in range(4):
-            total[b, c] *= over
+                w = through * weights[n, k]
+                red, green, blue = red + w * colors[n, k, 0], green + w * colors[n, k, 1], blue + w * colors[n, k, 2]
+                alpha += w * colors[n, k, 3]
+                through *= one - colors[n, k, 3]
+        over = one / max(weight, stacks.least[d, t])
+        total[d, t, b, 0], total[d, t, b, 1], total[d, t, b, 2] = over * red, over * green, over * blue
+        total[d, t, b, 3], total[d, t, b, 4] = over * alpha, weight
 
 
 @compiled
@@ -359,112 +395,133 @@ def _adjoint_level(a, d, t, sums, images, least, own, below):
 @loop
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
     """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
-    layers, height, _ = grid.row.shape
-    behind = np.empty((layers + 1, 4), grid.positions.dtype)
+    layers, height, width = grid.row.shape
+    sources, kind = _sources(layers, grid.positions.dtype), grid.positions.dtype
+    gradients, products = np.empty((layers, 5), kind), np.empty((layers, 2), kind)
+    slope = kind.type(2) * grid.scale * grid.gamma
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
-                _pull_target(d, columns[d], v, grid, y, stacks, adjoints, behind, g_positions, g_rgba)
+                for u in range(-1, 2):
+                    x, n = columns[d] - u, 3 * (v + 1) + u + 1
+                    if 0 <= x < width:
+                        _load_source(sources, n, grid, y + v, columns[d])
+                        _pull_source(gradients, products, d, n, sources, stacks, adjoints, layers)
+                        _scatter(g_positions, g_rgba, gradients, n, sources, grid.row, y, x, slope)
 
 
 @compiled
-def _pull_target(d, column, v, grid, y, stacks, adjoints, behind, g_positions, g_rgba):
-    """`pull` from one target, v rows farther on, to its sources in row y."""
-    for u in range(-1, 2):
-        x, n = column - u, 3 * (v + 1) + u + 1
-        for t in range(stacks.levels[d] if 0 <= x < grid.row.shape[2] else 0):
-            _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba)
+def _pull_source(gradients, products, d, n, sources, stacks, adjoints, layers):
+    """Fill the gradients (K, 5) of the colours and weights of a target's source.
+
+    `products` (K, 2) is working memory: the gradient's products with the colours of each layer, and of those behind.
+    """
+    weights, _, colors, counts = sources
+    gradients[:] = 0
+    zero, one = gradients.dtype.type(0), gradients.dtype.type(1)
+    for t in range(stacks.levels[d]):
+        for b in range(3):
+            first = stacks.plans[d, t, n, b]
+            if first < 0:
+                continue
+            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), counts[n])
+            red, green, blue, alpha = (
+                adjoints[d, t, b, 0],
+                adjoints[d, t, b, 1],
+                adjoints[d, t, b, 2],
+                adjoints[d, t, b, 3],
+            )
+            behind, through = zero, one
+            for k in range(last - 1, first - 1, -1):
+                own = red * colors[n, k, 0] + green * colors[n, k, 1] + blue * colors[n, k, 2] + alpha * colors[n, k, 3]
+                products[k, 0], products[k, 1] = own, behind
+                behind = weights[n, k] * own + (one - colors[n, k, 3]) * behind
+            gradients[first, 4] += adjoints[d, t, b, 4]
+            for k in range(first, last):
+                w = through * weights[n, k]
+                gradients[k, 0] += w * red
+                gradients[k, 1] += w * green
+                gradients[k, 2] += w * blue
+                gradients[k, 3] += w * alpha - through * products[k, 1]
+                gradients[k, 4] += through * products[k, 0]
+                through *= one - colors[n, k, 3]
 
 
 @compiled
-def _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba):
-    """`pull` from one level of a target to one of its sources."""
-    positions, rgba, row = grid.positions, grid.rgba, grid.row
-    layers, one, slope = len(row), positions.dtype.type(1), positions.dtype.type(2) * grid.scale * grid.gamma
-    for b in range(3):
-        first = stacks.plans[d, t, n, b]
-        if first < 0:
+def _scatter(g_positions, g_rgba, gradients, n, sources, row, y, x, slope):
+    """Add the gradients (K, 5) of a source's layers to those of their samples."""
+    weights, offsets, _, counts = sources
+    for k in range(counts[n]):
+        i = row[k, y, x]
+        if i < 0:
             continue
-        last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), layers)
-        while row[last - 1, y, x] < 0:
-            last -= 1
-        for c in range(4):
-            behind[last, c] = 0
-        for k in range(last - 1, first, -1):
-            i = row[k, y, x]
-            w, _, _ = splat(grid, i, y, x, u, v)
-            for c in range(4):
-                behind[k, c] = w * rgba[i, c] + (one - rgba[i, 3]) * behind[k + 1, c]
-        through = one
-        for k in range(first, last):
-            i = row[k, y, x]
-            w, dx, dy = splat(grid, i, y, x, u, v)
-            h, hidden = adjoints[d, t, b, 4] if k == first else 0 * one, 0 * one
-            for c in range(4):
-                h += through * adjoints[d, t, b, c] * rgba[i, c]
-                hidden += adjoints[d, t, b, c] * behind[k + 1, c]
-            if len(g_rgba) > 0:
-                for c in range(4):
-                    g_rgba[i, c] += w * through * adjoints[d, t, b, c]
-                g_rgba[i, 3] -= through * hidden
-            if len(g_positions) > 0:
-                g_positions[i, 0] += slope * w * h * dx
-                g_positions[i, 1] += slope * w * h * dy
-            through *= one - rgba[i, 3]
+        for c in range(4 if len(g_rgba) > 0 else 0):
+            g_rgba[i, c] += gradients[k, c]
+        if len(g_positions) > 0:
+            h = slope * weights[n, k] * gradients[k, 4]
+            g_positions[i, 0] += h * offsets[n, k, 0]
+            g_positions[i, 1] += h * offsets[n, k, 1]
 
 
 @loop
 def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
     """Fill targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
-    t_positions, t_rgba = tangents
-    change, grown = np.empty((3, 5), out.dtype), np.empty(4, out.dtype)
+    layers, kind = len(grid.row), out.dtype
+    sources, moves = _sources(layers, kind), np.empty((9, layers, 5), kind)
+    change, grown = np.empty((3, 5), kind), np.empty(4, kind)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d]
             if not 0 <= x - border < out.shape[2]:
                 continue
+            for n in range(9):
+                _load_source(sources, n, grid, y, x)
             for direction in range(len(out)):
+                _load_tangents(moves, sources, grid, y, x, tangents[0][direction], tangents[1][direction])
                 grown[:] = 0
                 for t in range(stacks.levels[d] - 1, -1, -1):
-                    _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba)
+                    _change(change, d, t, sources, moves, stacks, t == layers - 1)
                     _over(grown, change, stacks.sums, stacks.images, stacks.least, d, t)
                 for c in range(4):
                     out[direction, y - border, x - border, c] = grown[c]
 
 
 @compiled
-def _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba):
+def _load_tangents(moves, sources, grid, y, x, t_positions, t_rgba):
+    """Fill the tangents (9, K, 5) of the colours and weights of a target's sources."""
+    slope = moves.dtype.type(2) * grid.scale * grid.gamma
+    moves[:] = 0
+    for n in range(9):
+        for k in range(sources.counts[n]):
+            i = grid.row[k, y - n // 3 + 1, x - n % 3 + 1]
+            if i < 0:
+                continue
+            if len(t_positions) > 0:
+                along = sources.offsets[n, k, 0] * t_positions[i, 0] + sources.offsets[n, k, 1] * t_positions[i, 1]
+                moves[n, k, 4] = slope * sources.weights[n, k] * along
+            for c in range(4 if len(t_rgba) > 0 else 0):
+                moves[n, k, c] = t_rgba[i, c]
+
+
+@compiled
+def _change(change, d, t, sources, moves, stacks, whole):
     """Tangents (3, 5) of the sums of a level: of normalised colours, and of the weight."""
-    rgba, row, sums = grid.rgba, grid.row, stacks.sums
-    layers, zero, one = len(row), change.dtype.type(0), change.dtype.type(1)
-    slope, moved, tinted = change.dtype.type(2) * grid.scale * grid.gamma, t_positions.shape[1] > 0, t_rgba.shape[1] > 0
+    weights, _, colors, counts = sources
+    sums, zero, one = stacks.sums, change.dtype.type(0), change.dtype.type(1)
     change[:] = zero
     for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        py, px = y - v, x - u
         for b in range(3):
             first = stacks.plans[d, t, n, b]
             if first < 0:
                 continue
             through, d_through = one, zero
-            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), layers)
-            for k in range(first, last):
-                i = row[k, py, px]
-                if i < 0:
-                    break
-                w, dx, dy = splat(grid, i, py, px, u, v)
-                dw = zero
-                if moved:
-                    dw = slope * w * (dx * t_positions[direction, i, 0] + dy * t_positions[direction, i, 1])
-                if k == first:
-                    change[b, 4] += dw
+            change[b, 4] += moves[n, first, 4]
+            for k in range(first, min(_last(stacks.plans, stacks.ends, d, t, n, b, whole), counts[n])):
+                w, dw = through * weights[n, k], d_through * weights[n, k] + through * moves[n, k, 4]
                 for c in range(4):
-                    tint = through * w * t_rgba[direction, i, c] if tinted else zero
-                    change[b, c] += (d_through * w + through * dw) * rgba[i, c] + tint
-                d_through *= one - rgba[i, 3]
-                if tinted:
-                    d_through -= through * t_rgba[direction, i, 3]
-                through *= one - rgba[i, 3]
+                    change[b, c] += dw * colors[n, k, c] + w * moves[n, k, c]
+                d_through = d_through * (one - colors[n, k, 3]) - through * moves[n, k, 3]
+                through *= one - colors[n, k, 3]
     for b in range(3):
         over = one / max(sums[d, t, b, 4], stacks.least[d, t])
         more = change[b, 4] if sums[d, t, b, 4] >= stacks.least[d, t] else zero

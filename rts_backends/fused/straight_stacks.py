@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts_backends.fused.rows import ONE, PITCH, RX, RY, SOURCE, SUM, TILE, add_row, busy, compiled, loop, slot, tile
+from rts_backends.fused.rows import ONE, PITCH, RX, RY, SOURCE, SUM, TILE, add_row, compiled, loop, slot, tile
 from rts_backends.fused.stencil import TANGENT, add_tangent_row, gather, load_around, load_image, load_tangents
 
 IMAGE = 4 * PITCH
@@ -30,7 +30,7 @@ def find(start, stop, positions, row, ends, marks, straight, counts):
         row: (K, H, W), the sample of each cell, in order of depth.
         ends: (H, W) of `uniform_cells.survey`, 0 where no outline ends; or no rows.
         marks: (H, W) uint8, targets; straight ones are cleared.
-        straight: (H, W) uint8, to be filled.
+        straight: (H, W) uint8, to be filled with the number of layers of straight targets, 0 at others.
         counts: (H,), to be filled with the number of marks left.
     """
     layers, height, width = row.shape
@@ -56,6 +56,8 @@ def find(start, stop, positions, row, ends, marks, straight, counts):
         for x in range(width):
             marks[y - 1, x] ^= own[x]
             counts[y - 1] += marks[y - 1, x]
+        if 0 < y - 1 < height - 1:
+            _count(own, levels[0], levels[1], levels[2])
 
 
 @compiled
@@ -87,6 +89,16 @@ def _keep_even(own, above, level, below):
 
 
 @compiled
+def _count(own, above, level, below):
+    """Multiply marks by the number of layers, the largest of nine sources."""
+    for x in range(1, len(own) - 1):
+        most = 0
+        for u in range(-1, 2):
+            most = max(most, above[x + u], level[x + u], below[x + u])
+        own[x] *= np.uint8(most)
+
+
+@compiled
 def _keep_regular(own, depth, behind, source, source_behind):
     """Keep targets whose layer of one number is the one nearest to that layer of three sources in a row.
 
@@ -105,10 +117,21 @@ def _keep_regular(own, depth, behind, source, source_behind):
 
 
 @compiled
+def _depth(straight, y, first, count):
+    """The largest number of layers of `count` targets of row y, from `first` on; 0 if none is straight."""
+    height, width = straight.shape
+    most = np.uint8(0)
+    if 0 <= y < height:
+        for number in straight[y, max(first, 0) : min(first + count, width)]:
+            most = max(most, number)
+    return np.int64(most)
+
+
+@compiled
 def _sums(total, images, sources, layers, y, count):
     """Fill the sums of each layer in a row, colours over the weight and the weight, and the images from each on."""
     one = total.dtype.type(1)
-    images[layers * IMAGE :] = total.dtype.type(0)
+    images[layers * IMAGE : (layers + 1) * IMAGE] = total.dtype.type(0)
     for k in range(layers - 1, -1, -1):
         s, image, behind = total[k * SUM : (k + 1) * SUM], images[k * IMAGE :], images[(k + 1) * IMAGE :]
         s[:] = total.dtype.type(0)
@@ -143,9 +166,10 @@ def forward(start, stop, grid, straight, border, image):
         at = left + border
         loaded[:] = -9
         for y in range(start + border, stop + border):
-            if busy(straight, y, at, count, 1):
+            most = _depth(straight, y, at, count)
+            if most > 0:
                 load_around(sources, loaded, grid, y, at - 1, count + 2)
-                _sums(total, images, sources, layers, y, count)
+                _sums(total, images, sources, most, y, count)
                 _store(image[y - border], straight[y, at : at + count], left, images, count)
 
 
@@ -179,24 +203,21 @@ def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
         np.empty(IMAGE, g.dtype),
         np.empty(8 * PITCH, g.dtype),
     )
-    active, slope = np.empty(3, np.bool_), g.dtype.type(2) * grid.scale * grid.gamma
+    depths, slope = np.zeros(3, np.int64), g.dtype.type(2) * grid.scale * grid.gamma
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
         loaded[:] = -9
         for y in range(start - 1, stop + 1):
-            some = busy(straight, y, left - 1, count + 2, 1)
-            active[(y + 3) % 3] = some
-            if some:
+            most = _depth(straight, y, left - 1, count + 2)
+            depths[(y + 3) % 3] = most
+            if most > 0:
                 load_image(own, g, straight, 1, border, y, left - 1, count + 2)
                 load_around(sources, loaded, grid, y, left - 2, count + 4)
-                _sums(total, images, sources, layers, y, count + 2)
-                _adjoints(adjoints, total, images, own, layers, y, count + 2)
-            else:
-                for k in range(layers):
-                    slot(adjoints, k, y, SUM)[:] = g.dtype.type(0)
-            if y <= start or not active.any():
-                continue
-            for k in range(layers):
+                _sums(total, images, sources, most, y, count + 2)
+                _adjoints(adjoints, total, images, own, most, y, count + 2)
+            for k in range(most, layers):
+                slot(adjoints, k, y, SUM)[:] = g.dtype.type(0)
+            for k in range(depths.max() if y > start else 0):
                 s = slot(sources, k, y - 1, SOURCE)[2:]
                 above, level = slot(adjoints, k, y - 2, SUM), slot(adjoints, k, y - 1, SUM)
                 gather(gathered, s, above, level, slot(adjoints, k, y, SUM), count)
@@ -252,9 +273,10 @@ def push(start, stop, grid, t_positions, t_rgba, straight, border, out):
         at = left + border
         loaded[:] = -9
         for y in range(start + border, stop + border):
-            if busy(straight, y, at, count, 1):
+            most = _depth(straight, y, at, count)
+            if most > 0:
                 load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, y, at - 1, count + 2)
-                _sums(total, images, sources, layers, y, count)
+                _sums(total, images, sources, most, y, count)
                 for n in range(many):
-                    _change(grown, change, tangents[n], sources, total, images, layers, y, count)
+                    _change(grown, change, tangents[n], sources, total, images, most, y, count)
                     _store(out[n, y - border], straight[y, at : at + count], left, grown, count)
