@@ -51,52 +51,29 @@ class Stacks(NamedTuple):
         )
 
 
-class Sources(NamedTuple):
-    """The layers of the nine sources of a target; working memory.
-
-    Attributes:
-        weights: (9, K), 0 where there is no sample.
-        offsets: (9, K, 2), from samples to the target.
-        colors: (9, K, 4).
-        counts: (9,) int64, the number of layers.
-    """
-
-    weights: np.ndarray
-    offsets: np.ndarray
-    colors: np.ndarray
-    counts: np.ndarray
+WEIGHT, ALONG_X, ALONG_Y, DEPTH, SOURCE = 4, 5, 6, 7, 8
+"""A layer of a source: four numbers of its colour, its weight, the offset from sample to target, its depth; and their
+number."""
 
 
 @compiled
-def _sources(layers, kind):
-    return Sources(
-        np.empty((9, layers), kind),
-        np.empty((9, layers, 2), kind),
-        np.empty((9, layers, 4), kind),
-        np.empty(9, np.int64),
-    )
-
-
-@compiled
-def _load_source(sources, n, grid, y, x):
-    """Fill the layers of the n-th source of a target."""
-    rgba, row = grid.rgba, grid.row
-    weights, offsets, colors, zero = sources.weights, sources.offsets, sources.colors, rgba.dtype.type(0)
+def _load(sources, n, grid, y, x, u, v, beyond):
+    """Fill the layers (K, 8) of source n, from which (u, v) leads to a target; return their number."""
+    positions, rgba, row = grid.positions, grid.rgba, grid.row
     layers, height, width = row.shape
-    v, u = n // 3 - 1, n % 3 - 1
-    py, px = y - v, x - u
-    sources.counts[n] = 0
-    if not (0 <= py < height and 0 <= px < width):
-        return
+    py, px, count = y - v, x - u, 0
+    inside = 0 <= py < height and 0 <= px < width
     for k in range(layers):
-        i = row[k, py, px]
-        if i < 0:
-            weights[n, k] = colors[n, k, 0] = colors[n, k, 1] = colors[n, k, 2] = colors[n, k, 3] = zero
-            continue
-        weights[n, k], offsets[n, k, 0], offsets[n, k, 1] = splat(grid, i, py, px, u, v)
-        for c in range(4):
-            colors[n, k, c] = rgba[i, c]
-        sources.counts[n] = k + 1
+        i = row[k, py, px] if inside else -1
+        if i >= 0:
+            weight, along_x, along_y = splat(grid, i, py, px, u, v)
+            sources[n, k, 0], sources[n, k, 1], sources[n, k, 2] = rgba[i, 0], rgba[i, 1], rgba[i, 2]
+            sources[n, k, 3], sources[n, k, WEIGHT], sources[n, k, DEPTH] = rgba[i, 3], weight, positions[i, 2]
+            sources[n, k, ALONG_X], sources[n, k, ALONG_Y], count = along_x, along_y, k + 1
+        else:
+            sources[n, k, DEPTH] = beyond
+            sources[n, k, :DEPTH] = 0
+    return count
 
 
 # ---------------------------------------------------------------------------------------------------------- plans
@@ -126,9 +103,9 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
     """
     row, kind = grid.row, grid.positions.dtype.type
     layers = len(row)
-    depths, sides = np.empty((9, layers), grid.positions.dtype), np.zeros((9, layers), np.int64)
-    sources = _sources(layers, grid.positions.dtype)
-    counts, first, joins, shift = sources.counts, np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9, np.int64)
+    sources, counts = np.empty((9, layers, SOURCE), grid.positions.dtype), np.empty(9, np.int64)
+    sides = np.zeros((9, layers), np.int64)
+    first, joins, shift = np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9, np.int64)
     nominal = np.empty(9, grid.positions.dtype)
     for n in range(9):
         u, v = kind(n % 3 - 1), kind(n // 3 - 1)
@@ -139,8 +116,9 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
             for n in range(9):
-                _load_source(sources, n, grid, y, columns[d])
-            _load_depths(depths, sides, grid, facing, beyond, y, columns[d])
+                counts[n] = _load(sources, n, grid, y, columns[d], n % 3 - 1, n // 3 - 1, beyond)
+            if len(facing) > 0:
+                _load_sides(sides, facing, counts, y, columns[d])
             first[:], joins[:] = 0, 0
             stacks.levels[d] = layers
             for t in range(layers):
@@ -148,10 +126,10 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
                 if share < 0:
                     stacks.levels[d] = t
                     break
-                _shift(shift, t, d, ranges, depths, sides, len(facing) > 0, counts, first, joins)
-                _plan(stacks, d, t, depths, counts, first, joins, shift)
+                _shift(shift, t, d, ranges, sources, sides, len(facing) > 0, counts, first, joins)
+                _plan(stacks, d, t, sources, counts, first, joins, shift)
                 stacks.least[d, t] = kind(1) if t == 0 else share
-                _sum(stacks, d, t, sources, t == layers - 1)
+                _sum(stacks, d, t, sources, counts, t == layers - 1)
                 _advance(t, layers, counts, first, joins, shift)
             _composite(stacks, d, stacks.levels[d])
 
@@ -168,7 +146,7 @@ def _share(t, counts, first, joins, nominal):
 
 
 @compiled
-def _shift(shift, t, d, ranges, depths, sides, told, counts, first, joins):
+def _shift(shift, t, d, ranges, sources, sides, told, counts, first, joins):
     """Fill the numbers s of sources that take part in level t."""
     for n in range(9):
         if joins[n] > t or first[n] >= counts[n]:
@@ -176,52 +154,46 @@ def _shift(shift, t, d, ranges, depths, sides, told, counts, first, joins):
         if t == 0 and ranges[d, n, 1, 1] > ranges[d, n, 1, 0]:
             shift[n] = ranges[d, n, 1, 0]
         else:
-            shift[n] = _pair(depths, sides, told, counts, n, t, first[n], t == 0)
+            shift[n] = _pair(sources, sides, told, counts, n, t, first[n], t == 0)
 
 
 @compiled
-def _load_depths(depths, sides, grid, facing, beyond, y, x):
-    """Depths and sides of the layers of the nine sources of a target."""
-    row = grid.row
-    layers, height, width = row.shape
+def _load_sides(sides, facing, counts, y, x):
+    """Fill the sides (9, K) that the layers of the nine sources of a target show."""
     for n in range(9):
-        py, px = y - (n // 3 - 1), x - (n % 3 - 1)
-        for k in range(layers):
-            i = row[k, py, px] if 0 <= py < height and 0 <= px < width else -1
-            depths[n, k] = grid.positions[i, 2] if i >= 0 else beyond
-            if len(facing) > 0:
-                sides[n, k] = facing[k, py, px] if i >= 0 else 0
+        for k in range(counts[n]):
+            sides[n, k] = facing[k, y - n // 3 + 1, x - n % 3 + 1]
 
 
 @compiled
-def _pair(depths, sides, told, counts, n, t, first, behind_only):
+def _pair(sources, sides, told, counts, n, t, first, behind_only):
     """The number s of a source at level t; only below 0 if `behind_only`, since it is known not to be at the level."""
-    layers = depths.shape[1]
+    layers = sources.shape[1]
     if t >= counts[4]:
         return 0
-    own, z = depths[4, t], depths[n, first]
+    own, z = sources[4, t, DEPTH], sources[n, first, DEPTH]
     a, best_a = 0, abs(z - own)
     for k in range(first + 1, layers):
-        distance = abs(depths[n, k] - own)
-        if distance < best_a and not (told and opposite_sides(sides[n, k], sides[4, t], own > depths[n, k])):
+        distance, behind = abs(sources[n, k, DEPTH] - own), own > sources[n, k, DEPTH]
+        if distance < best_a and not (told and opposite_sides(sides[n, k], sides[4, t], behind)):
             a, best_a = k - first, distance
     b, best_b = 0, abs(own - z)
     for k in range(t + 1, layers):
-        distance = abs(depths[4, k] - z)
-        if distance < best_b and not (told and opposite_sides(sides[4, k], sides[n, first], z > depths[4, k])):
+        distance, behind = abs(sources[4, k, DEPTH] - z), z > sources[4, k, DEPTH]
+        if distance < best_b and not (told and opposite_sides(sides[4, k], sides[n, first], behind)):
             b, best_b = k - t, distance
     return -b if behind_only or best_b < best_a else a
 
 
 @compiled
-def _plan(stacks, d, t, depths, counts, first, joins, shift):
+def _plan(stacks, d, t, sources, counts, first, joins, shift):
     """Fill the plan of a level."""
-    plans, ends, layers = stacks.plans, stacks.ends, depths.shape[1]
+    plans, ends, layers = stacks.plans, stacks.ends, sources.shape[1]
     least = layers
     for n in range(9):
         if joins[n] <= t and first[n] < counts[n] and shift[n] < 0:
             least = min(least, -shift[n])
-    revealed = depths[4, t + least] if least < layers else depths[4, t]
+    revealed = sources[4, t + least if least < layers else t, DEPTH]
     for n in range(9):
         plans[d, t, n, 0] = plans[d, t, n, 1] = plans[d, t, n, 2] = -1
         ends[d, t, n] = 0
@@ -239,7 +211,7 @@ def _plan(stacks, d, t, depths, counts, first, joins, shift):
             continue
         best = np.inf
         for k in range(at + 1, counts[n]):
-            distance = abs(depths[n, k] - revealed)
+            distance = abs(sources[n, k, DEPTH] - revealed)
             if distance < best:
                 plans[d, t, n, 2], best = k, distance
 
@@ -268,23 +240,21 @@ def _last(plans, ends, d, t, n, b, whole):
 
 
 @compiled
-def _sum(stacks, d, t, sources, whole):
+def _sum(stacks, d, t, sources, counts, whole):
     """Fill the sums of a level; `whole` if layers behind it count at once."""
     plans, ends, total = stacks.plans, stacks.ends, stacks.sums
-    weights, _, colors, counts = sources
     zero, one = total.dtype.type(0), total.dtype.type(1)
     for b in range(3):
         red, green, blue, alpha, weight = zero, zero, zero, zero, zero
         for n in range(9):
             first, through = plans[d, t, n, b], one
-            if first < 0:
-                continue
-            weight += weights[n, first]
-            for k in range(first, min(_last(plans, ends, d, t, n, b, whole), counts[n])):
-                w = through * weights[n, k]
-                red, green, blue = red + w * colors[n, k, 0], green + w * colors[n, k, 1], blue + w * colors[n, k, 2]
-                alpha += w * colors[n, k, 3]
-                through *= one - colors[n, k, 3]
+            last = min(_last(plans, ends, d, t, n, b, whole), counts[n]) if first >= 0 else 0
+            for k in range(max(first, 0), last):
+                w = through * sources[n, k, WEIGHT]
+                weight += w if k == first else zero
+                red, green, blue = red + w * sources[n, k, 0], green + w * sources[n, k, 1], blue + w * sources[n, k, 2]
+                alpha += w * sources[n, k, 3]
+                through *= one - sources[n, k, 3]
         over = one / max(weight, stacks.least[d, t])
         total[d, t, b, 0], total[d, t, b, 1], total[d, t, b, 2] = over * red, over * green, over * blue
         total[d, t, b, 3], total[d, t, b, 4] = over * alpha, weight
@@ -396,78 +366,70 @@ def _adjoint_level(a, d, t, sums, images, least, own, below):
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
     """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
     layers, height, width = grid.row.shape
-    sources, kind = _sources(layers, grid.positions.dtype), grid.positions.dtype
-    gradients, products = np.empty((layers, 5), kind), np.empty((layers, 2), kind)
+    kind = grid.positions.dtype
+    source, products, gradients = (
+        np.empty((1, layers, SOURCE), kind),
+        np.empty((layers, 2), kind),
+        np.empty((layers, 5), kind),
+    )
     slope = kind.type(2) * grid.scale * grid.gamma
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
                 for u in range(-1, 2):
-                    x, n = columns[d] - u, 3 * (v + 1) + u + 1
-                    if 0 <= x < width:
-                        _load_source(sources, n, grid, y + v, columns[d])
-                        _pull_source(gradients, products, d, n, sources, stacks, adjoints, layers)
-                        _scatter(g_positions, g_rgba, gradients, n, sources, grid.row, y, x, slope)
+                    count = _load(source, 0, grid, y + v, columns[d], u, v, kind.type(0))
+                    gradients[:] = 0
+                    for t in range(stacks.levels[d] if count > 0 else 0):
+                        n, whole = 3 * (v + 1) + u + 1, t == layers - 1
+                        for b in range(3):
+                            first = stacks.plans[d, t, n, b]
+                            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, whole), count) if first >= 0 else 0
+                            _pull_chain(gradients, products, source, max(first, 0), last, adjoints, d, t, b)
+                    _scatter(g_positions, g_rgba, gradients, source, count, grid.row, y, columns[d] - u, slope)
 
 
 @compiled
-def _pull_source(gradients, products, d, n, sources, stacks, adjoints, layers):
-    """Fill the gradients (K, 5) of the colours and weights of a target's source.
+def _pull_chain(gradients, products, source, first, last, adjoints, d, t, b):
+    """Add the gradients (K, 5) of the colours and weights of layers first ≤ k < last of a source (1, K, 8).
 
     `products` (K, 2) is working memory: the gradient's products with the colours of each layer, and of those behind.
     """
-    weights, _, colors, counts = sources
-    gradients[:] = 0
-    zero, one = gradients.dtype.type(0), gradients.dtype.type(1)
-    for t in range(stacks.levels[d]):
-        for b in range(3):
-            first = stacks.plans[d, t, n, b]
-            if first < 0:
-                continue
-            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), counts[n])
-            red, green, blue, alpha = (
-                adjoints[d, t, b, 0],
-                adjoints[d, t, b, 1],
-                adjoints[d, t, b, 2],
-                adjoints[d, t, b, 3],
-            )
-            behind, through = zero, one
-            for k in range(last - 1, first - 1, -1):
-                own = red * colors[n, k, 0] + green * colors[n, k, 1] + blue * colors[n, k, 2] + alpha * colors[n, k, 3]
-                products[k, 0], products[k, 1] = own, behind
-                behind = weights[n, k] * own + (one - colors[n, k, 3]) * behind
-            gradients[first, 4] += adjoints[d, t, b, 4]
-            for k in range(first, last):
-                w = through * weights[n, k]
-                gradients[k, 0] += w * red
-                gradients[k, 1] += w * green
-                gradients[k, 2] += w * blue
-                gradients[k, 3] += w * alpha - through * products[k, 1]
-                gradients[k, 4] += through * products[k, 0]
-                through *= one - colors[n, k, 3]
+    red, green, blue, alpha = adjoints[d, t, b, 0], adjoints[d, t, b, 1], adjoints[d, t, b, 2], adjoints[d, t, b, 3]
+    behind, through = gradients.dtype.type(0), gradients.dtype.type(1)
+    for k in range(last - 1, first - 1, -1):
+        own = red * source[0, k, 0] + green * source[0, k, 1] + blue * source[0, k, 2] + alpha * source[0, k, 3]
+        products[k, 0], products[k, 1] = own, behind
+        behind = source[0, k, WEIGHT] * own + (gradients.dtype.type(1) - source[0, k, 3]) * behind
+    for k in range(first, last):
+        w = through * source[0, k, WEIGHT]
+        gradients[k, 0] += w * red
+        gradients[k, 1] += w * green
+        gradients[k, 2] += w * blue
+        gradients[k, 3] += w * alpha - through * products[k, 1]
+        gradients[k, 4] += through * products[k, 0] + (adjoints[d, t, b, 4] if k == first else 0)
+        through *= gradients.dtype.type(1) - source[0, k, 3]
 
 
 @compiled
-def _scatter(g_positions, g_rgba, gradients, n, sources, row, y, x, slope):
+def _scatter(g_positions, g_rgba, gradients, source, count, row, y, x, slope):
     """Add the gradients (K, 5) of a source's layers to those of their samples."""
-    weights, offsets, _, counts = sources
-    for k in range(counts[n]):
+    for k in range(count):
         i = row[k, y, x]
-        if i < 0:
-            continue
-        for c in range(4 if len(g_rgba) > 0 else 0):
-            g_rgba[i, c] += gradients[k, c]
-        if len(g_positions) > 0:
-            h = slope * weights[n, k] * gradients[k, 4]
-            g_positions[i, 0] += h * offsets[n, k, 0]
-            g_positions[i, 1] += h * offsets[n, k, 1]
+        if i >= 0:
+            for c in range(4 if len(g_rgba) > 0 else 0):
+                g_rgba[i, c] += gradients[k, c]
+            if len(g_positions) > 0:
+                h = slope * source[0, k, WEIGHT] * gradients[k, 4]
+                g_positions[i, 0] += h * source[0, k, ALONG_X]
+                g_positions[i, 1] += h * source[0, k, ALONG_Y]
 
 
 @loop
 def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
     """Fill targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
     layers, kind = len(grid.row), out.dtype
-    sources, moves = _sources(layers, kind), np.empty((9, layers, 5), kind)
+    sources, counts = np.empty((9, layers, SOURCE), kind), np.empty(9, np.int64)
+    moves = np.empty((9, layers, 5), kind)
     change, grown = np.empty((3, 5), kind), np.empty(4, kind)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
@@ -475,38 +437,37 @@ def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
             if not 0 <= x - border < out.shape[2]:
                 continue
             for n in range(9):
-                _load_source(sources, n, grid, y, x)
+                counts[n] = _load(sources, n, grid, y, x, n % 3 - 1, n // 3 - 1, kind.type(0))
             for direction in range(len(out)):
-                _load_tangents(moves, sources, grid, y, x, tangents[0][direction], tangents[1][direction])
+                _load_tangents(moves, sources, counts, grid, y, x, tangents[0][direction], tangents[1][direction])
                 grown[:] = 0
                 for t in range(stacks.levels[d] - 1, -1, -1):
-                    _change(change, d, t, sources, moves, stacks, t == layers - 1)
+                    _change(change, d, t, sources, counts, moves, stacks, t == layers - 1)
                     _over(grown, change, stacks.sums, stacks.images, stacks.least, d, t)
                 for c in range(4):
                     out[direction, y - border, x - border, c] = grown[c]
 
 
 @compiled
-def _load_tangents(moves, sources, grid, y, x, t_positions, t_rgba):
+def _load_tangents(moves, sources, counts, grid, y, x, t_positions, t_rgba):
     """Fill the tangents (9, K, 5) of the colours and weights of a target's sources."""
     slope = moves.dtype.type(2) * grid.scale * grid.gamma
     moves[:] = 0
     for n in range(9):
-        for k in range(sources.counts[n]):
+        for k in range(counts[n]):
             i = grid.row[k, y - n // 3 + 1, x - n % 3 + 1]
             if i < 0:
                 continue
             if len(t_positions) > 0:
-                along = sources.offsets[n, k, 0] * t_positions[i, 0] + sources.offsets[n, k, 1] * t_positions[i, 1]
-                moves[n, k, 4] = slope * sources.weights[n, k] * along
+                along = sources[n, k, ALONG_X] * t_positions[i, 0] + sources[n, k, ALONG_Y] * t_positions[i, 1]
+                moves[n, k, 4] = slope * sources[n, k, WEIGHT] * along
             for c in range(4 if len(t_rgba) > 0 else 0):
                 moves[n, k, c] = t_rgba[i, c]
 
 
 @compiled
-def _change(change, d, t, sources, moves, stacks, whole):
+def _change(change, d, t, sources, counts, moves, stacks, whole):
     """Tangents (3, 5) of the sums of a level: of normalised colours, and of the weight."""
-    weights, _, colors, counts = sources
     sums, zero, one = stacks.sums, change.dtype.type(0), change.dtype.type(1)
     change[:] = zero
     for n in range(9):
@@ -517,11 +478,12 @@ def _change(change, d, t, sources, moves, stacks, whole):
             through, d_through = one, zero
             change[b, 4] += moves[n, first, 4]
             for k in range(first, min(_last(stacks.plans, stacks.ends, d, t, n, b, whole), counts[n])):
-                w, dw = through * weights[n, k], d_through * weights[n, k] + through * moves[n, k, 4]
+                weight = sources[n, k, WEIGHT]
+                w, dw = through * weight, d_through * weight + through * moves[n, k, 4]
                 for c in range(4):
-                    change[b, c] += dw * colors[n, k, c] + w * moves[n, k, c]
-                d_through = d_through * (one - colors[n, k, 3]) - through * moves[n, k, 3]
-                through *= one - colors[n, k, 3]
+                    change[b, c] += dw * sources[n, k, c] + w * moves[n, k, c]
+                d_through = d_through * (one - sources[n, k, 3]) - through * moves[n, k, 3]
+                through *= one - sources[n, k, 3]
     for b in range(3):
         over = one / max(sums[d, t, b, 4], stacks.least[d, t])
         more = change[b, 4] if sums[d, t, b, 4] >= stacks.least[d, t] else zero
