@@ -144,7 +144,7 @@ class Cells:
         self.visible, self.border, self.one_part = settings.kind == "visible", settings.border, settings.one_part
         self.rims = self.visible and settings.rims
         self.translucent = self.visible and not settings.opaque
-        self.crosses = self.visible and settings.crossings and settings.opaque
+        self.crosses = self.visible and settings.crossings
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
@@ -236,7 +236,10 @@ class Cells:
             marks = layered.reached(self.row[0] >= 0)
             marks = marks & self._wanted if self._wanted is not None else marks
             marks = marks & ~amid if len(amid) else marks
-            straight, given = np.empty_like(marks), (self.positions, self.row, ends, marks)
+            # Beside lines of crossing plans tell the derivative in colours from that in positions.
+            bits, _ = self._pairs_within(extent)
+            crossed = layered.reached(bits > 0) if len(bits) else bits
+            straight, given = np.empty_like(marks), (self.positions, self.row, ends, crossed, marks)
             parallel(straight_stacks.find, height, *given, straight, marked, work=20 * self.row.size)
             states[straight > 0] = EMPTY
         if len(amid) and not self.visible:
@@ -297,9 +300,13 @@ class Cells:
 
         No rows without pairs.
         """
+        return self._pairs_within(self.choices.extent)
+
+    def _pairs_within(self, extent: float) -> tuple[np.ndarray, np.ndarray]:
+        """`_pairs` for the extent of `Choices`."""
         if not self.crosses:
             return crossing_pairs.nothing(self.row.shape[2])
-        return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(self.choices.extent))
+        return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(extent))
 
     @cached_property
     def crossings(self) -> Crossings:
@@ -307,7 +314,22 @@ class Cells:
         bits, some = self._pairs
         if not len(bits):
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
-        return crossings.listed(self.grid, self.choices, self.positions.dtype.type(self.choices.extent), bits, some)
+        extent = self.positions.dtype.type(self.choices.extent)
+        return crossings.listed(self._seen_grid, self.choices, extent, bits, some)
+
+    @cached_property
+    def _seen_grid(self) -> Grid:
+        """`grid` with fronts of the colour that is seen along their rays, through translucent layers."""
+        if not self.translucent:
+            return self.grid
+        seen = np.zeros((*self.row.shape[1:], 4), self.rgba.dtype)
+        for cells in self.row[::-1]:
+            here = cells >= 0
+            own = self.rgba[cells[here]]
+            seen[here] = own + (1 - own[:, 3:]) * seen[here]
+        colors, fronts = self.rgba.copy(), self.row[0] >= 0
+        colors[self.row[0][fronts]] = seen[fronts]
+        return self.grid._replace(rgba=read_only(colors))
 
     @property
     def _crossed(self) -> bool:
@@ -372,7 +394,7 @@ class Cells:
         parallel(stencil.pull, height, *plain, g, *gradients, work=self._plain_work)
         self._pull_mixed(g, *gradients)
         if self._crossed:
-            crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *gradients)
+            crossings.pull(self._seen_grid.rgba, self.row, self.crossings, self.border, g, *gradients)
         if self.rims and g_positions is not None:
             outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
@@ -402,6 +424,10 @@ class Cells:
         height, adjoints = self.row.shape[1], np.empty(stacks.sums.shape, g.dtype)
         given, work = (self.choices.offsets, self.choices.columns, stacks), len(self.row) * self._mixed_work
         parallel(layered.adjoint, height, *given, self.border, g, adjoints, work=work // 5)
+        if self._crossed:
+            # As in `_pull_mixed`.
+            parallel(layered.pull, height, self.grid, *given, adjoints, g_positions[:0], g_rgba, work=work)
+            adjoints[self.crossings.among_mixed()], g_rgba = 0, g_rgba[:0]
         parallel(layered.pull, height, self.grid, *given, adjoints, g_positions, g_rgba, work=work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
@@ -425,11 +451,27 @@ class Cells:
         if self.rims and t_positions is not None:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
-        if count := len(self.crossings.columns):
-            given = self.grid, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
-            parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
+        if self._crossed:
+            self._push_lines(tangents, out)
         if len(self._settled):
             self._paint(tangents[1], out)
+
+    def _push_lines(self, tangents: tuple[np.ndarray, ...], out: np.ndarray) -> None:
+        """Write the tangents of targets beside lines of crossing."""
+        t_positions, t_rgba = tangents
+        tints, choices, height = None, self.choices, out.shape[1]
+        if choices.stacks is not None:
+            # Those of colours are the stacks'; what is left moves with the lines.
+            tints, still = np.zeros_like(out), (t_positions[:, :0], t_rgba)
+            given = self.grid, choices.offsets, choices.columns, choices.stacks, still, self.border
+            parallel(layered.push, height, *given, tints, work=len(self.row) * self._mixed_work * len(out))
+            t_rgba = t_rgba[:, :0]
+        given = self._seen_grid, choices.ranges, choices.sums, self.crossings, t_positions, t_rgba, self.border
+        parallel(crossings.push, height, *given, out, work=80 * len(self.crossings.columns) * len(out))
+        if tints is not None:
+            rows, columns = (cells - self.border for cells in self.crossings.cells())
+            inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < out.shape[2])
+            out[:, rows[inside], columns[inside]] += tints[:, rows[inside], columns[inside]]
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
@@ -443,6 +485,7 @@ class Cells:
         copy.row, copy.exits = read_only(own), read_only(exits)
         copy.__dict__.pop("outlines", None)  # They refer to samples by number.
         copy.__dict__.pop("crossings", None)
+        copy.__dict__.pop("_seen_grid", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         gradients = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy._pull(g, *gradients)

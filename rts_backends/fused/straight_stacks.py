@@ -17,11 +17,11 @@ IMAGE = 4 * PITCH
 
 
 @loop
-def find(start, stop, positions, row, ends, marks, straight, counts):
+def find(start, stop, positions, row, ends, crossed, marks, straight, counts):
     """Move the marks of straight targets of rows [start, stop) to another mask.
 
     A target is straight if its sources have c or c − 1 layers, and if no layer of a source is nearer to the target's
-    layers before or behind the one of its number. No outline may end at the target.
+    layers before or behind the one of its number. No outline or line of crossing may be beside it.
 
     Args:
         start: first row.
@@ -29,6 +29,7 @@ def find(start, stop, positions, row, ends, marks, straight, counts):
         positions: (N, 3) of samples.
         row: (K, H, W), the sample of each cell, in order of depth.
         ends: (H, W) of `uniform_cells.survey`, 0 where no outline ends; or no rows.
+        crossed: (H, W) uint8, 1 beside lines of crossing; or no rows.
         marks: (H, W) uint8, targets; straight ones are cleared.
         straight: (H, W) uint8, to be filled with the number of layers of straight targets, 0 at others.
         counts: (H,), to be filled with the number of marks left.
@@ -45,7 +46,9 @@ def find(start, stop, positions, row, ends, marks, straight, counts):
         if 0 < y - 1 < height - 1:
             own[1 : width - 1] = marks[y - 1, 1 : width - 1]
             if len(ends) > 0:
-                _keep_unended(own, ends[y - 1])
+                _keep_zeros(own, ends[y - 1])
+            if len(crossed) > 0:
+                _keep_zeros(own, crossed[y - 1])
             _keep_even(own, levels[0], levels[1], levels[2])
             most = levels[at].max()
             for v in range(3):
@@ -72,9 +75,9 @@ def _load(depths, levels, positions, row, y):
 
 
 @compiled
-def _keep_unended(own, ends):
+def _keep_zeros(own, marks):
     for x in range(len(own)):
-        own[x] &= np.uint8(ends[x] == 0)
+        own[x] &= np.uint8(marks[x] == 0)
 
 
 @compiled
