@@ -365,27 +365,31 @@ def _adjoint_level(a, d, t, sums, images, least, own, below):
 @loop
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
     """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
-    layers, height, width = grid.row.shape
+    layers, height, _ = grid.row.shape
     kind = grid.positions.dtype
-    source, products, gradients = (
-        np.empty((1, layers, SOURCE), kind),
-        np.empty((layers, 2), kind),
-        np.empty((layers, 5), kind),
-    )
+    source, products = np.empty((1, layers, SOURCE), kind), np.empty((layers, 2), kind)
+    gradients = np.empty((layers, 5), kind)
     slope = kind.type(2) * grid.scale * grid.gamma
+    levels, plans, ends = stacks.levels, stacks.plans, stacks.ends
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
                 for u in range(-1, 2):
-                    count = _load(source, 0, grid, y + v, columns[d], u, v, kind.type(0))
+                    n, count = 3 * (v + 1) + u + 1, _load(source, 0, grid, y + v, columns[d], u, v, kind.type(0))
                     gradients[:] = 0
-                    for t in range(stacks.levels[d] if count > 0 else 0):
-                        n, whole = 3 * (v + 1) + u + 1, t == layers - 1
-                        for b in range(3):
-                            first = stacks.plans[d, t, n, b]
-                            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, whole), count) if first >= 0 else 0
-                            _pull_chain(gradients, products, source, max(first, 0), last, adjoints, d, t, b)
+                    _pull_source(gradients, products, source, count, levels[d], plans, ends, adjoints, d, n)
                     _scatter(g_positions, g_rgba, gradients, source, count, grid.row, y, columns[d] - u, slope)
+
+
+@compiled
+def _pull_source(gradients, products, source, count, levels, plans, ends, adjoints, d, n):
+    """Add the gradients (K, 5) of the colours and weights of the n-th source (1, K, 8) of a target."""
+    for t in range(levels if count > 0 else 0):
+        for b in range(3):
+            first, last = max(plans[d, t, n, b], 0), 0
+            if plans[d, t, n, b] >= 0:
+                last = min(_last(plans, ends, d, t, n, b, t == len(gradients) - 1), count)
+            _pull_chain(gradients, products, source, first, last, adjoints, d, t, b)
 
 
 @compiled
