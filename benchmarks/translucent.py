@@ -248,25 +248,50 @@ def fitted(scene: Callable, cameras: list[rts.Camera], goal: Any, start: Any, sp
     return found.parameters.numpy()
 
 
-def fit_rows(steps: int) -> Iterator[list[str]]:
-    for splatter in ("visible", "multi", "none"):
-        goal, start = torch.tensor(CURTAIN_GOAL), torch.tensor(CURTAIN_START)
-        off = fitted(curtain, [CAMERA], goal, start, splatter, steps) - goal.numpy()
-        place, alpha = np.linalg.norm(off[:2]) / 0.05, abs(off[2])
-        yield ["a curtain, one view", splatter, f"place {place:.2f} pixels, alpha {alpha:.3f} off"]
+class Task(NamedTuple):
+    """Numbers of a scene to be found.
+
+    Attributes:
+        scene: from the numbers to parts.
+        cameras: one for each picture.
+        goal: the numbers that the pictures are of.
+        start: the numbers at first.
+    """
+
+    scene: Callable[[Any], list[rts.Part]]
+    cameras: list[rts.Camera]
+    goal: torch.Tensor
+    start: torch.Tensor
+
+    def found(self, splatter: str, steps: int) -> torch.Tensor:
+        return torch.tensor(fitted(self.scene, self.cameras, self.goal, self.start, splatter, steps))
+
+
+def tasks() -> dict[str, Task]:
     cameras = [rts.Camera.look_at(eye, (0, 0, 0), (0, 1, 0), fov_y=30) for eye in LEAF_VIEWS]
-    for splatter in ("visible", "multi", "none"):
-        rng = np.random.default_rng(5)
-        goal = torch.tensor(rng.uniform(-0.5, 0.5, (LEAF_COUNT, 3)).astype(np.float32))
-        start = goal + torch.tensor(rng.uniform(-0.1, 0.1, goal.shape).astype(np.float32))
-        off = np.linalg.norm(fitted(leaves, cameras, goal, start, splatter, steps) - goal.numpy(), axis=1)
-        pixel = 2.2 / 64
-        yield [
-            f"{LEAF_COUNT} leaves, 6 views",
-            splatter,
-            f"median {np.median(off) / pixel:.2f}, worst {off.max() / pixel:.2f} pixels off "
-            f"(at first {np.median(np.linalg.norm((start - goal).numpy(), axis=1)) / pixel:.1f})",
-        ]
+    rng = np.random.default_rng(5)
+    goal = torch.tensor(rng.uniform(-0.5, 0.5, (LEAF_COUNT, 3)).astype(np.float32))
+    start = goal + torch.tensor(rng.uniform(-0.1, 0.1, goal.shape).astype(np.float32))
+    return {
+        "a curtain, one view": Task(curtain, [CAMERA], torch.tensor(CURTAIN_GOAL), torch.tensor(CURTAIN_START)),
+        f"{LEAF_COUNT} leaves, 6 views": Task(leaves, cameras, goal, start),
+    }
+
+
+def off(task: Task, numbers: torch.Tensor) -> str:
+    """How far off the numbers of a task are, in pixels of its pictures."""
+    error = (numbers - task.goal).numpy()
+    if error.ndim == 1:
+        return f"place {np.linalg.norm(error[:2]) / 0.05:.2f} pixels, alpha {abs(error[2]):.3f} off"
+    places = np.linalg.norm(error, axis=1) / (2.2 / 64)
+    return f"places {np.median(places):.2f} pixels off, {places.max():.2f} at worst"
+
+
+def fit_rows(steps: int) -> Iterator[list[str]]:
+    for name, task in tasks().items():
+        yield [name, "at first", off(task, task.start)]
+        for splatter in ("visible", "multi", "none"):
+            yield [name, splatter, off(task, task.found(splatter, steps))]
 
 
 # ----------------------------------------------------------------------------------------------------- pictures
@@ -293,6 +318,23 @@ def pictures(folder: Path) -> None:
     figure.savefig(folder / "translucent.png", dpi=100)
 
 
+def fit_pictures(folder: Path, steps: int) -> None:
+    """`translucent_fits.png`: the goal of each fit, its start, and scenes found with two splatters."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.6 * 4, 2.6 * 2 + 0.3), layout="constrained")
+    for n, (axes, (name, task)) in enumerate(zip(figure.subplots(2, 4), tasks().items(), strict=True)):
+        shown = {"picture": task.goal, "start": task.start}
+        shown |= {f"'{splatter}'": task.found(splatter, steps) for splatter in ("visible", "none")}
+        options: dict[str, Any] = {"layers": LAYERS, "supersample": 2, "background": np.float32([1, 1, 1])}
+        for axis, (title, numbers) in zip(axes, shown.items(), strict=True):
+            picture = rts.render(task.scene(numbers), task.cameras[0], SIZE, **options)[..., :3]
+            axis.imshow(picture.numpy().clip(0, 1))
+            axis.set(xticks=[], yticks=[], title="" if n else title)
+        axes[0].set_ylabel(name)
+    figure.savefig(folder / "translucent_fits.png", dpi=100)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=["derivatives", "time", "fits", "pictures"])
@@ -316,6 +358,7 @@ def main() -> None:
             (args.output / f"{name}.md").write_text(table(header, lines))
     if not args.only or "pictures" in args.only:
         pictures(args.output)
+        fit_pictures(args.output, args.steps)
 
 
 if __name__ == "__main__":
