@@ -31,7 +31,7 @@ class RtsWarning(UserWarning):
 
 
 class LayersWarning(RtsWarning):
-    """`layers="auto"` reached its limit."""
+    """Layers that contribute to an image are missing from it."""
 
 
 class SamplerWarning(RtsWarning):

@@ -21,6 +21,7 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
     "takes_views": ("__call__",),
     "reads": ("__call__", "base_color"),
     "fills_interiors": ("image", "accumulate"),
+    "translucent": ("image", "accumulate"),
 }
 """Promise → the methods that it is about, in classes that have them."""
 

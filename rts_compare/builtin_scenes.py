@@ -155,6 +155,11 @@ def stack_of_cards() -> Scene:
     return _scene("stack of cards", parts, moves=[len(parts) // 2])
 
 
+def card_behind_glass() -> Scene:
+    """A card behind a glass ball and a pane."""
+    return _scene("card behind glass", scene_shapes.behind_glass(), moves=[1])
+
+
 def crossing_spheres() -> Scene:
     """Two spheres."""
     return _scene("crossing spheres", scene_shapes.crossing_spheres(), moves=[1])
@@ -253,6 +258,9 @@ BUILTIN: dict[str, Builtin] = {
     "vase that turns": Builtin(vase, "a smooth surface with a pattern, seen outside and inside; it is made of radii"),
     "thin wires": Builtin(thin_wires, "seven slanted wires, one pixel wide or half a pixel, over black"),
     "stack of cards": Builtin(stack_of_cards, "six open cards that overlap; one in the middle moves"),
+    "card behind glass": Builtin(
+        card_behind_glass, "a card moves behind a pane and a ball of glass: up to four layers, all seen"
+    ),
     "crossing spheres": Builtin(
         crossing_spheres, "two spheres that pass through one another, unculled; the nearer moves"
     ),

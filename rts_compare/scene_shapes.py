@@ -138,6 +138,22 @@ def cards(count: int) -> tuple[list[Part], list[float]]:
     return parts, depths
 
 
+def of_glass(part: Part, alpha: float) -> Part:
+    """A part with a colour a vertex, as glass of this alpha."""
+    colors = np.asarray(part.theta["colors"])[:, :3]
+    colors = np.concatenate([colors, np.full_like(colors[:, :1], alpha)], axis=1)
+    return part.replace(theta={**part.theta, "colors": colors}, shader=plugin("rts.shaders", "unlit")(opaque=False))
+
+
+def behind_glass() -> list[Part]:
+    """A glass ball, a card behind it, and a pane of glass that hides neither."""
+    vertices, faces = icosphere(3)
+    ball = of_glass(unlit(0.5 * vertices, faces, (0.2, 0.9, 0.4)), 0.5)
+    corners = np.array([[-0.9, -0.5, -0.8], [0.3, -0.6, -0.8], [0.4, 0.35, -0.8], [-0.8, 0.45, -0.8]])
+    pane = of_glass(unlit(corners * [0.8, 0.9, -1] + [0.35, 0.1, 0], QUAD, (0.3, 0.4, 1.0)), 0.4)
+    return [ball, unlit(corners, QUAD, (0.9, 0.3, 0.1)), pane]
+
+
 def wires(size: int, widths: Sequence[float]) -> Part:
     """Seven thin quads from nearly upright to nearly level.
 

@@ -70,6 +70,7 @@ def test_each_channel_is_as_in_an_image_of_three(target, count):
     ],
     ids=str,
 )
+@pytest.mark.filterwarnings("ignore:samples are translucent")
 def test_so_it_is_with_every_splatter_and_number_of_samples(options):
     found = show(scene(0, 7), **options)
     if getattr(options.get("supersample"), "contrast", None) is None:

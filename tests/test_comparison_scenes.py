@@ -99,7 +99,7 @@ def test_the_torus_on_a_lattice_is_nearly_the_exact_one():
 
 def test_names_may_be_written_in_many_ways():
     assert builtin("Torus-by_ray").name == builtin("  TORUS BY RAY").name == "torus by ray"
-    assert len(names()) == 14
+    assert len(names()) == 15
 
 
 def test_an_unknown_name_is_refused_with_the_nearest_one():

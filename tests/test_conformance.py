@@ -22,7 +22,7 @@ from rts.plugin_api.records import Fragments, RayHits
 from rts.registry import instance
 from rts.scene.row_cameras import RowCameras
 from rts.shading.shaders import Depth, Normals, Unlit
-from rts.splatting import Multi, Plain
+from rts.splatting import Multi, Plain, Single
 from rts.testing import (
     EngineConformance,
     OperationConformance,
@@ -848,9 +848,16 @@ class Cutting(OddMulti):
         return without_border(super().image(splats.replace(row=np.where(middle, splats.row, -1))), border)
 
 
+class Dark(Single):
+    """It promises to be translucent, and drops the layers behind."""
+
+    translucent = True
+
+
 SPLATTERS = {
     "a_constant_interior_stays": {"dimmed": OddMulti(made=lambda image, *_: 0.99 * image)},
     "the_front_layer_hides_those_behind": {"back to front": OddMulti(lambda p, c, r: (p, c, r[::-1]))},
+    "light_passes_through_translucent_layers": {"fronts only": Dark()},
     "empty_cells_stay_empty": {"last row": OddMulti(lambda p, c, r: (p, c, np.where(r < 0, len(c) - 1, r)))},
     "colors_stay_premultiplied": {
         "alpha halved": OddMulti(made=lambda image, *_: image * np.array([1, 1, 1, 0.5])),

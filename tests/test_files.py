@@ -213,6 +213,28 @@ def test_textures_are_linear_and_their_alpha_makes_the_shader_translucent(tmp_pa
     np.testing.assert_allclose(part.theta["texture"][0, 0], [0.2158605, 1, 0, 0.2], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "mode, cutoff, expected",
+    [
+        ("OPAQUE", None, None),
+        (None, None, None),
+        ("BLEND", None, [0.2, 0.6]),
+        ("MASK", None, [0, 1]),
+        ("MASK", 0.7, [0, 0]),
+    ],
+)
+def test_alpha_of_a_gltf_blends_cuts_out_or_is_ignored(tmp_path, mode, cutoff, expected):
+    image = Image.fromarray(np.uint8([[[255, 0, 0, 51], [0, 255, 0, 153]]]))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, alphaMode=mode, alphaCutoff=cutoff)
+    mesh = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)], process=False)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=[(0, 0), (1, 0), (0, 1)], material=material)
+    mesh.export(tmp_path / "m.glb")
+    [part] = rts.load(tmp_path / "m.glb")
+    assert part.shader.opaque == (expected is None)
+    texture = part.theta["texture"]
+    np.testing.assert_allclose(texture[0, :, 3:].ravel(), [] if expected is None else expected, atol=1e-6)
+
+
 def test_vertex_and_face_colors_of_a_ply(tmp_path):
     mesh = trimesh.creation.box()
     mesh.visual.vertex_colors = np.tile([128, 0, 255, 255], (8, 1)).astype(np.uint8)

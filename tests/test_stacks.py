@@ -61,6 +61,42 @@ def sorted_over(colors):
     return image
 
 
+# ---------------------------------------------------------------------------------------- nothing dropped in silence
+
+
+@pytest.mark.parametrize("name", ["single", "multi"])
+@pytest.mark.parametrize("target", ALL)
+def test_splatters_for_opaque_layers_warn_of_translucent_ones(name, target):
+    parts = [card(0.5, (1, 0, 0), 0.25), card(-0.5, (0, 0, 1), 1)]
+    parts = [part.replace(theta=arrays(target, part.theta)) for part in parts]
+    with pytest.warns(rts.errors.LayersWarning, match=r"translucent.*use splatter='visible'"):
+        rts.render(parts, CAMERA, (8, 8), splatter=name)
+
+
+@pytest.mark.parametrize("name", ["none", "visible"])
+def test_light_behind_the_last_layer_is_told(name):
+    parts = [card(0.5, (1, 0, 0), 0.25), card(0, (0, 1, 0), 0.5), card(-0.5, (0, 0, 1), 1)]
+    with pytest.warns(rts.errors.LayersWarning, match="the last of 2 layers.*'auto'"):
+        rts.render(parts, CAMERA, (8, 8), splatter=name)
+
+
+@pytest.mark.parametrize("name", ["none", "visible"])
+@pytest.mark.parametrize("layers", [3, "auto"])
+def test_with_enough_layers_there_is_no_warning(name, layers, recwarn):
+    parts = [card(0.5, (1, 0, 0), 0.25), card(0, (0, 1, 0), 0.5), card(-0.5, (0, 0, 1), 1)]
+    rts.render(parts, CAMERA, (8, 8), splatter=name, layers=layers)
+    rts.render(parts[:2], CAMERA, (8, 8), splatter=name, layers=layers)
+    assert not recwarn
+
+
+def test_a_function_that_gives_alpha_one_needs_no_promise(recwarn):
+    part = card(0.5, (1, 0, 0), 1).replace(
+        shader=lambda theta, gbuffer, camera: theta["colors"][:1].repeat(len(gbuffer["position"]), 0)
+    )
+    rts.render(part, CAMERA, (8, 8), splatter="multi")
+    assert not recwarn
+
+
 # ------------------------------------------------------------------------------------------------------ order
 
 
@@ -81,7 +117,7 @@ def test_cards_in_any_order_of_parts_are_sorted(kind):
     expected = sorted_over([np.append(0.3 * c, 0.3) for c in colors])
     for _ in range(3):
         parts = [cards[k] for k in rng.permutation(8)]
-        image = rts.render(parts, CAMERA, (24, 24), layers=8, splatter=kind())
+        image = rts.render(parts, CAMERA, (24, 24), layers=9, splatter=kind())
         np.testing.assert_allclose(image[8:16, 8:16], np.broadcast_to(expected, (8, 8, 4)), atol=1e-6)
 
 
@@ -91,7 +127,7 @@ def test_either_card_of_a_pair_that_crosses_is_in_front_on_its_side():
         theta={"colors": np.tile(np.float32([1, 0, 0, 0.5]), (4, 1))},
         shader=rts.plugin("shaders", "unlit")(opaque=False),
     )
-    image = rts.render([card(0, (0, 1, 0), 0.5), aslant], rts.Camera.look_at((0, 0, 6), (0, 0, 0)), (32, 32))
+    image = rts.render([card(0, (0, 1, 0), 0.5), aslant], rts.Camera.look_at((0, 0, 6), (0, 0, 0)), (32, 32), layers=3)
     np.testing.assert_allclose(image[16, 13], (0.25, 0.5, 0, 0.75), atol=1e-6)
     np.testing.assert_allclose(image[16, 18], (0.5, 0.25, 0, 0.75), atol=1e-6)
 
@@ -152,18 +188,41 @@ def scene():
     return [card(0.5, (1, 0.1, 0.1), 0.5, right=0.13), card(0, (0.1, 1, 0.1), 0.5, left=-0.41), ball(0.5), backdrop(-1)]
 
 
-@pytest.mark.parametrize("supersample", [1, 2])
-def test_compiled_images_of_smooth_scenes_are_those_of_the_specification(supersample):
+@functools.cache
+def crossed():
+    """Two cards of glass that pass through each other, before a backdrop."""
+    cards, turns = [card(0, (1, 0.1, 0.1), 0.5), card(0, (0.1, 1, 0.1), 0.7)], [(0.2, 0.5, 0), (-0.3, -0.4, 0)]
+    moves = [rts.rigid(np.float32([*turn, 0, 0, 0])) for turn in turns]
+    return [*(c.replace(transform=move) for c, move in zip(cards, moves, strict=True)), backdrop(-1.5)]
+
+
+def moved(part, pose):
+    """The part, moved by a pose (6,) of torch."""
     torch = pytest.importorskip("torch")
+    before = np.eye(4) if part.transform is None else part.transform
+    return part.replace(transform=rts.rigid(pose) @ torch.tensor(np.float32(before)))
 
-    def image(move, kind):
-        parts = [part.replace(transform=rts.rigid(move)) for part in scene()[:3]]
-        return rts.render([*parts, scene()[3]], CAMERA, (24, 24), layers=6, splatter=kind(), supersample=supersample)
 
-    move = torch.zeros(6)
-    results = [derivative("torch-cpu", lambda m, k=kind: image(m, k), move, torch.ones(6)) for kind in BOTH]
-    np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-5)
-    np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-4 * np.abs(results[1][1]).max())
+@pytest.mark.parametrize("supersample", [1, 2])
+@pytest.mark.parametrize("parts", [scene, crossed])
+def test_compiled_images_of_smooth_scenes_are_those_of_the_specification(parts, supersample):
+    torch = pytest.importorskip("torch")
+    first, *others = parts()
+    weights = torch.tensor(np.random.default_rng(2).normal(size=(24, 24, 4)).astype(np.float32))
+
+    def image(given, kind):
+        part = moved(first.replace(theta={**first.theta, "colors": given[1]}), given[0])
+        options = {"layers": 6, "splatter": kind(), "supersample": supersample}
+        return rts.render([part, *others], CAMERA, (24, 24), **options)
+
+    given = torch.zeros(6), torch.tensor(first.theta["colors"])
+    results = []
+    for kind in BOTH:
+        value, change = torch.func.jvp(lambda g, k=kind: image(g, k), (given,), ((torch.ones(6), given[1] * 0 + 0.1),))
+        pulled = torch.func.grad(lambda g, k=kind: (image(g, k) * weights).sum())(given)
+        results.append(to_numpy((value, change, *pulled)))
+    for found, expected in zip(*results, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("kind", BOTH)
@@ -189,7 +248,7 @@ def test_gradients_of_colour_and_alpha_are_finite_differences(kind):
 
 
 def test_a_glass_ball_keeps_its_coverage():
-    image, solid = (rts.render(ball(alpha), CAMERA, (48, 48), layers=2) for alpha in (0.5, 1))
+    image, solid = (rts.render(ball(alpha), CAMERA, (48, 48), layers=3) for alpha in (0.5, 1))
     # Front and back of alpha ½ let a quarter through, at the outline, too.
     assert image[..., 3].sum() == pytest.approx(0.75 * solid[..., 3].sum(), rel=0.003)
     assert image[..., 3].max() == pytest.approx(0.75, abs=1e-6)
@@ -206,18 +265,39 @@ EDGES = {
 }
 
 
-@pytest.mark.parametrize("supersample, most", [(1, 0.06), (2, 0.04)])
+@pytest.mark.parametrize("supersample, most", [(1, 0.06), pytest.param(2, 0.04, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("name", EDGES)
 def test_edges_move_as_areas_do(name, supersample, most):
-    torch = pytest.importorskip("torch")
     parts, index = EDGES[name]
-    parts, size = [*parts, backdrop(-1.5)], (96, 96)
-    pixel = 3.2 / size[0]
+    error, gain = errors_of_motion([*parts, backdrop(-1.5)], index, (1, 0.5, 0), supersample)
+    assert error < most
+    assert gain == pytest.approx(1, abs=0.025)
+
+
+def test_outlines_behind_glass_have_fine_samples():
+    glass = card(1, (0.5, 0.5, 1), 0.5, left=-3, right=3, bottom=-3, top=3)
+    parts = [glass, card(0, (0.9, 0.2, 0.1), 1, left=-0.7, right=0.6), card(-1, (0.1, 0.2, 0.3), 1)]
+    images = [rts.render(parts, CAMERA, (32, 32), layers=3, supersample=s) for s in (1, 4, rts.Adaptive(4))]
+    assert np.abs(images[0] - images[1]).max() > 0.1
+    np.testing.assert_allclose(images[2], images[1], atol=1e-5)
+
+
+def test_lines_of_crossing_move_as_depths_say():
+    # The error is that of opaque cards. Where lines move as samples do, the gain is 0.09.
+    error, gain = errors_of_motion(crossed(), 0, (0, 0, 2), 1)
+    assert error < 0.1
+    assert gain == pytest.approx(1, abs=0.04)
+
+
+def errors_of_motion(parts, index, along, supersample):
+    """Error and gain of the derivative as a part moves along a direction, in pixels; both smoothed."""
+    torch = pytest.importorskip("torch")
+    size = (96, 96)
+    direction = torch.tensor([0, 0, 0, *along]) * 3.2 / size[0]
 
     def image(step, **options):
-        move = step * torch.tensor([0, 0, 0, pixel, pixel / 2, 0])
-        moved = [p.replace(transform=rts.rigid(move)) if i == index else p for i, p in enumerate(parts)]
-        return rts.render(moved, CAMERA, size, layers=4, **options)
+        scene = [moved(part, step * direction) if i == index else part for i, part in enumerate(parts)]
+        return rts.render(scene, CAMERA, size, layers=4, **options)
 
     ends = [to_numpy(image(torch.tensor(step), splatter="none", supersample=16)) for step in (-0.5, 0.5)]
     expected = low_passed((ends[1] - ends[0])[..., :3])
@@ -225,5 +305,4 @@ def test_edges_move_as_areas_do(name, supersample, most):
         "torch-cpu", functools.partial(image, supersample=supersample), torch.zeros(()), torch.ones(())
     )
     found = low_passed(change[..., :3])
-    assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
-    assert (found * expected).sum() / (expected**2).sum() == pytest.approx(1, abs=0.025)
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected), (found * expected).sum() / (expected**2).sum()

@@ -27,12 +27,15 @@ class Splatter(Plugin):
             `needed`. It shows nothing if all nine are empty. A cell that is `settled` shows the colour of its sample,
             whichever samples are given. Samples farther than `reach` from all cells that are not settled may therefore
             be missing; with `Splats.wanted`, those farther than `reach` + 1 from wanted ones that are not settled.
+        translucent: a promise that samples behind others show as far as alpha lets light through, in all their layers,
+            if `Splats.opaque` is False. Without it an image of translucent samples comes with a `LayersWarning`.
     """
 
     layers: int | None = None
     reach: int = 1
     reads: frozenset[str] = frozenset()
     fills_interiors: bool = False
+    translucent: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:
@@ -43,7 +46,7 @@ class Splatter(Plugin):
         return without_border(self.image(splats), splats.border)
 
     @final
-    def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0) -> Array:
+    def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0, opaque: bool = True) -> Array:
         """Splat packed samples; for direct calls, with arrays of any engine, lists and numbers.
 
         Args:
@@ -51,6 +54,8 @@ class Splatter(Plugin):
             rgba: (N, 4) premultiplied.
             row: (K, H, W) int32, the sample of each cell front to back, or −1.
             border: cells at each side that splat into the image but are no part of it.
+            opaque: a promise that alpha is 1. With False, light passes through samples, if the splatter is
+                `translucent`.
 
         Returns:
             (H − 2 border, W − 2 border, 4) premultiplied RGBA.
@@ -59,7 +64,7 @@ class Splatter(Plugin):
             InputError: wrong shapes, or `row` holds no integers.
             EngineError: arrays of two engines.
         """
-        return self.cropped(_checked_splats(positions, rgba, row, border))
+        return self.cropped(_checked_splats(positions, rgba, row, border).replace(opaque=opaque))
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """The samples that can reach the image, in value or derivative, where all are opaque and on pixel centres.

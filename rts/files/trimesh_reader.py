@@ -128,14 +128,31 @@ def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray 
         texture = None if image is None else pixels(image)
         if _known(material, "baseColorFactor") is not None:
             color = _unit_range(material.baseColorFactor)
-        if gltf and _known(material, "alphaMode") in (None, "OPAQUE"):
+        mode = _known(material, "alphaMode") if gltf else "BLEND"
+        if mode in (None, "OPAQUE"):
             texture, color = (None if x is None else x[..., :3] for x in (texture, color))
+        elif mode == "MASK":
+            cutoff = _known(material, "alphaCutoff")
+            texture, color = _cut_out(texture, color, 0.5 if cutoff is None else cutoff)
     elif visual.kind == "vertex":
         attributes["colors"] = (_unit_range(visual.vertex_colors), faces)
     elif visual.kind == "face":
         one_a_face = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
         attributes["colors"] = (_unit_range(visual.face_colors), one_a_face)
     return attributes, texture, color
+
+
+def _cut_out(
+    texture: np.ndarray | None, color: np.ndarray | None, cutoff: float
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """A texture (h, w, 4) and a material's colour (4,) whose product has alpha 1 from the cutoff on, and 0 below."""
+    factor = 1.0 if color is None or len(color) < 4 else color[3]
+    if texture is not None and texture.shape[-1] == 4:
+        alpha = (texture[..., 3:] * factor >= cutoff).astype(texture.dtype)
+        texture, factor = np.concatenate([texture[..., :3], alpha], axis=-1), 1.0
+    if color is not None and len(color) == 4:
+        color = np.append(color[:3], float(factor >= cutoff))
+    return texture, color
 
 
 def _known(thing: Any, name: str, default: Any = None) -> Any:

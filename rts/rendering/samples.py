@@ -116,7 +116,10 @@ def _on_one_grid(
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     request = Request(capacity, facing="facing" in reader.reads, exits=exits and "exit" in reader.reads and gradient)
     taken = partial(_taken, scene, grid, request)
-    sampled = taken(settings.layers, hidden) if settings.layers != "auto" else with_layers_that_count(taken, hidden)
+    if settings.layers == "auto":
+        sampled = with_layers_that_count(taken, hidden, scene.opaque)
+    else:
+        sampled = taken(settings.layers, hidden)
     return replace(sampled, supersample=side, apron=settings.apron)
 
 
@@ -153,7 +156,7 @@ def with_fine(
     assert isinstance(adaptive, Adaptive)
     cells = FineGrid(size, adaptive.samples, settings.apron)
     grid = Grid.sampled(scene, camera, (cells.side * size[0], cells.side * size[1]), cells.apron)
-    where = Where(adaptive, adaptive.dilates(scene.parts), colors)
+    where = Where(adaptive, adaptive.dilates(scene.parts), scene.opaque, colors)
     flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
 
     def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:

@@ -42,6 +42,11 @@ class Scene(NamedTuple):
         """The number of channels of the shaders, besides alpha."""
         return self.parts[0].shader.channels
 
+    @property
+    def opaque(self) -> list[bool]:
+        """For each part, whether its shader promises to be opaque."""
+        return [bool(part.shader.opaque) for part in self.parts]
+
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | Prepared, camera: Camera, sampler: Any, engine: str | None) -> Scene:
         """The checked scene of a user's arguments."""

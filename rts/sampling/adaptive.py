@@ -23,8 +23,8 @@ class Adaptive:
     """A value for `supersample`: s² samples in pixels near outlines, one in every other pixel.
 
     A pixel with s² samples is called active. In samples of one a pixel, its front ends towards a neighbour that shows
-    nothing or another surface, or a neighbour's front ends towards it. Active pixels look as with
-    `supersample=samples`, the others as with `supersample=1`.
+    nothing or another surface, or a neighbour's front ends towards it; behind translucent layers, the next layer does.
+    Active pixels look as with `supersample=samples`, the others as with `supersample=1`.
 
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
@@ -98,6 +98,37 @@ def _number(text: str) -> float | None:
 def finest(supersample: Any) -> Any:
     """The most samples along a side of a pixel: `samples` of an `Adaptive`, else the argument itself."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
+
+
+def visible_outlines(
+    row: np.ndarray,
+    depth: np.ndarray,
+    sizes: Sequence[int],
+    settled: np.ndarray | None = None,
+    opaque: Sequence[bool] | None = None,
+) -> np.ndarray:
+    """Cells (H, W) bool at `outlines` of fronts, and of layers behind translucent ones.
+
+    Args:
+        row: see `outlines`.
+        depth: see `outlines`.
+        sizes: see `outlines`.
+        settled: see `outlines`.
+        opaque: for each part, whether its shader promises to be opaque; None if all do.
+    """
+    marks = outlines(row, depth, sizes, settled)
+    if opaque is None or all(opaque):
+        return marks
+    ends = np.cumsum(sizes)
+    for k in range(1, len(row)):
+        before, rest = row[k - 1], row[k:]
+        clear = (before >= 0) & ~np.asarray(opaque)[np.searchsorted(ends[:-1], before, side="right")]
+        if not clear.any():
+            break
+        # Layers behind as a scene of their own, empty where light does not reach them.
+        row = np.concatenate([row[:k], np.where(clear, rest, -1).astype(row.dtype)])
+        marks |= outlines(row[k:], np.where(row[k:] >= 0, depth[k:], 0), sizes)
+    return marks
 
 
 def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:

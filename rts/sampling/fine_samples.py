@@ -12,7 +12,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Fine, Sampled
-from rts.sampling.adaptive import Adaptive, contrasts, outlines
+from rts.sampling.adaptive import Adaptive, contrasts, visible_outlines
 from rts.sampling.hidden import HiddenRule, planned, with_layers_that_count
 from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
@@ -24,11 +24,13 @@ class Where(NamedTuple):
     Attributes:
         adaptive: the user's settings.
         dilates: True if the neighbours of active pixels are active, too.
+        opaque: for each part, whether its shader promises to be opaque.
         colors: (N, 4) of the coarse samples, to measure contrast; None to ignore it.
     """
 
     adaptive: Adaptive
     dilates: bool
+    opaque: Sequence[bool]
     colors: np.ndarray | None = None
 
 
@@ -41,8 +43,8 @@ def active(
     apron: int,
     where: Where,
 ) -> np.ndarray:
-    """Active pixels (H, W) bool of the image, from coarse samples (K, ·, ·) with an apron; see `outlines`."""
-    pixels = outlines(row, depth, sizes, settled)
+    """Active pixels (H, W) bool of the image, from coarse samples (K, ·, ·) with an apron; see `visible_outlines`."""
+    pixels = visible_outlines(row, depth, sizes, settled, where.opaque)
     if where.colors is not None and where.adaptive.contrast is not None:
         pixels |= contrasts(row[0], where.colors, where.adaptive.contrast)
     pixels = dilated(pixels) if where.dilates else pixels
@@ -98,5 +100,5 @@ def fine_samples(
         known = None if hidden is None else HiddenInStrips(hidden, host)
         flat = flat and bool((values[-1] >= 0).any()) and not host.dropped
     taken = partial(take, listed=layout.cells, capacity=allotted)
-    sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known)
+    sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known, where.opaque)
     return replace(arranged(sampled, layout, grid), flat=flat)

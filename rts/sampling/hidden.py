@@ -178,12 +178,17 @@ def numbers_of(settled: np.ndarray) -> np.ndarray:
     return settled.view(np.int8) - np.int8(1)
 
 
-def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidden: Hidden | None) -> Sampled:
+def with_layers_that_count(
+    taken: Callable[[int, Hidden | None], Sampled], hidden: Hidden | None, opaque: Sequence[bool]
+) -> Sampled:
     """A scene sampled with as many layers as its image needs.
+
+    If parts are translucent, an empty layer is added: it says that nothing lies behind the others.
 
     Args:
         taken: samples the scene with a number of layers, without the samples that a rule drops.
         hidden: the rule; None to keep all.
+        opaque: for each part, whether its shader promises to be opaque.
     """
     count = 3  # A closed surface before nothing needs two: the second at its outlines.
     while True:
@@ -205,7 +210,7 @@ def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidde
             f'layers="auto"; give a larger number if their derivative matters',
             LayersWarning,
         )
-    cells = sampled.cells.first(min(most, LAYER_LIMIT))
+    cells = sampled.cells.first(min(most + (not all(opaque)), LAYER_LIMIT))
     return replace(sampled, cells=cells, overflow=sampled.overflow + missing)
 
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from rts.arrays.array_functions import described, shape_of
-from rts.arrays.engines import namespace
+from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
-from rts.errors import InputError
+from rts.errors import InputError, LayersWarning, warn
+from rts.plugin_base import promised
 
 GROUP = 3
 """Number of channels, besides alpha, in one call of a splatter."""
+
+LOST = 0.01
+"""The share of light that may pass through a layer, and be lost, without a warning."""
 
 
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
@@ -27,6 +31,8 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
         InputError: the splatter returned an image of another shape.
     """
     rgba = splats.rgba
+    if not splats.opaque:
+        _warn_of_lost_light(splatter, splats)
     count = shape_of(rgba)[1] - 1
     if count == GROUP:
         return _cropped(splatter, splats)
@@ -38,6 +44,26 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     left = count - GROUP * (len(images) - 1)
     alpha = images[0][..., GROUP:]
     return xp.concat([*(image[..., :GROUP] for image in images[:-1]), images[-1][..., :left], alpha], axis=-1)
+
+
+def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
+    """Warn if samples are translucent under a splatter that takes them to be opaque, or if the last layer's are."""
+    alpha, last = value_of(splats.rgba[:, -1]), value_of(splats.row[-1])
+    if alpha is None or last is None or not len(alpha):
+        return
+    if not promised(splatter, "translucent"):
+        if alpha.min() < 1 - LOST:
+            warn(
+                f"samples are translucent, and {splatter!r} leaves out some of the light that passes through them; "
+                f"use splatter='visible'",
+                LayersWarning,
+            )
+    elif (last >= 0).any() and alpha[last[last >= 0]].min() < 1 - LOST:
+        warn(
+            f"light passes through the last of {len(splats.row)} layers, and surfaces farther back, if any, are left "
+            f"out; give a larger number of layers, or layers='auto'",
+            LayersWarning,
+        )
 
 
 def _cropped(splatter: Splatter, splats: Splats) -> Array:

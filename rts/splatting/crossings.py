@@ -23,7 +23,7 @@ derivative in positions is that of
     (Ŵ_a c_a + Ŵ_b c_b) / (Ŵ_a + Ŵ_b),    c = Σ w rgba / Σ w over the fronts of one sheet:
 
 coverage Ŵ moves with the line, mean colours with their samples. The image's value, and its derivative in colours, stay
-as they are.
+as they are. Where layers are translucent, the layers of each source, composited, stand in for its front's colour.
 """
 
 from __future__ import annotations
@@ -79,13 +79,14 @@ class Lines(NamedTuple):
         return totals
 
 
-def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
+def motion(kernel: Kernel, layers: Layers, lines: Lines, colors: Callable[[int, int], Array]) -> Array:
     """The change of the image as lines move: zeros (H, W, 4) with derivatives in positions.
 
     Args:
         kernel: the splatter.
         layers: the samples, of at least two layers.
         lines: see `targets`.
+        colors: for offsets (u, v), what each source shows, (H, W, 4).
     """
     xp, target = layers.xp, lines.target
     moves = [
@@ -98,7 +99,7 @@ def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
     still = stopped(xp.stack(kernel.offsets(layers.position[0]), axis=-1))
 
     coverage = lines.sums(lambda u, v: kernel.weight(layers.at(still, u, v) + kernel.gamma * line, u, v)[..., None])
-    weighted = lines.sums(lambda u, v: stopped(layers.color(0, u, v)) * layers.weight(0, u, v)[..., None])
+    weighted = lines.sums(lambda u, v: stopped(colors(u, v)) * layers.weight(0, u, v)[..., None])
     means = [g[..., :4] / xp.where(target[..., None], g[..., 4:], 1.0) for g in weighted]
     total = xp.where(target[..., None], coverage[0] + coverage[1], 1.0)
     mixed = sum(w / total * mean for w, mean in zip(coverage, means, strict=True))

@@ -29,6 +29,8 @@ from rts.splatting.layers import (
 class Plain(Splatter):
     """No splatting: layers are composited front to back, without derivative at occlusion boundaries."""
 
+    translucent = True
+
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
         positions, rgba, row = splats.positions, splats.rgba, splats.row

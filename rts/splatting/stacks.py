@@ -19,6 +19,7 @@ that of opaque layers, continuously in alpha.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,14 +46,14 @@ class Source:
     alpha: list[Array]
 
     @classmethod
-    def at(cls, layers: Layers, n: Steps) -> Source:
-        """The source from which steps `n` lead to the target."""
+    def at(cls, layers: Layers, n: Steps, still: Array | None) -> Source:
+        """The source from which steps `n` lead to the target; weights have no derivative at targets `still` (H, W)."""
         every = range(len(layers.target))
         return cls(
             layers.source(*n),
             layers.sides(*n),
             [layers.at(layers.covered[k], *n) for k in every],
-            layers.splats(*n),
+            layers.splats(*n, still=still),
             [layers.color(k, *n)[..., 3] for k in every],
         )
 
@@ -89,7 +90,19 @@ def picked(values: list[Array], index: Array, xp: Any) -> Array:
     return total
 
 
-def image(layers: Layers, shift: dict[Steps, Array], sigma: float, gains: Any) -> Array:
+def composites(layers: Layers) -> Callable[[int, int], Array]:
+    """For an offset (u, v), the layers of each source composited, in the form of `Layers.color`, (H, W, 5)."""
+
+    def composite(u: int, v: int) -> Array:
+        front, total = layers.color(0, u, v), 0.0
+        for k in reversed(range(len(layers.target))):
+            total = over(layers.color(k, u, v)[..., :4], total)
+        return layers.xp.concat([total, front[..., 4:]], axis=-1)
+
+    return composite
+
+
+def image(layers: Layers, shift: dict[Steps, Array], sigma: float, gains: Any, still: Array | None = None) -> Array:
     """The image (H, W, 4) of stacks of translucent layers.
 
     Args:
@@ -97,9 +110,10 @@ def image(layers: Layers, shift: dict[Steps, Array], sigma: float, gains: Any) -
         shift: for each offset the number s of `Visible` at the first level.
         sigma: of the kernel, cells.
         gains: from the sums (H, W, 5) of F and S at the first level, the change (H, W, 5) of each with its coverage.
+        still: (H, W) bool, targets whose image has no derivative in positions; None for none.
     """
     xp, count = layers.xp, len(layers.target)
-    sources = {n: Source.at(layers, n) for n in NEIGHBOURS}
+    sources = {n: Source.at(layers, n, still) for n in NEIGHBOURS}
     zero = xp.zeros_like(shift[NEIGHBOURS[0]])
     left = dict.fromkeys(NEIGHBOURS, Left(zero, zero))
     levels = []

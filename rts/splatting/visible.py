@@ -42,7 +42,7 @@ class Visible(Kernel):
     Closed surfaces need no culling, if K reaches through their back faces to the layers behind.
 
     If samples may be translucent (`Splats.opaque` is False), the same rule goes on behind each layer (`stacks.py`).
-    Lines of crossing then move as samples do.
+    Outlines and lines of crossing behind the first layer then move as samples do.
 
     Attributes:
         rims: whether coverage moves as outlines do, extrapolated from the samples inside of them (`rims.py`). Otherwise
@@ -64,6 +64,7 @@ class Visible(Kernel):
     CONTINUED: ClassVar[float] = CONTINUED
     RIMS: ClassVar[tuple[float, ...]] = RIMS
     CROSSINGS: ClassVar[tuple[float, ...]] = CROSSINGS
+    translucent = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     @functools.cached_property
@@ -93,7 +94,7 @@ class Visible(Kernel):
             m = xp.where(shown[n] & (-s < m), -s, m)
         differentiates = engine_of(splats.positions).differentiates
         lines, crossed = None, None
-        if self.crossings and count > 1 and differentiates and splats.opaque:
+        if self.crossings and count > 1 and differentiates:
             pairs = crossings.pairs_of(layers)
             lines, crossed = crossings.targets(layers, shift, pairs), functools.reduce(operator.or_, pairs.values())
         still = None if lines is None else lines.target
@@ -108,7 +109,8 @@ class Visible(Kernel):
             return [rims.spread(total, gain) for total, gain in zip(totals, moved, strict=True)]
 
         if not splats.opaque:
-            return stacks.image(layers, shift, self.sigma, changes)
+            image = stacks.image(layers, shift, self.sigma, changes, still)
+            return image if lines is None else image + crossings.motion(self, layers, lines, stacks.composites(layers))
         front, surface, behind = 0.0, 0.0, 0.0
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
@@ -122,7 +124,11 @@ class Visible(Kernel):
         for i, change in enumerate(changes([front, surface])):
             colors[i] = colors[i] + (change if isinstance(change, float) else change[..., :4])
         image = over(colors[0], over(*colors[1:]))
-        return image if lines is None else image + crossings.motion(self, layers, lines)
+        return (
+            image
+            if lines is None
+            else image + crossings.motion(self, layers, lines, functools.partial(layers.color, 0))
+        )
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`: as `Kernel`, and possible ends of chords, and two layers near lines of crossing."""

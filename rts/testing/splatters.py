@@ -61,6 +61,18 @@ class SplatterConformance(Conformance):
         image = _splat(splatter, splats.replace(rgba=rgba))[r : HEIGHT - r, r : WIDTH - r]
         claim_close(image, np.broadcast_to([1, 0, 0, 1], image.shape), TOLERANCE, "the color of a covered surface")
 
+    def test_light_passes_through_translucent_layers(self, splatter: Any) -> None:
+        """A splatter that promises to be `translucent` composites a front layer of alpha ½ over the one behind."""
+        if not promised(_instance(splatter), "translucent"):
+            pytest.skip("the splatter does not promise to be translucent")
+        splats = everywhere(LAYERS)
+        rgba = splats.rgba.copy()
+        rgba[splats.row[0].ravel()] = [0.5, 0, 0, 0.5]
+        rgba[splats.row[1].ravel()] = [0, 1, 0, 1]
+        r = _instance(splatter).reach
+        image = _splat(splatter, splats.replace(rgba=rgba, opaque=False))[r : HEIGHT - r, r : WIDTH - r]
+        claim_close(image, np.broadcast_to([0.5, 0.5, 0, 1], image.shape), TOLERANCE, "the colour of two layers")
+
     def test_empty_cells_stay_empty(self, splatter: Any) -> None:
         """The image is zero where no cell within reach has a sample: row −1 is no sample."""
         splats = everywhere(LAYERS)

@@ -24,7 +24,6 @@ from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.rows import Grid
 from rts_backends.fused.stacks import Stacks
-from rts_backends.fused.straight_stacks import Straight
 from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
@@ -73,8 +72,8 @@ class Choices(NamedTuple):
         listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: largest less least depth of the fronts, the camera's 0 included.
-        stacks: where layers are translucent, the plans of these targets, and the targets that need no plan; the latter
-            are not listed above.
+        stacks: where layers are translucent, the plans of these targets, and the targets that need no plan, which are
+            not listed above.
     """
 
     mixed: np.ndarray
@@ -87,7 +86,7 @@ class Choices(NamedTuple):
     listed: np.ndarray
     repeated: bool
     extent: float
-    stacks: tuple[Stacks, Straight] | None = None
+    stacks: Stacks | None = None
 
 
 class Cells:
@@ -145,7 +144,7 @@ class Cells:
         self.visible, self.border, self.one_part = settings.kind == "visible", settings.border, settings.one_part
         self.rims = self.visible and settings.rims
         self.translucent = self.visible and not settings.opaque
-        self.crosses = self.visible and settings.crossings and settings.opaque
+        self.crosses = self.visible and settings.crossings
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
@@ -179,6 +178,11 @@ class Cells:
     def _plain_work(self) -> int:
         """Nanoseconds that the stencil takes at least."""
         return 4 * self.row.shape[1] * self.row.shape[2]
+
+    @property
+    def _layers_work(self) -> int:
+        """Nanoseconds that stencils of all layers take at least."""
+        return len(self.row) * self._plain_work
 
     @property
     def _mixed_work(self) -> int:
@@ -226,18 +230,18 @@ class Cells:
         if layers > 1 and self._wanted is not None:
             before, marks = marks, np.empty_like(marks)
             parallel(listing.narrow, height, before, self._wanted, marks, marked, work=self.row[0].size)
-        straight = None
+        straight = np.zeros((0, width), np.uint8)
         if self.translucent:
             # Any target that some layer reaches; `narrow` comes before, since outlines look farther.
             marks = layered.reached(self.row[0] >= 0)
             marks = marks & self._wanted if self._wanted is not None else marks
             marks = marks & ~amid if len(amid) else marks
-            levels = (self.row >= 0).sum(axis=0, dtype=np.int32)
-            regular, both = np.empty_like(marks), np.empty((height, 2), np.int64)
-            parallel(straight_stacks.find, height, self.grid, levels, marks, regular, both, work=self.row.size * 9)
-            marked, straight = both[:, 0], Straight.of(both[:, 1], layers, kind)
-            given = self.grid, levels, regular, states, EMPTY, straight
-            parallel(straight_stacks.fill, height, *given, work=100 * layers * len(straight.columns))
+            # Beside lines of crossing plans tell the derivative in colours from that in positions.
+            bits, _ = self._pairs_within(extent)
+            crossed = layered.reached(bits > 0) if len(bits) else bits
+            straight, given = np.empty_like(marks), (self.positions, self.row, ends, crossed, marks)
+            parallel(straight_stacks.find, height, *given, straight, marked, work=20 * self.row.size)
+            states[straight > 0] = EMPTY
         if len(amid) and not self.visible:
             marks &= ~amid
             marked = marks.sum(axis=1, dtype=np.int64)
@@ -250,12 +254,12 @@ class Cells:
             continued = kind.type(Visible.CONTINUED)
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             parallel(listing.choose, height, self.grid, *given, work=500 * len(columns))
-        layered_targets = None
-        if straight is not None:
-            stacks = Stacks.of(len(columns), layers, kind)
-            layered_targets, given = (stacks, straight), (self.facing, beyond, offsets, columns, ranges, stacks)
+        stacks = None
+        if self.translucent:
+            stacks = Stacks.of(len(columns), layers, kind, straight)
+            given = self.facing, beyond, offsets, columns, ranges, stacks
             parallel(layered.fill, height, self.grid, *given, work=400 * layers * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, layered_targets)
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent, stacks)
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -284,11 +288,8 @@ class Cells:
             given = self.grid, *decide, *listed, ends
             parallel(outlines.fill, height, *given, result, work=90 * len(result.columns))
             if choices.stacks is not None:
-                stacks, straight = choices.stacks
-                own = result.offsets, result.columns, choices.offsets, choices.columns, stacks
+                own = result.offsets, result.columns, choices.offsets, choices.columns, choices.stacks
                 parallel(layered.recolor, height, *own, result.changes, work=20 * len(result.columns))
-                own = result.offsets, result.columns, straight
-                parallel(straight_stacks.recolor, height, *own, result.changes, work=20 * len(result.columns))
             if self._crossed:
                 self.crossings.still(result.offsets, result.columns, result.changes)
         return result
@@ -299,9 +300,13 @@ class Cells:
 
         No rows without pairs.
         """
+        return self._pairs_within(self.choices.extent)
+
+    def _pairs_within(self, extent: float) -> tuple[np.ndarray, np.ndarray]:
+        """`_pairs` for the extent of `Choices`."""
         if not self.crosses:
             return crossing_pairs.nothing(self.row.shape[2])
-        return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(self.choices.extent))
+        return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(extent))
 
     @cached_property
     def crossings(self) -> Crossings:
@@ -309,7 +314,22 @@ class Cells:
         bits, some = self._pairs
         if not len(bits):
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
-        return crossings.listed(self.grid, self.choices, self.positions.dtype.type(self.choices.extent), bits, some)
+        extent = self.positions.dtype.type(self.choices.extent)
+        return crossings.listed(self._seen_grid, self.choices, extent, bits, some)
+
+    @cached_property
+    def _seen_grid(self) -> Grid:
+        """`grid` with fronts of the colour that is seen along their rays, through translucent layers."""
+        if not self.translucent:
+            return self.grid
+        seen = np.zeros((*self.row.shape[1:], 4), self.rgba.dtype)
+        for cells in self.row[::-1]:
+            here = cells >= 0
+            own = self.rgba[cells[here]]
+            seen[here] = own + (1 - own[:, 3:]) * seen[here]
+        colors, fronts = self.rgba.copy(), self.row[0] >= 0
+        colors[self.row[0][fronts]] = seen[fronts]
+        return self.grid._replace(rgba=read_only(colors))
 
     @property
     def _crossed(self) -> bool:
@@ -322,11 +342,11 @@ class Cells:
             given = self.plain_grid, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if self.choices.stacks is not None:
-                stacks, regular = self.choices.stacks
+                stacks = self.choices.stacks
                 given = self.choices.offsets, self.choices.columns, stacks.images, self.border
                 parallel(layered.forward, len(out), *given, out, work=self._mixed_work // 10)
-                given = regular.offsets, regular.columns, regular.images, self.border
-                parallel(layered.forward, len(out), *given, out, work=10 * len(regular.columns))
+                given = self.grid, stacks.straight, self.border
+                parallel(straight_stacks.forward, len(out), *given, out, work=self._layers_work)
             elif len(self.choices.columns):
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
@@ -374,7 +394,7 @@ class Cells:
         parallel(stencil.pull, height, *plain, g, *gradients, work=self._plain_work)
         self._pull_mixed(g, *gradients)
         if self._crossed:
-            crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *gradients)
+            crossings.pull(self._seen_grid.rgba, self.row, self.crossings, self.border, g, *gradients)
         if self.rims and g_positions is not None:
             outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
@@ -382,7 +402,7 @@ class Cells:
         """Add mixed targets' shares to the gradients; a gradient of no rows gets none."""
         count, height = len(self.choices.columns), self.row.shape[1]
         if self.choices.stacks is not None:
-            self._pull_stacks(*self.choices.stacks, g, g_positions, g_rgba)
+            self._pull_stacks(self.choices.stacks, g, g_positions, g_rgba)
             return
         if not (count and (len(g_positions) or len(g_rgba))):
             return
@@ -397,17 +417,17 @@ class Cells:
         if len(g_positions) or len(g_rgba):
             parallel(mixed_targets.pull, *given, g_positions, g_rgba, work=work)
 
-    def _pull_stacks(
-        self, stacks: Stacks, straight: Straight, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray
-    ) -> None:
+    def _pull_stacks(self, stacks: Stacks, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
         """`_pull_mixed` of translucent layers."""
-        adjoints, work = np.empty(straight.sums.shape, g.dtype), 100 * len(self.row) * len(straight.columns)
-        parallel(straight_stacks.adjoint, self.row.shape[1], straight, self.border, g, adjoints, work=work // 5)
-        given = self.grid, straight, adjoints, g_positions, g_rgba
-        parallel(straight_stacks.pull, self.row.shape[1], *given, work=work)
+        given = self.grid, stacks.straight, self.border, g, g_positions, g_rgba
+        parallel(straight_stacks.pull, self.row.shape[1], *given, work=3 * self._layers_work)
         height, adjoints = self.row.shape[1], np.empty(stacks.sums.shape, g.dtype)
         given, work = (self.choices.offsets, self.choices.columns, stacks), len(self.row) * self._mixed_work
         parallel(layered.adjoint, height, *given, self.border, g, adjoints, work=work // 5)
+        if self._crossed:
+            # As in `_pull_mixed`.
+            parallel(layered.pull, height, self.grid, *given, adjoints, g_positions[:0], g_rgba, work=work)
+            adjoints[self.crossings.among_mixed()], g_rgba = 0, g_rgba[:0]
         parallel(layered.pull, height, self.grid, *given, adjoints, g_positions, g_rgba, work=work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
@@ -420,24 +440,38 @@ class Cells:
         )
         parallel(stencil.push, out.shape[1], self.plain_grid, *tangents, self.choices.states, self.border, out)
         if self.choices.stacks is not None:
-            stacks, straight = self.choices.stacks
+            stacks = self.choices.stacks
             given = self.grid, self.choices.offsets, self.choices.columns, stacks, tangents, self.border
-            work = len(self.row) * self._mixed_work * len(out)
-            parallel(layered.push, out.shape[1], *given, out, work=work)
-            given = self.grid, straight, tangents, self.border
-            work = 100 * len(self.row) * len(straight.columns) * len(out)
-            parallel(straight_stacks.push, out.shape[1], *given, out, work=work)
+            parallel(layered.push, out.shape[1], *given, out, work=len(self.row) * self._mixed_work * len(out))
+            given = self.grid, *tangents, stacks.straight, self.border
+            parallel(straight_stacks.push, out.shape[1], *given, out, work=3 * self._layers_work * len(out))
         elif len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed_targets.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
         if self.rims and t_positions is not None:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
-        if count := len(self.crossings.columns):
-            given = self.grid, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
-            parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
+        if self._crossed:
+            self._push_lines(tangents, out)
         if len(self._settled):
             self._paint(tangents[1], out)
+
+    def _push_lines(self, tangents: tuple[np.ndarray, ...], out: np.ndarray) -> None:
+        """Write the tangents of targets beside lines of crossing."""
+        t_positions, t_rgba = tangents
+        tints, choices, height = None, self.choices, out.shape[1]
+        if choices.stacks is not None:
+            # Those of colours are the stacks'; what is left moves with the lines.
+            tints, still = np.zeros_like(out), (t_positions[:, :0], t_rgba)
+            given = self.grid, choices.offsets, choices.columns, choices.stacks, still, self.border
+            parallel(layered.push, height, *given, tints, work=len(self.row) * self._mixed_work * len(out))
+            t_rgba = t_rgba[:, :0]
+        given = self._seen_grid, choices.ranges, choices.sums, self.crossings, t_positions, t_rgba, self.border
+        parallel(crossings.push, height, *given, out, work=80 * len(self.crossings.columns) * len(out))
+        if tints is not None:
+            rows, columns = (cells - self.border for cells in self.crossings.cells())
+            inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < out.shape[2])
+            out[:, rows[inside], columns[inside]] += tints[:, rows[inside], columns[inside]]
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
@@ -451,6 +485,7 @@ class Cells:
         copy.row, copy.exits = read_only(own), read_only(exits)
         copy.__dict__.pop("outlines", None)  # They refer to samples by number.
         copy.__dict__.pop("crossings", None)
+        copy.__dict__.pop("_seen_grid", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         gradients = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy._pull(g, *gradients)

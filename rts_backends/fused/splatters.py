@@ -167,6 +167,7 @@ class Visible(_Fused):
 
     kind = "visible"
     specification = specified.Visible
+    translucent = specified.Visible.translucent
     reach = specified.Visible.reach
     epsilon: float = specified.Visible.epsilon
     calibration: float | None = specified.Visible.calibration

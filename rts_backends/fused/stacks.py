@@ -26,6 +26,7 @@ class Stacks(NamedTuple):
         least: (M, K), the least weight that fills a buffer.
         sums: (M, K, 3, 5), of each buffer the colours over the weight, taken as at least `least`, and the weight.
         images: (M, K + 1, 4), the image from each level on.
+        straight: (H, W) uint8, the number of layers of further targets, which need no plan (`straight_stacks.py`).
     """
 
     levels: np.ndarray
@@ -34,10 +35,11 @@ class Stacks(NamedTuple):
     least: np.ndarray
     sums: np.ndarray
     images: np.ndarray
+    straight: np.ndarray
 
     @classmethod
-    def of(cls, count: int, layers: int, kind: np.dtype) -> Stacks:
-        """Room for `count` targets."""
+    def of(cls, count: int, layers: int, kind: np.dtype, straight: np.ndarray) -> Stacks:
+        """Room for `count` targets with plans."""
         return cls(
             np.zeros(count, np.int32),
             np.empty((count, layers, 9, 3), np.int16),
@@ -45,7 +47,33 @@ class Stacks(NamedTuple):
             np.empty((count, layers), kind),
             np.empty((count, layers, 3, 5), kind),
             np.empty((count, layers + 1, 4), kind),
+            straight,
         )
+
+
+WEIGHT, ALONG_X, ALONG_Y, DEPTH, SOURCE = 4, 5, 6, 7, 8
+"""A layer of a source: four numbers of its colour, its weight, the offset from sample to target, its depth; and their
+number."""
+
+
+@compiled
+def _load(sources, n, grid, y, x, u, v, beyond):
+    """Fill the layers (K, 8) of source n, from which (u, v) leads to a target; return their number."""
+    positions, rgba, row = grid.positions, grid.rgba, grid.row
+    layers, height, width = row.shape
+    py, px, count = y - v, x - u, 0
+    inside = 0 <= py < height and 0 <= px < width
+    for k in range(layers):
+        i = row[k, py, px] if inside else -1
+        if i >= 0:
+            weight, along_x, along_y = splat(grid, i, py, px, u, v)
+            sources[n, k, 0], sources[n, k, 1], sources[n, k, 2] = rgba[i, 0], rgba[i, 1], rgba[i, 2]
+            sources[n, k, 3], sources[n, k, WEIGHT], sources[n, k, DEPTH] = rgba[i, 3], weight, positions[i, 2]
+            sources[n, k, ALONG_X], sources[n, k, ALONG_Y], count = along_x, along_y, k + 1
+        else:
+            sources[n, k, DEPTH] = beyond
+            sources[n, k, :DEPTH] = 0
+    return count
 
 
 # ---------------------------------------------------------------------------------------------------------- plans
@@ -75,13 +103,9 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
     """
     row, kind = grid.row, grid.positions.dtype.type
     layers = len(row)
-    depths, sides = np.empty((9, layers), grid.positions.dtype), np.zeros((9, layers), np.int64)
-    counts, first, joins, shift = (
-        np.empty(9, np.int64),
-        np.empty(9, np.int64),
-        np.empty(9, np.int64),
-        np.empty(9, np.int64),
-    )
+    sources, counts = np.empty((9, layers, SOURCE), grid.positions.dtype), np.empty(9, np.int64)
+    sides = np.zeros((9, layers), np.int64)
+    first, joins, shift = np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9, np.int64)
     nominal = np.empty(9, grid.positions.dtype)
     for n in range(9):
         u, v = kind(n % 3 - 1), kind(n // 3 - 1)
@@ -91,7 +115,10 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
         nominal[n] /= whole
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
-            _load(depths, sides, counts, grid, facing, beyond, y, columns[d])
+            for n in range(9):
+                counts[n] = _load(sources, n, grid, y, columns[d], n % 3 - 1, n // 3 - 1, beyond)
+            if len(facing) > 0:
+                _load_sides(sides, facing, counts, y, columns[d])
             first[:], joins[:] = 0, 0
             stacks.levels[d] = layers
             for t in range(layers):
@@ -99,10 +126,10 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
                 if share < 0:
                     stacks.levels[d] = t
                     break
-                _shift(shift, t, d, ranges, depths, sides, len(facing) > 0, counts, first, joins)
-                _plan(stacks, d, t, depths, counts, first, joins, shift)
+                _shift(shift, t, d, ranges, sources, sides, len(facing) > 0, counts, first, joins)
+                _plan(stacks, d, t, sources, counts, first, joins, shift)
                 stacks.least[d, t] = kind(1) if t == 0 else share
-                _sum(stacks, d, t, grid, counts, y, columns[d], t == layers - 1)
+                _sum(stacks, d, t, sources, counts, t == layers - 1)
                 _advance(t, layers, counts, first, joins, shift)
             _composite(stacks, d, stacks.levels[d])
 
@@ -119,7 +146,7 @@ def _share(t, counts, first, joins, nominal):
 
 
 @compiled
-def _shift(shift, t, d, ranges, depths, sides, told, counts, first, joins):
+def _shift(shift, t, d, ranges, sources, sides, told, counts, first, joins):
     """Fill the numbers s of sources that take part in level t."""
     for n in range(9):
         if joins[n] > t or first[n] >= counts[n]:
@@ -127,55 +154,46 @@ def _shift(shift, t, d, ranges, depths, sides, told, counts, first, joins):
         if t == 0 and ranges[d, n, 1, 1] > ranges[d, n, 1, 0]:
             shift[n] = ranges[d, n, 1, 0]
         else:
-            shift[n] = _pair(depths, sides, told, counts, n, t, first[n], t == 0)
+            shift[n] = _pair(sources, sides, told, counts, n, t, first[n], t == 0)
 
 
 @compiled
-def _load(depths, sides, counts, grid, facing, beyond, y, x):
-    """Depths, sides and numbers of layers of the nine sources of a target."""
-    row = grid.row
-    layers, height, width = row.shape
+def _load_sides(sides, facing, counts, y, x):
+    """Fill the sides (9, K) that the layers of the nine sources of a target show."""
     for n in range(9):
-        py, px = y - (n // 3 - 1), x - (n % 3 - 1)
-        counts[n] = 0
-        for k in range(layers):
-            i = row[k, py, px] if 0 <= py < height and 0 <= px < width else -1
-            depths[n, k] = grid.positions[i, 2] if i >= 0 else beyond
-            if i >= 0:
-                counts[n] += 1
-            if len(facing) > 0:
-                sides[n, k] = facing[k, py, px] if i >= 0 else 0
+        for k in range(counts[n]):
+            sides[n, k] = facing[k, y - n // 3 + 1, x - n % 3 + 1]
 
 
 @compiled
-def _pair(depths, sides, told, counts, n, t, first, behind_only):
+def _pair(sources, sides, told, counts, n, t, first, behind_only):
     """The number s of a source at level t; only below 0 if `behind_only`, since it is known not to be at the level."""
-    layers = depths.shape[1]
+    layers = sources.shape[1]
     if t >= counts[4]:
         return 0
-    own, z = depths[4, t], depths[n, first]
+    own, z = sources[4, t, DEPTH], sources[n, first, DEPTH]
     a, best_a = 0, abs(z - own)
     for k in range(first + 1, layers):
-        distance = abs(depths[n, k] - own)
-        if distance < best_a and not (told and opposite_sides(sides[n, k], sides[4, t], own > depths[n, k])):
+        distance, behind = abs(sources[n, k, DEPTH] - own), own > sources[n, k, DEPTH]
+        if distance < best_a and not (told and opposite_sides(sides[n, k], sides[4, t], behind)):
             a, best_a = k - first, distance
     b, best_b = 0, abs(own - z)
     for k in range(t + 1, layers):
-        distance = abs(depths[4, k] - z)
-        if distance < best_b and not (told and opposite_sides(sides[4, k], sides[n, first], z > depths[4, k])):
+        distance, behind = abs(sources[4, k, DEPTH] - z), z > sources[4, k, DEPTH]
+        if distance < best_b and not (told and opposite_sides(sides[4, k], sides[n, first], behind)):
             b, best_b = k - t, distance
     return -b if behind_only or best_b < best_a else a
 
 
 @compiled
-def _plan(stacks, d, t, depths, counts, first, joins, shift):
+def _plan(stacks, d, t, sources, counts, first, joins, shift):
     """Fill the plan of a level."""
-    plans, ends, layers = stacks.plans, stacks.ends, depths.shape[1]
+    plans, ends, layers = stacks.plans, stacks.ends, sources.shape[1]
     least = layers
     for n in range(9):
         if joins[n] <= t and first[n] < counts[n] and shift[n] < 0:
             least = min(least, -shift[n])
-    revealed = depths[4, t + least] if least < layers else depths[4, t]
+    revealed = sources[4, t + least if least < layers else t, DEPTH]
     for n in range(9):
         plans[d, t, n, 0] = plans[d, t, n, 1] = plans[d, t, n, 2] = -1
         ends[d, t, n] = 0
@@ -193,7 +211,7 @@ def _plan(stacks, d, t, depths, counts, first, joins, shift):
             continue
         best = np.inf
         for k in range(at + 1, counts[n]):
-            distance = abs(depths[n, k] - revealed)
+            distance = abs(sources[n, k, DEPTH] - revealed)
             if distance < best:
                 plans[d, t, n, 2], best = k, distance
 
@@ -222,33 +240,24 @@ def _last(plans, ends, d, t, n, b, whole):
 
 
 @compiled
-def _sum(stacks, d, t, grid, counts, y, x, whole):
+def _sum(stacks, d, t, sources, counts, whole):
     """Fill the sums of a level; `whole` if layers behind it count at once."""
-    plans, ends, total = stacks.plans, stacks.ends, stacks.sums[d, t]
-    rgba, row = grid.rgba, grid.row
-    one = total.dtype.type(1)
-    total[:] = total.dtype.type(0)
-    for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        py, px = y - v, x - u
-        for b in range(3):
-            first = plans[d, t, n, b]
-            if first < 0:
-                continue
-            through = one
-            for k in range(first, min(_last(plans, ends, d, t, n, b, whole), counts[n])):
-                i = row[k, py, px]
-                w, _, _ = splat(grid, i, py, px, u, v)
-                if k == first:
-                    total[b, 4] += w
-                w *= through
-                for c in range(4):
-                    total[b, c] += w * rgba[i, c]
-                through *= one - rgba[i, 3]
+    plans, ends, total = stacks.plans, stacks.ends, stacks.sums
+    zero, one = total.dtype.type(0), total.dtype.type(1)
     for b in range(3):
-        over = one / max(total[b, 4], stacks.least[d, t])
-        for c in range(4):
-            total[b, c] *= over
+        red, green, blue, alpha, weight = zero, zero, zero, zero, zero
+        for n in range(9):
+            first, through = plans[d, t, n, b], one
+            last = min(_last(plans, ends, d, t, n, b, whole), counts[n]) if first >= 0 else 0
+            for k in range(max(first, 0), last):
+                w = through * sources[n, k, WEIGHT]
+                weight += w if k == first else zero
+                red, green, blue = red + w * sources[n, k, 0], green + w * sources[n, k, 1], blue + w * sources[n, k, 2]
+                alpha += w * sources[n, k, 3]
+                through *= one - sources[n, k, 3]
+        over = one / max(weight, stacks.least[d, t])
+        total[d, t, b, 0], total[d, t, b, 1], total[d, t, b, 2] = over * red, over * green, over * blue
+        total[d, t, b, 3], total[d, t, b, 4] = over * alpha, weight
 
 
 @compiled
@@ -357,111 +366,128 @@ def _adjoint_level(a, d, t, sums, images, least, own, below):
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
     """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
     layers, height, _ = grid.row.shape
-    behind = np.empty((layers + 1, 4), grid.positions.dtype)
+    kind = grid.positions.dtype
+    source, products = np.empty((1, layers, SOURCE), kind), np.empty((layers, 2), kind)
+    gradients = np.empty((layers, 5), kind)
+    slope = kind.type(2) * grid.scale * grid.gamma
+    levels, plans, ends = stacks.levels, stacks.plans, stacks.ends
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
-                _pull_target(d, columns[d], v, grid, y, stacks, adjoints, behind, g_positions, g_rgba)
+                for u in range(-1, 2):
+                    n, count = 3 * (v + 1) + u + 1, _load(source, 0, grid, y + v, columns[d], u, v, kind.type(0))
+                    gradients[:] = 0
+                    _pull_source(gradients, products, source, count, levels[d], plans, ends, adjoints, d, n)
+                    _scatter(g_positions, g_rgba, gradients, source, count, grid.row, y, columns[d] - u, slope)
 
 
 @compiled
-def _pull_target(d, column, v, grid, y, stacks, adjoints, behind, g_positions, g_rgba):
-    """`pull` from one target, v rows farther on, to its sources in row y."""
-    for u in range(-1, 2):
-        x, n = column - u, 3 * (v + 1) + u + 1
-        for t in range(stacks.levels[d] if 0 <= x < grid.row.shape[2] else 0):
-            _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba)
+def _pull_source(gradients, products, source, count, levels, plans, ends, adjoints, d, n):
+    """Add the gradients (K, 5) of the colours and weights of the n-th source (1, K, 8) of a target."""
+    for t in range(levels if count > 0 else 0):
+        for b in range(3):
+            first, last = max(plans[d, t, n, b], 0), 0
+            if plans[d, t, n, b] >= 0:
+                last = min(_last(plans, ends, d, t, n, b, t == len(gradients) - 1), count)
+            _pull_chain(gradients, products, source, first, last, adjoints, d, t, b)
 
 
 @compiled
-def _pull_source(d, t, n, grid, y, x, u, v, stacks, adjoints, behind, g_positions, g_rgba):
-    """`pull` from one level of a target to one of its sources."""
-    positions, rgba, row = grid.positions, grid.rgba, grid.row
-    layers, one, slope = len(row), positions.dtype.type(1), positions.dtype.type(2) * grid.scale * grid.gamma
-    for b in range(3):
-        first = stacks.plans[d, t, n, b]
-        if first < 0:
-            continue
-        last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), layers)
-        while row[last - 1, y, x] < 0:
-            last -= 1
-        for c in range(4):
-            behind[last, c] = 0
-        for k in range(last - 1, first, -1):
-            i = row[k, y, x]
-            w, _, _ = splat(grid, i, y, x, u, v)
-            for c in range(4):
-                behind[k, c] = w * rgba[i, c] + (one - rgba[i, 3]) * behind[k + 1, c]
-        through = one
-        for k in range(first, last):
-            i = row[k, y, x]
-            w, dx, dy = splat(grid, i, y, x, u, v)
-            h, hidden = adjoints[d, t, b, 4] if k == first else 0 * one, 0 * one
-            for c in range(4):
-                h += through * adjoints[d, t, b, c] * rgba[i, c]
-                hidden += adjoints[d, t, b, c] * behind[k + 1, c]
-            if len(g_rgba) > 0:
-                for c in range(4):
-                    g_rgba[i, c] += w * through * adjoints[d, t, b, c]
-                g_rgba[i, 3] -= through * hidden
+def _pull_chain(gradients, products, source, first, last, adjoints, d, t, b):
+    """Add the gradients (K, 5) of the colours and weights of layers first ≤ k < last of a source (1, K, 8).
+
+    `products` (K, 2) is working memory: the gradient's products with the colours of each layer, and of those behind.
+    """
+    red, green, blue, alpha = adjoints[d, t, b, 0], adjoints[d, t, b, 1], adjoints[d, t, b, 2], adjoints[d, t, b, 3]
+    behind, through = gradients.dtype.type(0), gradients.dtype.type(1)
+    for k in range(last - 1, first - 1, -1):
+        own = red * source[0, k, 0] + green * source[0, k, 1] + blue * source[0, k, 2] + alpha * source[0, k, 3]
+        products[k, 0], products[k, 1] = own, behind
+        behind = source[0, k, WEIGHT] * own + (gradients.dtype.type(1) - source[0, k, 3]) * behind
+    for k in range(first, last):
+        w = through * source[0, k, WEIGHT]
+        gradients[k, 0] += w * red
+        gradients[k, 1] += w * green
+        gradients[k, 2] += w * blue
+        gradients[k, 3] += w * alpha - through * products[k, 1]
+        gradients[k, 4] += through * products[k, 0] + (adjoints[d, t, b, 4] if k == first else 0)
+        through *= gradients.dtype.type(1) - source[0, k, 3]
+
+
+@compiled
+def _scatter(g_positions, g_rgba, gradients, source, count, row, y, x, slope):
+    """Add the gradients (K, 5) of a source's layers to those of their samples."""
+    for k in range(count):
+        i = row[k, y, x]
+        if i >= 0:
+            for c in range(4 if len(g_rgba) > 0 else 0):
+                g_rgba[i, c] += gradients[k, c]
             if len(g_positions) > 0:
-                g_positions[i, 0] += slope * w * h * dx
-                g_positions[i, 1] += slope * w * h * dy
-            through *= one - rgba[i, 3]
+                h = slope * source[0, k, WEIGHT] * gradients[k, 4]
+                g_positions[i, 0] += h * source[0, k, ALONG_X]
+                g_positions[i, 1] += h * source[0, k, ALONG_Y]
 
 
 @loop
 def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
     """Fill targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
-    t_positions, t_rgba = tangents
-    change, grown = np.empty((3, 5), out.dtype), np.empty(4, out.dtype)
+    layers, kind = len(grid.row), out.dtype
+    sources, counts = np.empty((9, layers, SOURCE), kind), np.empty(9, np.int64)
+    moves = np.empty((9, layers, 5), kind)
+    change, grown = np.empty((3, 5), kind), np.empty(4, kind)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d]
             if not 0 <= x - border < out.shape[2]:
                 continue
+            for n in range(9):
+                counts[n] = _load(sources, n, grid, y, x, n % 3 - 1, n // 3 - 1, kind.type(0))
             for direction in range(len(out)):
+                _load_tangents(moves, sources, counts, grid, y, x, tangents[0][direction], tangents[1][direction])
                 grown[:] = 0
                 for t in range(stacks.levels[d] - 1, -1, -1):
-                    _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba)
+                    _change(change, d, t, sources, counts, moves, stacks, t == layers - 1)
                     _over(grown, change, stacks.sums, stacks.images, stacks.least, d, t)
                 for c in range(4):
                     out[direction, y - border, x - border, c] = grown[c]
 
 
 @compiled
-def _change(change, d, t, direction, grid, y, x, stacks, t_positions, t_rgba):
+def _load_tangents(moves, sources, counts, grid, y, x, t_positions, t_rgba):
+    """Fill the tangents (9, K, 5) of the colours and weights of a target's sources."""
+    slope = moves.dtype.type(2) * grid.scale * grid.gamma
+    moves[:] = 0
+    for n in range(9):
+        for k in range(counts[n]):
+            i = grid.row[k, y - n // 3 + 1, x - n % 3 + 1]
+            if i < 0:
+                continue
+            if len(t_positions) > 0:
+                along = sources[n, k, ALONG_X] * t_positions[i, 0] + sources[n, k, ALONG_Y] * t_positions[i, 1]
+                moves[n, k, 4] = slope * sources[n, k, WEIGHT] * along
+            for c in range(4 if len(t_rgba) > 0 else 0):
+                moves[n, k, c] = t_rgba[i, c]
+
+
+@compiled
+def _change(change, d, t, sources, counts, moves, stacks, whole):
     """Tangents (3, 5) of the sums of a level: of normalised colours, and of the weight."""
-    rgba, row, sums = grid.rgba, grid.row, stacks.sums
-    layers, zero, one = len(row), change.dtype.type(0), change.dtype.type(1)
-    slope, moved, tinted = change.dtype.type(2) * grid.scale * grid.gamma, t_positions.shape[1] > 0, t_rgba.shape[1] > 0
+    sums, zero, one = stacks.sums, change.dtype.type(0), change.dtype.type(1)
     change[:] = zero
     for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        py, px = y - v, x - u
         for b in range(3):
             first = stacks.plans[d, t, n, b]
             if first < 0:
                 continue
             through, d_through = one, zero
-            last = min(_last(stacks.plans, stacks.ends, d, t, n, b, t == layers - 1), layers)
-            for k in range(first, last):
-                i = row[k, py, px]
-                if i < 0:
-                    break
-                w, dx, dy = splat(grid, i, py, px, u, v)
-                dw = zero
-                if moved:
-                    dw = slope * w * (dx * t_positions[direction, i, 0] + dy * t_positions[direction, i, 1])
-                if k == first:
-                    change[b, 4] += dw
+            change[b, 4] += moves[n, first, 4]
+            for k in range(first, min(_last(stacks.plans, stacks.ends, d, t, n, b, whole), counts[n])):
+                weight = sources[n, k, WEIGHT]
+                w, dw = through * weight, d_through * weight + through * moves[n, k, 4]
                 for c in range(4):
-                    tint = through * w * t_rgba[direction, i, c] if tinted else zero
-                    change[b, c] += (d_through * w + through * dw) * rgba[i, c] + tint
-                d_through *= one - rgba[i, 3]
-                if tinted:
-                    d_through -= through * t_rgba[direction, i, 3]
-                through *= one - rgba[i, 3]
+                    change[b, c] += dw * sources[n, k, c] + w * moves[n, k, c]
+                d_through = d_through * (one - sources[n, k, 3]) - through * moves[n, k, 3]
+                through *= one - sources[n, k, 3]
     for b in range(3):
         over = one / max(sums[d, t, b, 4], stacks.least[d, t])
         more = change[b, 4] if sums[d, t, b, 4] >= stacks.least[d, t] else zero

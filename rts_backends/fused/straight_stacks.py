@@ -1,236 +1,285 @@
-"""Targets of translucent layers whose nine sources have the same layers: most targets, without plans.
+"""Targets of translucent layers whose nine sources pair layer by layer: most targets, without plans.
 
 Layer by layer, all sources are at the level of the target. So nothing lies in front of a level or in a gap, and the
-image is I = S + (W − A) · I' at each level, see `rts.splatting.stacks`.
+image is I = S + (W − A) · I' at each level, see `rts.splatting.stacks`. Each layer is splatted by a stencil of its own,
+in rows of tiles as in `stencil.py`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from rts.plugin_api.loops import compiled, loop
-from rts_backends.fused.mixed_targets import splat
+from rts_backends.fused.rows import ONE, PITCH, RX, RY, SOURCE, SUM, TILE, add_row, compiled, loop, slot, tile
+from rts_backends.fused.stencil import TANGENT, add_tangent_row, gather, load_around, load_image, load_tangents
 
-
-class Straight(NamedTuple):
-    """S targets and what their sums are.
-
-    Attributes:
-        offsets: (H + 1,) int64, where the targets of each row begin.
-        columns: (S,) int32, their columns.
-        levels: (S,) int32, the number of layers of each.
-        sums: (S, K, 5), at each level the colours over the weight, taken as at least one, and the weight.
-        images: (S, K + 1, 4), the image from each level on.
-    """
-
-    offsets: np.ndarray
-    columns: np.ndarray
-    levels: np.ndarray
-    sums: np.ndarray
-    images: np.ndarray
-
-    @classmethod
-    def of(cls, counts: np.ndarray, layers: int, kind: np.dtype) -> Straight:
-        """Room for so many targets (H,) in each row."""
-        offsets = np.concatenate([[0], np.cumsum(counts)])
-        count = offsets[-1]
-        sums, images = np.empty((count, layers, 5), kind), np.empty((count, layers + 1, 4), kind)
-        return cls(offsets, np.empty(count, np.int32), np.empty(count, np.int32), sums, images)
+IMAGE = 4 * PITCH
+"""Length of the planes of an image's row."""
 
 
 @loop
-def find(start, stop, grid, levels, marks, straight, counts):
-    """Move marks of straight targets of rows [start, stop) to another mask.
+def find(start, stop, positions, row, ends, crossed, marks, straight, counts):
+    """Move the marks of straight targets of rows [start, stop) to another mask.
+
+    A target is straight if its sources have c or c − 1 layers, and if no layer of a source is nearer to the target's
+    layers before or behind the one of its number. No outline or line of crossing may be beside it.
 
     Args:
         start: first row.
         stop: end of the rows.
-        grid: the samples, the layers of each cell in order of depth.
-        levels: (H, W) int32, the number of layers of each cell.
-        marks: (H, W) uint8, targets; those that are straight are cleared.
-        straight: (H, W) uint8, to be filled.
-        counts: (H, 2), to be filled with the number of either.
+        positions: (N, 3) of samples.
+        row: (K, H, W), the sample of each cell, in order of depth.
+        ends: (H, W) of `uniform_cells.survey`, 0 where no outline ends; or no rows.
+        crossed: (H, W) uint8, 1 beside lines of crossing; or no rows.
+        marks: (H, W) uint8, targets; straight ones are cleared.
+        straight: (H, W) uint8, to be filled with the number of layers of straight targets, 0 at others.
+        counts: (H,), to be filled with the number of marks left.
     """
-    height, width = levels.shape
-    for y in range(start, stop):
-        counts[y] = 0
+    layers, height, width = row.shape
+    depths, levels = np.empty((3, layers + 1, width), positions.dtype), np.zeros((3, width), np.int32)
+    for y in range(start - 1, stop + 1):
+        if 0 <= y < height:
+            _load(depths[(y + 3) % 3], levels[(y + 3) % 3], positions, row, y)
+        if y <= start:
+            continue
+        own, at = straight[y - 1], (y + 2) % 3
+        own[:] = 0
+        if 0 < y - 1 < height - 1:
+            own[1 : width - 1] = marks[y - 1, 1 : width - 1]
+            if len(ends) > 0:
+                _keep_zeros(own, ends[y - 1])
+            if len(crossed) > 0:
+                _keep_zeros(own, crossed[y - 1])
+            _keep_even(own, levels[0], levels[1], levels[2])
+            most = levels[at].max()
+            for v in range(3):
+                for k in range(most - 1):
+                    here, there = depths[at], depths[v]
+                    _keep_regular(own, here[k], here[k + 1], there[k], there[k + 1])
+        counts[y - 1] = 0
         for x in range(width):
-            straight[y, x] = 0
-            if not marks[y, x]:
-                continue
-            inside = 0 < y < height - 1 and 0 < x < width - 1
-            if inside and _is_straight(grid.positions, grid.row, levels, y, x):
-                marks[y, x], straight[y, x] = 0, 1
-            counts[y, straight[y, x]] += 1
+            marks[y - 1, x] ^= own[x]
+            counts[y - 1] += marks[y - 1, x]
+        if 0 < y - 1 < height - 1:
+            _count(own, levels[0], levels[1], levels[2])
 
 
 @compiled
-def _is_straight(positions, row, levels, y, x):
-    count = levels[y, x]
-    for n in range(9):
-        if levels[y - n // 3 + 1, x - n % 3 + 1] != count:
-            return False
-    for t in range(count - 1):
-        own, next_own = positions[row[t, y, x], 2], positions[row[t + 1, y, x], 2]
-        for n in range(9):
-            py, px = y - n // 3 + 1, x - n % 3 + 1
-            z, next_z = positions[row[t, py, px], 2], positions[row[t + 1, py, px], 2]
-            distance = abs(z - own)
-            if distance > abs(next_z - own) or distance > abs(next_own - z):
-                return False
-    return count > 0
-
-
-@loop
-def fill(start, stop, grid, levels, marks, states, empty, straight):
-    """List the targets of rows [start, stop), and fill their sums and images; the stencil leaves them out."""
-    rgba, row = grid.rgba, grid.row
-    sums, images = straight.sums, straight.images
-    zero, one = sums.dtype.type(0), sums.dtype.type(1)
-    for y in range(start, stop):
-        d = straight.offsets[y]
-        for x in range(marks.shape[1]):
-            if not marks[y, x]:
-                continue
-            straight.columns[d], straight.levels[d], states[y, x] = x, levels[y, x], empty
-            for c in range(4):
-                images[d, levels[y, x], c] = zero
-            for t in range(levels[y, x] - 1, -1, -1):
-                red, green, blue, alpha, weight = zero, zero, zero, zero, zero
-                for n in range(9):
-                    v, u = n // 3 - 1, n % 3 - 1
-                    i = row[t, y - v, x - u]
-                    w, _, _ = splat(grid, i, y - v, x - u, u, v)
-                    red, green, blue = red + w * rgba[i, 0], green + w * rgba[i, 1], blue + w * rgba[i, 2]
-                    alpha, weight = alpha + w * rgba[i, 3], weight + w
-                over = one / max(weight, one)
-                sums[d, t, 0], sums[d, t, 1], sums[d, t, 2] = over * red, over * green, over * blue
-                sums[d, t, 3], sums[d, t, 4] = over * alpha, weight
-                through = min(weight, one) - over * alpha
-                for c in range(4):
-                    images[d, t, c] = sums[d, t, c] + through * images[d, t + 1, c]
-            d += 1
-
-
-@loop
-def recolor(start, stop, own, listed, straight, changes):
-    """Fill `outlines.Outlines.changes` (L, 2, 4) of listed targets that are straight, see `stacks.recolor`."""
-    sums, images = straight.sums, straight.images
-    for y in range(start, stop):
-        d = straight.offsets[y]
-        for j in range(own[y], own[y + 1]):
-            while d < straight.offsets[y + 1] and straight.columns[d] < listed[j]:
-                d += 1
-            if d == straight.offsets[y + 1] or straight.columns[d] != listed[j]:
-                continue
-            weight = sums[d, 0, 4]
-            for c in range(4 if 0 < weight < 1 else 0):
-                changes[j, 1, c] = (sums[d, 0, c] + (weight - sums[d, 0, 3]) * images[d, 1, c]) / weight
-
-
-@loop
-def adjoint(start, stop, straight, border, g, adjoints):
-    """Fill the gradients (S, K, 5) of the sums that are not normalised, from the image's (H, W, 4)."""
-    sums, images = straight.sums, straight.images
-    zero, one = g.dtype.type(0), g.dtype.type(1)
-    own = np.empty(4, g.dtype)
-    for y in range(start, stop):
-        for d in range(straight.offsets[y], straight.offsets[y + 1]):
-            x = straight.columns[d]
-            inside = 0 <= y - border < g.shape[0] and 0 <= x - border < g.shape[1]
-            for c in range(4):
-                own[c] = g[y - border, x - border, c] if inside else zero
-            for t in range(straight.levels[d]):
-                weight, alpha, through, dot = sums[d, t, 4], sums[d, t, 3], zero, zero
-                over = one / max(weight, one)
-                for c in range(4):
-                    through += own[c] * images[d, t + 1, c]
-                    dot += own[c] * sums[d, t, c]
-                    adjoints[d, t, c] = over * own[c]
-                    own[c] *= min(weight, one) - alpha
-                adjoints[d, t, 3] -= over * through
-                adjoints[d, t, 4] = -(dot - through * alpha) * over if weight >= one else through
-
-
-@loop
-def pull(start, stop, grid, straight, adjoints, g_positions, g_rgba):
-    """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
-    height = grid.row.shape[1]
-    for y in range(start, stop):
-        for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
-            for d in range(straight.offsets[y + v], straight.offsets[y + v + 1]):
-                levels, column = straight.levels[d], straight.columns[d]
-                _pull_target(d, levels, column, v, grid, y, adjoints, g_positions, g_rgba)
+def _load(depths, levels, positions, row, y):
+    """Fill the depths (K + 1, W) of a row's layers, infinity where there is none, and the number of layers (W,)."""
+    levels[:] = 0
+    for k in range(len(row)):
+        for x in range(len(levels)):
+            i = row[k, y, x]
+            levels[x] += i >= 0
+            depths[k, x] = positions[i, 2] if i >= 0 else depths.dtype.type(np.inf)
 
 
 @compiled
-def _pull_target(d, levels, column, v, grid, y, adjoints, g_positions, g_rgba):
-    """`pull` from one target, v rows farther on, to its sources in row y."""
-    rgba, row, slope = grid.rgba, grid.row, grid.positions.dtype.type(2) * grid.scale * grid.gamma
-    for t in range(levels):
-        red, green, blue = adjoints[d, t, 0], adjoints[d, t, 1], adjoints[d, t, 2]
-        alpha, weight = adjoints[d, t, 3], adjoints[d, t, 4]
+def _keep_zeros(own, marks):
+    for x in range(len(own)):
+        own[x] &= np.uint8(marks[x] == 0)
+
+
+@compiled
+def _keep_even(own, above, level, below):
+    """Keep targets whose nine sources differ by at most one layer."""
+    for x in range(1, len(own) - 1):
+        least = most = level[x]
         for u in range(-1, 2):
-            i = row[t, y, column - u]
-            w, dx, dy = splat(grid, i, y, column - u, u, v)
-            if len(g_rgba) > 0:
-                g_rgba[i, 0] += w * red
-                g_rgba[i, 1] += w * green
-                g_rgba[i, 2] += w * blue
-                g_rgba[i, 3] += w * alpha
-            if len(g_positions) > 0:
-                h = weight + red * rgba[i, 0] + green * rgba[i, 1] + blue * rgba[i, 2] + alpha * rgba[i, 3]
-                g_positions[i, 0] += slope * w * h * dx
-                g_positions[i, 1] += slope * w * h * dy
+            a, b, c = above[x + u], level[x + u], below[x + u]
+            least, most = min(least, a, b, c), max(most, a, b, c)
+        own[x] &= np.uint8(most - least <= 1)
+
+
+@compiled
+def _count(own, above, level, below):
+    """Multiply marks by the number of layers, the largest of nine sources."""
+    for x in range(1, len(own) - 1):
+        most = 0
+        for u in range(-1, 2):
+            most = max(most, above[x + u], level[x + u], below[x + u])
+        own[x] *= np.uint8(most)
+
+
+@compiled
+def _keep_regular(own, depth, behind, source, source_behind):
+    """Keep targets whose layer of one number is the one nearest to that layer of three sources in a row.
+
+    An infinite depth makes a distance infinite or NaN, which no other exceeds.
+    """
+    for x in range(1, len(own) - 1):
+        irregular = False
+        for u in range(3):
+            distance = abs(source[x + u - 1] - depth[x])
+            irregular |= distance > abs(source_behind[x + u - 1] - depth[x])
+            irregular |= distance > abs(behind[x] - source[x + u - 1])
+        own[x] &= np.uint8(not irregular)
+
+
+# ---------------------------------------------------------------------------------------------- value, derivatives
+
+
+@compiled
+def _depth(straight, y, first, count):
+    """The largest number of layers of `count` targets of row y, from `first` on; 0 if none is straight."""
+    height, width = straight.shape
+    most = np.uint8(0)
+    if 0 <= y < height:
+        for number in straight[y, max(first, 0) : min(first + count, width)]:
+            most = max(most, number)
+    return np.int64(most)
+
+
+@compiled
+def _sums(total, images, sources, layers, y, count):
+    """Fill the sums of each layer in a row, colours over the weight and the weight, and the images from each on."""
+    one = total.dtype.type(1)
+    images[layers * IMAGE : (layers + 1) * IMAGE] = total.dtype.type(0)
+    for k in range(layers - 1, -1, -1):
+        s, image, behind = total[k * SUM : (k + 1) * SUM], images[k * IMAGE :], images[(k + 1) * IMAGE :]
+        s[:] = total.dtype.type(0)
+        for v in range(-1, 2):
+            add_row(s, slot(sources, k, y - v, SOURCE), v, count)
+        for j in range(count):
+            over = one / max(s[ONE + j], one)
+            for c in range(4):
+                s[c * PITCH + j] *= over
+            through = min(s[ONE + j], one) - s[3 * PITCH + j]
+            for c in range(4):
+                image[c * PITCH + j] = s[c * PITCH + j] + through * behind[c * PITCH + j]
+
+
+@compiled
+def _store(image, marks, left, planes, count):
+    """Write planes of colour to the marked targets among `count` of a row, from column `left` on."""
+    for j in range(count):
+        if marks[j]:
+            for c in range(4):
+                image[left + j, c] = planes[c * PITCH + j]
 
 
 @loop
-def push(start, stop, grid, straight, tangents, border, out):
-    """Fill targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
-    t_positions, t_rgba = tangents
-    change, grown = np.empty(5, out.dtype), np.empty(4, out.dtype)
-    for y in range(start + border, stop + border):
-        for d in range(straight.offsets[y], straight.offsets[y + 1]):
-            x = straight.columns[d]
-            for direction in range(len(out) if 0 <= x - border < out.shape[2] else 0):
-                grown[:] = 0
-                for t in range(straight.levels[d] - 1, -1, -1):
-                    _change(change, d, t, direction, grid, y, x, straight.sums, t_positions, t_rgba)
-                    _over(grown, change, straight.sums, straight.images, d, t)
+def forward(start, stop, grid, straight, border, image):
+    """Fill the straight targets (H, W) of rows [start, stop) of the image (H, W, 4)."""
+    layers, width = len(grid.row), image.shape[1]
+    sources, loaded = np.empty(3 * layers * SOURCE, image.dtype), np.empty(3, np.int64)
+    total, images = np.empty(layers * SUM, image.dtype), np.empty((layers + 1) * IMAGE, image.dtype)
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        at = left + border
+        loaded[:] = -9
+        for y in range(start + border, stop + border):
+            most = _depth(straight, y, at, count)
+            if most > 0:
+                load_around(sources, loaded, grid, y, at - 1, count + 2)
+                _sums(total, images, sources, most, y, count)
+                _store(image[y - border], straight[y, at : at + count], left, images, count)
+
+
+@compiled
+def _adjoints(to, total, images, own, layers, y, count):
+    """Fill the gradients of the sums that are not normalised, from the image's in planes `own`, which change."""
+    zero, one = own.dtype.type(0), own.dtype.type(1)
+    for k in range(layers):
+        a, s, behind = slot(to, k, y, SUM), total[k * SUM : (k + 1) * SUM], images[(k + 1) * IMAGE :]
+        for j in range(count):
+            weight, alpha, through, dot = s[ONE + j], s[3 * PITCH + j], zero, zero
+            over = one / max(weight, one)
+            for c in range(4):
+                p = c * PITCH + j
+                through += own[p] * behind[p]
+                dot += own[p] * s[p]
+                a[p] = over * own[p]
+                own[p] *= min(weight, one) - alpha
+            a[3 * PITCH + j] -= over * through
+            a[ONE + j] = -(dot - through * alpha) * over if weight >= one else through
+
+
+@loop
+def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
+    """Add straight targets' shares to the gradients of the samples of source rows [start, stop)."""
+    layers, _, width = grid.row.shape
+    sources, loaded = np.empty(3 * layers * SOURCE, g.dtype), np.empty(3, np.int64)
+    total, images = np.empty(layers * SUM, g.dtype), np.empty((layers + 1) * IMAGE, g.dtype)
+    adjoints, own, gathered = (
+        np.empty(3 * layers * SUM, g.dtype),
+        np.empty(IMAGE, g.dtype),
+        np.empty(8 * PITCH, g.dtype),
+    )
+    depths, slope = np.zeros(3, np.int64), g.dtype.type(2) * grid.scale * grid.gamma
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        loaded[:] = -9
+        for y in range(start - 1, stop + 1):
+            most = _depth(straight, y, left - 1, count + 2)
+            depths[(y + 3) % 3] = most
+            if most > 0:
+                load_image(own, g, straight, 1, border, y, left - 1, count + 2)
+                load_around(sources, loaded, grid, y, left - 2, count + 4)
+                _sums(total, images, sources, most, y, count + 2)
+                _adjoints(adjoints, total, images, own, most, y, count + 2)
+            for k in range(most, layers):
+                slot(adjoints, k, y, SUM)[:] = g.dtype.type(0)
+            for k in range(depths.max() if y > start else 0):
+                s = slot(sources, k, y - 1, SOURCE)[2:]
+                above, level = slot(adjoints, k, y - 2, SUM), slot(adjoints, k, y - 1, SUM)
+                gather(gathered, s, above, level, slot(adjoints, k, y, SUM), count)
+                _scatter(g_positions, g_rgba, grid.row[k, y - 1], left, gathered, s, slope, count)
+
+
+@compiled
+def _scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
+    """Add the sums that a row of cells has gathered to the gradients of their samples."""
+    for j in range(count):
+        i = row[left + j]
+        if i >= 0:
+            if len(g_rgba) > 0:
                 for c in range(4):
-                    out[direction, y - border, x - border, c] = grown[c]
+                    g_rgba[i, c] += gathered[c * PITCH + j]
+            if len(g_positions) > 0:
+                h = gathered[5 * PITCH + j]
+                g_positions[i, 0] += slope * (gathered[6 * PITCH + j] - s[RX + j] * h)
+                g_positions[i, 1] += slope * (gathered[7 * PITCH + j] - s[RY + j] * h)
 
 
 @compiled
-def _change(change, d, t, direction, grid, y, x, sums, t_positions, t_rgba):
-    """Fill the tangent (5,) of the sums at a level."""
-    rgba, row, zero, one = grid.rgba, grid.row, change.dtype.type(0), change.dtype.type(1)
-    slope, moved, tinted = change.dtype.type(2) * grid.scale * grid.gamma, t_positions.shape[1] > 0, t_rgba.shape[1] > 0
-    change[:] = zero
-    for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        i = row[t, y - v, x - u]
-        w, dx, dy = splat(grid, i, y - v, x - u, u, v)
-        dw = zero
-        if moved:
-            dw = slope * w * (dx * t_positions[direction, i, 0] + dy * t_positions[direction, i, 1])
-        change[4] += dw
-        for c in range(4):
-            change[c] += dw * rgba[i, c] + (w * t_rgba[direction, i, c] if tinted else zero)
-    over = one / max(sums[d, t, 4], one)
-    more = change[4] if sums[d, t, 4] >= one else zero
-    for c in range(4):
-        change[c] = (change[c] - more * sums[d, t, c]) * over
-
-
-@compiled
-def _over(grown, change, sums, images, d, t):
-    """From the tangent of the image of the next level to that of a level."""
+def _change(grown, change, tangent, sources, total, images, layers, y, count):
+    """Fill the tangent of a row of the image, in planes `grown`, from the tangents of the sources."""
     zero, one = grown.dtype.type(0), grown.dtype.type(1)
-    weight, behind = sums[d, t, 4], change[3]
-    more = change[4] if weight < one else zero
-    for c in range(4):
-        through = (more - behind) * images[d, t + 1, c] + (min(weight, one) - sums[d, t, 3]) * grown[c]
-        grown[c] = change[c] + through
+    grown[:] = zero
+    for k in range(layers - 1, -1, -1):
+        s, behind = total[k * SUM : (k + 1) * SUM], images[(k + 1) * IMAGE :]
+        change[:] = zero
+        for v in range(-1, 2):
+            add_tangent_row(change, slot(sources, k, y - v, SOURCE), slot(tangent, k, y - v, TANGENT), v, count)
+        for j in range(count):
+            weight, alpha, more = s[ONE + j], s[3 * PITCH + j], change[ONE + j]
+            covered, scaled = (zero, more) if weight >= one else (more, zero)
+            over = one / max(weight, one)
+            hidden = (change[3 * PITCH + j] - scaled * alpha) * over
+            for c in range(4):
+                p = c * PITCH + j
+                through = (covered - hidden) * behind[p] + (min(weight, one) - alpha) * grown[p]
+                grown[p] = (change[p] - scaled * s[p]) * over + through
+
+
+@loop
+def push(start, stop, grid, t_positions, t_rgba, straight, border, out):
+    """Fill the straight targets of rows [start, stop) of the tangents (T, H, W, 4)."""
+    layers, (many, _, width, _) = len(grid.row), out.shape
+    sources, loaded = np.empty(3 * layers * SOURCE, out.dtype), np.empty(3, np.int64)
+    total, images = np.empty(layers * SUM, out.dtype), np.empty((layers + 1) * IMAGE, out.dtype)
+    tangents, change = np.empty((many, 3 * layers * TANGENT), out.dtype), np.empty(SUM, out.dtype)
+    grown = np.empty(IMAGE, out.dtype)
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        at = left + border
+        loaded[:] = -9
+        for y in range(start + border, stop + border):
+            most = _depth(straight, y, at, count)
+            if most > 0:
+                load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, y, at - 1, count + 2)
+                _sums(total, images, sources, most, y, count)
+                for n in range(many):
+                    _change(grown, change, tangents[n], sources, total, images, most, y, count)
+                    _store(out[n, y - border], straight[y, at : at + count], left, grown, count)

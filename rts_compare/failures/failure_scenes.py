@@ -172,6 +172,17 @@ def shells() -> Scene:
     return posed("card behind a shell", [sphere(0.45), far], moves=[1], depth=CARD_DEPTH)
 
 
+def pane() -> Scene:
+    """A pane of glass slides over a card."""
+    panes = [scene_shapes.of_glass(card((56, 60), (30, 26), 2.8, RED, SIZE), 0.5)]
+    return posed("pane of glass", [*panes, card((70, 66), (34, 24), CARD_DEPTH, GREEN, SIZE)], moves=[0], depth=2.8)
+
+
+def behind_glass() -> Scene:
+    """A card behind a pane and a ball of glass."""
+    return posed("card behind glass", scene_shapes.behind_glass(), moves=[1], depth=DISTANCE + 0.8)
+
+
 def coplanar(apart: float = 0.0) -> Scene:
     """Two cards in one plane, or some way apart, which overlap; the nearer one slides."""
     cards = [card((40, 44), (22, 18), DISTANCE, RED, SIZE), card((58, 54), (20, 22), DISTANCE + apart, GREEN, SIZE)]

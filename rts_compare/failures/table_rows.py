@@ -22,6 +22,7 @@ GRID = (
 )
 NO_EDGES = "`none` has no derivative at outlines, by construction."
 ONE_LAYER = "`single` knows nothing of what lies behind."
+OPAQUE_ALONE = "`single` and `multi` take layers to be opaque."
 THIN = "What is thinner than a pixel is met by some rays only, and nothing tells of it between them: more samples help."
 COARSE = "An error of one sample a pixel, which tells only between which two centres an edge is: more samples help."
 
@@ -79,6 +80,18 @@ ROWS: tuple[Row, ...] = (
         f"The card in the middle moves. {ERRORS}",
         Several(tuple(Derivative(partial(failure_scenes.stack, count)) for count in (2, 4, 6, 8))),
         f"{NO_EDGES} {ONE_LAYER}",
+    ),
+    Row(
+        "pane of glass",
+        f"It lets half of the light through, and slides over a card. {ERROR}",
+        Derivative(failure_scenes.pane, pixel=1.0),
+        f"{NO_EDGES} {OPAQUE_ALONE}",
+    ),
+    Row(
+        "card behind glass",
+        f"It moves behind a pane and a closed ball of glass: the fourth layer. {ERROR}",
+        Derivative(failure_scenes.behind_glass, pixel=1.0),
+        f"{NO_EDGES} {OPAQUE_ALONE} Two layers are too few; 'auto' takes all.",
     ),
     Row(
         "coplanar surfaces",
