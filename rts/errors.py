@@ -31,7 +31,7 @@ class RtsWarning(UserWarning):
 
 
 class LayersWarning(RtsWarning):
-    """`layers="auto"` reached its limit."""
+    """The number of layers found by `layers="auto"` reached its limit; the image may need more."""
 
 
 class SamplerWarning(RtsWarning):
@@ -47,7 +47,7 @@ class EmptyImageWarning(RtsWarning):
 
 
 class ToleranceWarning(RtsWarning):
-    """No setting is as accurate as required."""
+    """No setting that was tried is as accurate as required."""
 
 
 class InputWarning(RtsWarning):
