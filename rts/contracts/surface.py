@@ -167,7 +167,7 @@ class TriangleSurface(Surface):
     def proxy_key(self, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Hashable:
         """A value that changes when the view requires other triangles, for the same inputs.
 
-        Override it only if triangles depend on the view. The default is size and camera, which change in every view.
+        Override it only if triangles depend on the view. The default is size and camera: each view has its triangles.
         """
         return size, *(m.tobytes() for m in camera)
 

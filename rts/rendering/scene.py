@@ -26,7 +26,7 @@ class Scene(NamedTuple):
         camera: the camera of the whole image.
         samplers: the sampler of each part, as the user chose it.
         entries: the structure that each sampler has built for its part, or None.
-        sizes: for each part the largest number that its surface reads; None if unknown.
+        sizes: for each part the largest absolute number in the θ that its surface reads; None if unknown.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
     """
 

@@ -707,7 +707,7 @@ def world_vectors(view: Array, direction: Sequence[float]) -> Array:
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
-    """View and projection in one engine and dtype: those of the matrix that is no constant, if one is not."""
+    """View and projection in one engine and dtype; if only one is a constant, those of the other."""
     _, (view, projection) = promote(view, projection)
     return view, projection
 
