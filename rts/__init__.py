@@ -3,11 +3,11 @@
 Find where camera rays meet a surface with any ordinary renderer; evaluate the surface there, shade it and splat it;
 differentiate only that.
 
-Plugins import from `rts.plugin_api` what is not here. The kinds of warnings are in `rts.errors`.
+Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`.
 
-The surfaces that come with it are attributes, too, loaded when they are first used: `rts.Mesh`, `rts.Bezier`,
-`rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are
-`rts.tune`, of the package `rts_compare`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
+`rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are `rts.tune`, of the package `rts_compare`,
+`rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -55,10 +55,10 @@ _MOVED = {
     "rts.plugin_api.records": "ArraySpec Fragments Proxy RayHits Rays Samples Splats",
     "rts.splatting": "exact_calibration",
 }
-"""Module → names that were here."""
+"""Module → names that moved there from `rts`, separated by spaces."""
 
 if TYPE_CHECKING:
-    # Names alone, so that misspelt ones are found: entry points say what they stand for, as of everybody's plugins.
+    # Declared so that type checkers find misspelt names; the objects come from entry points.
     Bezier: Any
     BSpline: Any
     Isosurface: Any
@@ -73,7 +73,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str):
-        """A built-in surface or function, found through entry points when it is first asked for."""
+        """The built-in surface or function of this name, imported through its entry point on first use."""
         for place, names in _MOVED.items():
             if name in names.split():
                 raise AttributeError(f"rts.{name} is {place}.{name} now")

@@ -38,11 +38,13 @@ VARIABLES: Mapping[str, tuple[str, ...]] = {
     "rts.shaders": ("opaque", "uniform", "takes_views", "reads"),
     "rts.splatters": ("layers", "reach", "reads", "fills_interiors", "translucent"),
 }
-"""Group → class variables of its base class that are reported."""
+"""Group → class variables of its base class that are reported as capabilities."""
 
 
 def capabilities(group: str, plugin: Any) -> dict[str, Any]:
-    """Capabilities by name: class variables of the group's base, and whether certain methods are overridden.
+    """Capabilities by name: values of `VARIABLES`, and True or False for `METHODS`, which a plugin may override.
+
+    Empty for groups without a base class, such as "rts.commands".
 
     Args:
         group: such as "rts.samplers".
@@ -73,7 +75,7 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:
-    """Capabilities in a line: names of true ones, names and values of others."""
+    """Capabilities in a line: names of true ones, names and values of others; False and None are left out."""
     words = []
     for name, value in capabilities.items():
         shown = name.replace("_", " ")

@@ -47,7 +47,7 @@ class EmptyImageWarning(RtsWarning):
 
 
 class ToleranceWarning(RtsWarning):
-    """No setting is as accurate as required."""
+    """No setting that was tried is as accurate as required."""
 
 
 class InputWarning(RtsWarning):

@@ -13,7 +13,7 @@ from rts.errors import PluginError
 
 
 class Plugin(abc.ABC):  # noqa: B024
-    """The common base of the base classes; a plugin subclasses the one of its kind."""
+    """The common base of `Surface`, `Sampler` and the like; a plugin subclasses the base class of its kind."""
 
 
 PROMISES: Mapping[str, tuple[str, ...]] = {
@@ -23,11 +23,11 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
     "fills_interiors": ("image", "accumulate"),
     "translucent": ("image", "accumulate"),
 }
-"""Promise → the methods that it is about, in classes that have them."""
+"""Promise → the methods whose behaviour it describes; a class may lack some of them."""
 
 
 def overrides(plugin: Any, method: str, base: type) -> bool:
-    """True if a plugin of this base class, or a class of such plugins, overrides a method of the base."""
+    """True if a plugin, or a class of plugins, subclasses the base and overrides a method of the base."""
     return _overrides(plugin if isinstance(plugin, type) else type(plugin), method, base)
 
 
@@ -39,8 +39,8 @@ def _overrides(kind: type, method: str, base: type) -> bool:
 def promised(plugin: Any, name: str) -> Any:
     """The value of a promise that holds for a plugin, or for a class of plugins.
 
-    A promise holds for the class that states it. If a subclass overrides a method that the promise is about, the value
-    is the default of the base. A class without such a method states the promise for its subclasses.
+    A promise holds for the class that states it. If a subclass overrides a method listed in `PROMISES`, the value is
+    the default of the base. If the class itself defines no such method, the promise holds for its subclasses, too.
     """
     holds, default = _holds(plugin if isinstance(plugin, type) else type(plugin), name)
     return getattr(plugin, name) if holds or name in getattr(plugin, "__dict__", ()) else default
@@ -48,7 +48,7 @@ def promised(plugin: Any, name: str) -> Any:
 
 @functools.lru_cache(maxsize=4096)
 def _holds(kind: type, name: str) -> tuple[bool, Any]:
-    """True if a promise of a class holds; also the value of its base."""
+    """True if a promise holds for a class; also the default value, that of its base."""
     stated = [c for c in kind.__mro__ if name in vars(c)]
     own, base = stated[0], stated[-1]
     there = {m for c in own.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}

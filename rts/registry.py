@@ -1,8 +1,8 @@
 """Plugins by (group, name), found through the entry points of installed distributions.
 
-Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines; rts.commands, what `rts` does; and
-rts.functions, which those of the library itself are attributes of `rts`. The library's own plugins are
-registered in its `pyproject.toml` in the same way as anyone's. Only the plugin asked for is imported.
+Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines; rts.commands, the subcommands of `rts`;
+and rts.functions, of which the library's own are attributes of `rts`. The library registers its own plugins in its
+`pyproject.toml`, in the same way as anyone's. Only the plugin asked for is imported.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class PluginInfo(NamedTuple):
         group: the entry-point group.
         name: the plugin's name.
         distribution: name and version of the distribution that registers it.
-        error: the reason why it does not load, or None.
-        missing: packages of the extra with the plugin's name that are not installed. A plugin may be ready without
-            them, with fewer features.
+        error: the reason why the plugin does not load, or None.
+        missing: packages that the extra of the plugin's name requires and that are not installed. A plugin may be
+            ready without them, with fewer features.
         install: the requirement that brings the missing packages, such as "rasterize-then-splat[torch]". None if no
-            package is missing, or no extra brings it.
-        capabilities: its capabilities by name, see `rts.capabilities`. Empty if it does not load.
+            package is missing.
+        capabilities: the plugin's capabilities by name, see `rts.capabilities`. Empty if it does not load.
     """
 
     group: str
@@ -96,12 +96,12 @@ def plugins(group: str, *, details: Literal[True]) -> list[PluginInfo]: ...
 
 
 def plugins(group: str, *, details: bool = False) -> list[str] | list[PluginInfo]:
-    """The plugins registered in a group, such as "rts.samplers" (or "samplers"), sorted by name.
+    """The names of the plugins registered in a group, sorted.
 
     Args:
-        group: the group.
-        details: whether to return a `PluginInfo` for each, with distribution, state and capabilities. This imports
-            every plugin.
+        group: such as "rts.samplers" (or "samplers").
+        details: whether to return a `PluginInfo` in place of each name, with distribution, state and capabilities.
+            This imports every plugin of the group.
 
     Raises:
         InputError: no such group.
@@ -176,7 +176,7 @@ def plugin(group: str, name: str) -> Any:
 
 
 def built_in_attributes() -> dict[str, tuple[str, str]]:
-    """Attribute of `rts` → group and name of the surface or function of the library's own distribution it stands for.
+    """Attribute of `rts` → group and name of a surface or function that the library's own distribution registers.
 
     Such as "Mesh" → ("rts.surfaces", "mesh"), and "tune" → ("rts.functions", "tune").
     """
@@ -192,16 +192,16 @@ def built_in_attributes() -> dict[str, tuple[str, str]]:
 
 
 def attribute(name: str, known: Iterable[str]) -> Any:
-    """The built-in surface of a class's name, such as `rts.Mesh`, or the function of a name, such as `rts.tune`.
+    """The built-in surface or function that is an attribute of `rts`, such as `rts.Mesh` or `rts.tune`.
 
     Args:
-        name: the attribute of `rts`.
-        known: the other attributes of `rts`, for a hint in errors.
+        name: the attribute's name.
+        known: `rts.__all__`; other names in lower case are refused, and errors suggest the nearest.
 
     Raises:
-        AttributeError: there is no such thing, or it cannot be imported.
+        AttributeError: `rts` has no such attribute, or it cannot be imported.
     """
-    # Modules that are imported are looked for here, too: they are not worth a look at entry points.
+    # Python also asks for submodules, in lower case; for their sake entry points need not be read.
     found = built_in_attributes() if name[:1].isupper() or name in known else {}
     if name not in found:
         raise AttributeError(f"module 'rts' has no attribute {name!r}{_suggest(name, [*known, *found])}")

@@ -36,7 +36,7 @@ def check_numbers(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
     """Refuse anything but a finite real array, or list of numbers, of one of these shapes.
 
     Returns:
-        The value as NumPy; None if it is traced, or batched.
+        The value as NumPy; None if it is traced, or batched by `vmap`.
     """
     expected = " or ".join("a number" if s == () else str(s) for s in shapes)
     wrong = InputError(f"{name} is {quoted(value)}; expected {'' if () in shapes else 'numbers of shape '}{expected}")
@@ -76,7 +76,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
-    """`check_numbers`, which also refuses numbers of zero or less."""
+    """`check_numbers` that also refuses numbers of zero or less; without shapes, one number is expected."""
     array = check_numbers(name, value, *(shapes or ((),)))
     if array is not None and not (array > 0).all():
         raise InputError(
@@ -110,7 +110,7 @@ ROTATION_TOLERANCE = 2e-3
 
 
 def is_invertible(matrix: np.ndarray) -> bool:
-    """True if a matrix has an inverse. Lengths of its rows and columns do not matter."""
+    """True if a matrix has an inverse, once its rows and columns are scaled to length one."""
     for axis in (1, 0):
         length = np.linalg.norm(matrix, axis=axis, keepdims=True)
         matrix = matrix / np.where(length > 0, length, 1)

@@ -24,7 +24,8 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         name: the name in error messages.
 
     Raises:
-        InputError: a leaf is no array, is complex, or has no values in one piece of memory.
+        InputError: a leaf is no array, is complex, or cannot be used, such as a sparse tensor.
+        EngineError: a leaf is an array of an unknown framework.
     """
     kind = type(tree)
     if kind is np.ndarray:
@@ -112,7 +113,7 @@ def kind_of(x: Any) -> str:
 
 
 def promote(*values: Any) -> tuple[Any, list[Array]]:
-    """Namespace and arrays: the arguments of a call as floating arrays of one engine.
+    """The array-API namespace of the arguments, and the arguments as floating arrays of one engine.
 
     Numbers and lists become arrays. If all arguments are NumPy arrays or numbers, the result is float64.
     """
@@ -168,7 +169,7 @@ def without_border(image: Array, border: int) -> Array:
 
 
 def is_finite(*arrays: Array) -> bool:
-    """True if all known values are finite; quick if they are."""
+    """True if no array holds NaN or infinity; traced arrays pass. Quick if all are finite."""
     return all(map(_is_finite, arrays))
 
 

@@ -59,7 +59,7 @@ class Engine(Plugin):
 
     @abc.abstractmethod
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
-        """Sums (count, C) of the rows of `values` (M, C) that share a segment (M,)."""
+        """Sums (count, C) of rows of `values` (M, C); `segments` (M,) holds the index of the sum of each row."""
 
     @abc.abstractmethod
     def to_numpy(self, x: Array) -> np.ndarray:
@@ -82,7 +82,10 @@ class Engine(Plugin):
         raise self._no_derivatives()
 
     def jacobian(self, f: Callable) -> Callable:
-        """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, a row an unknown, by forward mode."""
+        """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, by forward mode.
+
+        The first axis of derivatives is that of the vector.
+        """
         raise self._no_derivatives()
 
     def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
@@ -133,9 +136,9 @@ class Engine(Plugin):
         return False
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
-        """Call `f` if `on_host` holds for the arrays, else `otherwise`; both return the same results.
+        """Call `f` with the arrays if `on_host` holds for them, else `otherwise`; both return the same results.
 
-        Engines that trace decide once the compiled program knows its device.
+        A traced program chooses between the two once its device is known.
         """
         return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
 
@@ -173,7 +176,7 @@ class Engine(Plugin):
     def by_rows_in_use(
         self, f: Callable[[dict[str, Array]], Array], rows: Mapping[str, Array], row: Array, whole: Array
     ) -> Array:
-        """The value `whole` of `f(rows)`, a function that treats each row by itself.
+        """The values `f(rows)` of a function that treats each row by itself; `whole` holds them already.
 
         The default returns `whole`. Compiled programs may allot more rows than are used. Their engine may call `f` with
         fewer rows instead, and so skip most of the unused ones.
@@ -181,7 +184,7 @@ class Engine(Plugin):
         Args:
             f: packed arrays (n, ·) by name → (n, ·).
             rows: packed arrays (N, ·).
-            row: (K, H, W) integers; rows up to the largest of them are in use.
+            row: (K, H, W) integers, the row of each cell, or −1; rows up to the largest are in use.
             whole: `f(rows)`, (N, ·).
 
         Returns:
@@ -250,7 +253,10 @@ class Engine(Plugin):
         return f
 
     def take_error(self) -> RtsError | None:
-        """The last error raised inside a host call, once; for frameworks that wrap such errors in their own."""
+        """The last error raised inside a host call, handed out once; None if there is none.
+
+        For frameworks that wrap such errors in their own.
+        """
         return None
 
 
@@ -363,12 +369,12 @@ def context_of(*trees: Tree) -> Context:
 def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> Context:
     """The engine of a scene, and an array of its dtype: the one rule for dtypes.
 
-    The dtype is the widest floating one of the torch or jax arrays. If all arrays are NumPy, it is that of the widest
-    in θ: cameras, transforms and backgrounds in NumPy are constants, and widen nothing. It is float32 at least.
+    The dtype is the widest floating one of the torch or jax arrays. If all arrays are NumPy, it is float64 if some θ
+    holds a float64 array, else float32. NumPy cameras, transforms and backgrounds are constants, and widen nothing.
 
     Args:
         parts: the parts.
-        *others: further arrays of the scene.
+        *others: further arrays of the scene, such as cameras.
         engine: the name of an engine to use in any case; arrays of another one are refused.
     """
     own, like = context_of(parts, *others)
@@ -404,7 +410,7 @@ _names: list[str] = []
 
 
 def load_engines() -> None:
-    """Load the engines whose framework has been imported, so that they know the library's records."""
+    """Load the engines whose framework has been imported, so that these frameworks accept the library's records."""
     _imported()
 
 
@@ -474,7 +480,7 @@ def _widest(arrays: Sequence[Any]) -> Array | None:
 
 
 def floating_bits(x: Array) -> int:
-    """Number of bits of a real floating dtype, of an array; 0 for other dtypes. Cached by dtype."""
+    """Number of bits of an array's dtype if it is real and floating, else 0. Cached by dtype."""
     bits = _BITS.get(x.dtype)
     if bits is None:
         xp = namespace(x)

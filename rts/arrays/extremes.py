@@ -27,7 +27,7 @@ def extent(x: np.ndarray) -> tuple[int, int]:
 
 
 def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """A bool mask of the non-negative indices, and the least and the largest of all indices and −1."""
+    """A bool mask of the non-negative indices, and the least and the largest of all; −1 takes part in both."""
     if not x.size:
         return np.zeros(x.shape, np.bool_), -1, -1
     if x.dtype == np.int32:
@@ -39,7 +39,7 @@ def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
 
 
 def _ends(x: np.ndarray, mask: np.ndarray) -> tuple[int, int]:
-    """The least and the largest number of int32. `mask`, of x's shape or empty, is set where x is not negative."""
+    """The least and the largest number in x, int32. Also sets `mask`, of x's shape or empty, to x ≥ 0."""
     from rts.arrays import extremes_loops
 
     numbers = read_only(x).reshape(-1)
@@ -49,7 +49,7 @@ def _ends(x: np.ndarray, mask: np.ndarray) -> tuple[int, int]:
 
 
 def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
-    """Indices of the first covered minimum, if below zero, and of the first covered maximum, if above zero."""
+    """Indices of the least covered number, if below zero, and of the largest, if above; of equals the first."""
     if x.dtype != np.float32:
         sizes = np.where(covered, x, 0).reshape(1, -1)
         extremes, length = np.concatenate([-sizes, sizes]).max(axis=1, initial=0)[None], x.size
@@ -68,7 +68,7 @@ def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
 
 
 def _sizes(x: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Largest distances below and above zero in each chunk of covered float32 numbers, as bits (·, 2) int32."""
+    """Largest distances below and above zero of covered float32 numbers, for each chunk: their bits (·, 2), int32."""
     from rts.arrays import extremes_loops
 
     bits = read_only(x).reshape(-1).view(np.int32)

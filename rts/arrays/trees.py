@@ -86,7 +86,7 @@ def collected(tree: Tree) -> list[Any]:
 
 _LEAF, _NOTHING, _RECORD, _SEQUENCE, _MAPPING = range(1, 6)
 _KINDS: dict[type, int] = {}
-"""The kind of each type of tree met so far."""
+"""The kind, such as `_LEAF`, of each type of tree met so far."""
 
 
 def _kind(tree: Tree) -> int:

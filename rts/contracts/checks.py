@@ -49,12 +49,12 @@ class CheckedPart(Part):
 
     @functools.cached_property
     def reads(self) -> tuple[str, ...] | None:
-        """Entries of the G-buffer and of θ that the shader promises to be content with; None for all."""
+        """The only entries of the G-buffer and of θ that the shader promises to need; None for all."""
         return promised(self.shader, "reads")
 
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
-"""Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""
+"""Rough number of bytes to sample, shade and splat a cell of a layer in array code; compiled code needs less."""
 
 
 def _memory() -> float:
@@ -357,7 +357,7 @@ def check_splats(
     used = np.unique(rows[(rows >= first) & (rows < first + count)]) - first
 
     def wrong(x: Any) -> bool:
-        """True if a value holds NaN or infinity; of an array with a row per sample, visible rows count."""
+        """True if a value holds NaN or infinity; if it has a row for each sample, only visible rows are checked."""
         array = value_of(x)
         if array is None or array.dtype.kind != "f":
             return False

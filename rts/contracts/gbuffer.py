@@ -14,8 +14,8 @@ class GBuffer(dict):
     Surfaces return attributes in local space; shaders receive positions and normals in world space. An attribute may be
     deferred: it is computed when first read, so a shader pays for what it reads. Reading a missing attribute raises an
     `InputError`. Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
-    With "uv" shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one sample to the right
-    and one down, without derivative.
+    If there is "uv", shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the
+    right, and ∂u/∂y, ∂v/∂y, the change to the cell below; without derivative.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -34,7 +34,7 @@ class GBuffer(dict):
 
     @property
     def computed(self) -> dict[str, Any]:
-        """Attributes computed so far; deferred ones count once they have been read."""
+        """Attributes computed so far, among them the deferred ones that have been read."""
         return {name: self[name] for name in super().__iter__()}
 
     def defer(self, name: str, compute: Callable[[], Any]) -> None:

@@ -11,9 +11,9 @@ from rts.scene.topology import fixed
 def pieces(faces: np.ndarray) -> np.ndarray:
     """Number the consistently oriented pieces of a triangle table, the largest first.
 
-    Two triangles belong to one piece if they alone share an edge and run along it in opposite directions. A piece has
-    no sides if some two of its triangles run along their edge in the same direction, as in a Möbius strip. The number
-    of such a piece is 0, and so is that of pieces beyond the range of numbers.
+    Two triangles are joined if they alone share an edge and run along it in opposite directions; joined triangles make
+    a piece. A piece has no sides if some two of its triangles run along their edge in the same direction, as in a
+    Möbius strip. Such a piece has the number 0, and so have pieces from `Cells.MORE_BEHIND` on.
 
     Args:
         faces: (T, 3) integers.

@@ -40,8 +40,8 @@ class Proxy(NamedTuple):
     Attributes:
         vertices: (V, 3) float32, local space.
         faces: (T, 3) int32.
-        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`, or none where I = 0 and
-            the surface has no `refine`.
+        ids: (T, I) int32, handed on to the samples of the triangle. None means `faces`; or no ids, if I = 0 and the
+            surface has no `refine`.
         corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
     """
 
@@ -88,21 +88,22 @@ local space."""
 
 @record()
 class Cells:
-    """The samples in the cells of a grid, by number, front to back.
+    """The samples in the cells of a grid, front to back, as indices of packed rows.
 
     Attributes:
-        row: (K, H, W) int32, the sample in each cell, or −1.
-        depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1. None where positions tell it.
+        row: (K, H, W) int32, the index of the sample in each cell, or −1.
+        depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1. None where positions hold it.
         facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on. It is negative
             where the piece is seen from behind, and 0 where the side is unknown or not of interest. Pieces are
             consistently oriented: a piece seen from opposite sides in two neighbouring cells is not one sheet there.
             Numbers are larger by `MORE_BEHIND` in the last layer of cells whose K layers are all covered. None where
             no sides are recorded.
-        exit: (H, W) int32, the sample where the ray leaves the closed part behind its front, or −1. Exits have rows of
-            their own, which `row` does not name, in cells at outlines and beside them. None where none are recorded.
-        settled: (H, W) integers, marks cells whose colour cannot change, however the scene moves: the sample that has
-            this colour, or −1. Such a cell may lack a sample of its own, and so may cells around it that affect no
-            others. Samples in it and in the eight cells around it have its colour. None if no cells are marked.
+        exit: (H, W) int32, the index of the sample where the ray leaves the closed part behind its front, or −1. Exits
+            are further samples, not in `row`, in cells at outlines and beside them. None if none are recorded.
+        settled: (H, W) integers. In a cell whose colour cannot change, however the scene moves, the index of a sample
+            of this colour; −1 in others. Such a cell may lack a sample of its own, and so may cells around it that
+            affect no others. Samples in it and in the eight cells around it have its colour. None if no cells are
+            marked.
     """
 
     MORE_BEHIND: ClassVar[int] = 1 << 14
@@ -184,7 +185,7 @@ class Question(NamedTuple):
     Attributes:
         covered: (K, H, W) bool, true where there is a sample.
         depth: (K, H, W) float, the depths of the samples; anything where nothing is covered.
-        size: the largest coordinate that depths were computed from, which bounds rounding; 0 if unknown.
+        size: the largest absolute coordinate that depths were computed from, which bounds rounding; 0 if unknown.
         part: (K, H, W) integers, the part of each sample; None if all are of one part, or if it is unknown.
     """
 
@@ -209,11 +210,11 @@ class Decision(NamedTuple):
 
 
 class Hidden(Protocol):
-    """The decider on hidden samples. It goes by depths alone, and keeps no state.
+    """A rule that tells which samples are hidden, by their depths alone. It keeps no state.
 
     Attributes:
         settles: whether decisions have `settled` (see `Cells.settled`).
-        size: the largest number that surfaces read, which bounds rounding; 0 if unknown.
+        size: the largest absolute number in the θ that surfaces read, which bounds rounding; 0 if unknown.
     """
 
     @property
@@ -223,7 +224,7 @@ class Hidden(Protocol):
 
     @property
     def size(self) -> float:
-        """The largest number that surfaces read; 0 if unknown."""
+        """The largest absolute number in the θ that surfaces read; 0 if unknown."""
         ...
 
     def decide(self, question: Question) -> Decision:
@@ -239,7 +240,7 @@ class Request:
         capacity: number of packed rows to allot, or None for as many as there are. Every sampler follows it.
         cells: (L, C) int32, the only cells of the grid to sample, as flat indices, none twice, or −1 for none; an array
             of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
-        hidden: decides which samples to keep, once depths are known; None to keep all.
+        hidden: the rule that tells which samples to drop, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
         exits: whether to compute `Cells.exit` of a part that is culled, at outlines and beside them.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
@@ -262,13 +263,13 @@ class Fine(_OnCells):
 
     Attributes:
         samples: one `Samples` for each part; their cells are a list, not a grid.
-        index: (M,) int32, the sample that each splat shows, counted over all parts in order.
+        index: (M,) int32, the index of the sample that each splat shows, counted over all parts in order.
         shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
         cells: the index of the splat in each cell of the layout; without depth.
         part: (K, h, w) int32, the part seen there, or −1.
         wanted: (h, w) bool, the cells of active pixels.
-        pixel: (H, W) int32, for each pixel of the image the index of its pixel in the layout, counted along lines
-            without the apron; −1 where the pixel is not active.
+        pixel: (H, W) int32, for each pixel of the image the index of its pixel in the layout, counted row by row with
+            the apron left out; −1 where the pixel is not active.
         coarse: (h', w') bool, the cells of the coarse grid, with its apron, whose pixels are not active.
         overflow: () int32, number of pixels that stay coarse for want of room, plus number of samples dropped.
         supersample: s; each active pixel has s² cells.
@@ -354,7 +355,7 @@ class Splats(_OnCells):
             See `parts`.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for a depth of the scene's
             scale.
-        wanted: (H, W) bool, the targets whose colour is used; others may have any finite colour. None for all.
+        wanted: (H, W) bool, the cells whose colour is used; others may get any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
         one_part: whether all samples are of one part.
         opaque: a promise that alpha is 1 at all samples.

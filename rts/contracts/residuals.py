@@ -25,14 +25,14 @@ class Residuals(Plugin):
         """Residuals, of any shape."""
 
     def at_stage(self, stage: Any) -> Callable[[Tree], Array]:
-        """The residuals at another resolution, for `rts.fit` with a schedule."""
+        """The residuals at the resolution of an `rts.Stage`, for `rts.fit` with a schedule."""
         raise NotImplementedError
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for their Jacobian J.
 
         W and S are diagonals of `self.loss.weights(r)`, ones for the mean square.
-        U counts the numbers in the parameters, in the order of `rts.arrays.trees.leaves`. All are arrays of the
-        parameters' engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
+        U is the number of numbers in the parameters, in the order of `rts.arrays.trees.leaves`. All three are arrays of
+        the parameters' engine, perhaps traced. A class with this method spares Levenberg–Marquardt the Jacobian.
         """
         raise NotImplementedError

@@ -22,7 +22,7 @@ class Sampler(Plugin):
 
     @abc.abstractmethod
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
-        """The `layers` nearest samples of every pixel.
+        """The `layers` nearest samples of every cell.
 
         Args:
             part: the part; its `transform` is already in the camera. A sampler that cannot ignore triangles seen from
@@ -33,15 +33,15 @@ class Sampler(Plugin):
             request: the number of rows to allot, and further options.
 
         Returns:
-            Samples, without derivative, in arrays of the engine of the part and the camera. The sampler, the part and
-            the request decide which fields are None; values never do.
+            Samples, without derivative, in arrays of the engine of the part and the camera. Which fields are None
+            depends on the sampler, the part and the request, never on values in arrays.
 
         Raises:
             InputError: this sampler cannot sample the surface.
         """
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
-        """The sampler for a part: this one, or another if this one only chooses, as "auto" does.
+        """The sampler for a part: this one, or another if this one only chooses among samplers, as "auto" does.
 
         Args:
             part: the part.

@@ -13,10 +13,10 @@ from rts.scene.camera import Camera
 
 
 class Shader(Plugin):
-    """A function that colours samples. Any function with the signature of `__call__` will do, with these attributes.
+    """A function that colours samples. A plain function with the signature of `__call__` and these attributes will do.
 
-    Promises other than `opaque` belong to a class and its `__call__`. A subclass with a `__call__` of its own has to
-    repeat them.
+    Promises other than `opaque` hold for the `__call__` of the class that states them. A subclass that overrides
+    `__call__` has to repeat them.
 
     Attributes:
         channels: C, the number of channels besides alpha: 3 for colours, any other number for features.
@@ -25,9 +25,9 @@ class Shader(Plugin):
         takes_views: a promise that one call may take samples of several views, as `rts.render_views` then does:
             `camera` is a `RowCameras`, whose methods give a row for each sample. Such a shader also declares `reads`,
             without "uv_footprint".
-        reads: a promise that it needs no entries but these, of the G-buffer besides position and of θ; None for all.
-            Samples then carry no others. `rts.explain` lists entries of θ that nobody reads, and warns of names that
-            almost match one of these.
+        reads: a promise to need no entries but these, of θ and, besides "position", of the G-buffer; None for all.
+            Samples then carry no others. `rts.explain` lists entries of θ that neither surface nor shader reads, and
+            warns of names that almost match one of these.
     """
 
     channels: int = 3
@@ -55,7 +55,7 @@ class Shader(Plugin):
 
 
 class FunctionShader(Shader):
-    """A function as a shader, with the attributes of a shader that it has."""
+    """A function as a shader; attributes that the function lacks have the defaults of `Shader`."""
 
     def __init__(self, function: Callable[..., Array]):
         self.function = function

@@ -42,7 +42,7 @@ class Splatter(Plugin):
         """The image of all cells, those of the border included: (H, W, 4) premultiplied RGBA."""
 
     def cropped(self, splats: Splats) -> Array:
-        """The image without the border: (H − 2 border, W − 2 border, 4). Override it only to save a copy."""
+        """The result of `image` with the border cut off: (H − 2 border, W − 2 border, 4). Override to save a copy."""
         return without_border(self.image(splats), splats.border)
 
     @final
@@ -52,7 +52,7 @@ class Splatter(Plugin):
         Args:
             positions: (N, 3) pixel x, pixel y, linear depth.
             rgba: (N, 4) premultiplied.
-            row: (K, H, W) int32, the sample of each cell front to back, or −1.
+            row: (K, H, W) int32, the index of the sample of each cell, front to back, or −1.
             border: cells at each side that splat into the image but are no part of it.
             opaque: a promise that alpha is 1. With False, light passes through samples, if the splatter is
                 `translucent`.
@@ -67,16 +67,16 @@ class Splatter(Plugin):
         return self.cropped(_checked_splats(positions, rgba, row, border).replace(opaque=opaque))
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """The samples that can reach the image, in value or derivative, where all are opaque and on pixel centres.
+        """The samples that can affect the image, in value or derivative, if all are opaque and on cells' centres.
 
-        Others are dropped before they are evaluated, in a class that overrides it. Host arrays.
+        If a class overrides this method, other samples are dropped before they are evaluated. Host arrays.
 
         Args:
             covered: (K, H, W) bool.
             depth: (K, H, W) float; 0 where nothing is covered.
 
         Returns:
-            (K, H, W) bool; by default all that are covered.
+            (K, H, W) bool; by default `covered`.
         """
         return covered
 
@@ -108,7 +108,7 @@ class SummingSplatter(Splatter):
 
         Returns:
             Mean loss (), JᵀSJ / n (T, T) and JᵀWr / n (T,), where W and S are diagonals of `loss.weights(r)`, ones for
-            the square; None where this splatter cannot work on these arrays.
+            the square. None if this splatter cannot work on these arrays.
         """
 
 

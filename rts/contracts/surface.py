@@ -123,8 +123,8 @@ class TriangleSurface(Surface):
     Attributes:
         proxy_is_cheap: whether making the triangles costs no more than comparing their inputs with the last ones.
         refine_moves: whether `refine` moves samples or drops them. If it only adds tables or params, hidden samples are
-            left out before.
-        face_count: the number of triangles, or None if unknown beforehand; the sampler "auto" decides by it.
+            dropped before `refine` is called.
+        face_count: the number of triangles, or None if unknown beforehand; by it the sampler "auto" chooses a sampler.
     """
 
     proxy_is_cheap: bool = False
@@ -165,14 +165,14 @@ class TriangleSurface(Surface):
         """
 
     def proxy_key(self, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """A value that changes when triangles must be rebuilt for another reason than their inputs, e.g. the camera.
+        """A value that changes when the view requires other triangles, for the same inputs.
 
-        Override it only where triangles depend on the view. The default is the view: triangles are rebuilt for each.
+        Override it only if triangles depend on the view. The default is size and camera: each view has its triangles.
         """
         return size, *(m.tobytes() for m in camera)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """Numbers of consistently oriented pieces, so that a front side is not continued by a back side.
+        """The consistently oriented piece of each triangle, so that splatters do not join a front to a back side.
 
         Not called where `refine` moves samples. `rts.plugin_api.checks.pieces` computes them from the edges
         that triangles share.
@@ -181,8 +181,8 @@ class TriangleSurface(Surface):
             proxy: the result of `proxy`.
 
         Returns:
-            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 where its winding means nothing; or
-            (1,), the number of all.
+            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 if its winding tells no sides; or
+            (1,), one such number for all triangles.
         """
         return np.zeros(1, np.int16)
 
@@ -190,7 +190,7 @@ class TriangleSurface(Surface):
         """Move samples from the triangles onto the surface, along their rays, or drop them; on the host.
 
         Set `row` of a cell to −1 where its ray misses the surface. Layers need not be in order afterwards, and two may
-        have met at one root: the core sorts and merges them, and closes gaps.
+        hold the same point of the surface: the core sorts and merges them, and closes gaps.
 
         Args:
             inputs: the result of `proxy_inputs`, on the host.

@@ -12,7 +12,7 @@ from rts.arrays.trees import Array
 
 
 def ranges_of_views(view: np.ndarray, count: int) -> Iterator[tuple[int, slice]]:
-    """Index and range of rows of each of `count` views, from 0 on."""
+    """The index, from 0 on, and the slice of rows of each of `count` views."""
     ends = np.searchsorted(view[: rows_in_views(view)], np.arange(1, count + 2))
     return enumerate(itertools.starmap(slice, itertools.pairwise(ends.tolist())))
 
@@ -23,10 +23,10 @@ def rows_in_views(view: np.ndarray) -> int:
 
 
 def index_of_views(view: Array) -> Array:
-    """The view (N,) of each row, counted from 0 on; unused rows have the first."""
+    """The view (N,) of each row, counted from 0 on; unused rows get 0."""
     return view - namespace(view).astype(view > 0, view.dtype)
 
 
 def of_view(x: np.ndarray | None, place: int | slice) -> np.ndarray | None:
-    """The entries of an optional array at a place; None stays None."""
+    """`x[place]`, the entries at an index or in a slice; None stays None."""
     return None if x is None else x[place]

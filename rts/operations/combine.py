@@ -19,7 +19,7 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 
     Args:
         rows: (V, C) float, such as control points.
-        ids: (N, I) integers, indices of rows. A sum of fewer rows repeats any index with a weight of zero.
+        ids: (N, I) integers, indices of rows. For a sum of fewer rows, repeat any index with a weight of zero.
         weights: (N, I) float.
 
     Raises:
@@ -49,7 +49,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
 
     Args:
         rows: (V, C) float.
-        ids: (N, I) integers.
+        ids: (N, I) integers, indices of rows.
         column: the first of the three columns.
         weights: (N, W) float, of which the first two are used.
 

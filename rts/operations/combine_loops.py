@@ -27,7 +27,7 @@ def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
 def forward(
     rows: np.ndarray, weights: np.ndarray, ids: np.ndarray, out: np.ndarray, column: int, count: int, affine: bool
 ) -> None:
-    """Fill `out` (N, C)."""
+    """Fill `out` (N, C) with the weighted sums."""
     check(rows, ids, column, count)
     _combine(rows, weights, ids, out, column, count, affine)
 
@@ -50,7 +50,7 @@ def push(
     count: int,
     affine: bool,
 ) -> None:
-    """Fill `out` (N, C) with the tangent along `t_rows` (V, C) and `t_weights` (N, W), or None for zeros."""
+    """Fill `out` (N, C) with the derivative along `t_rows` (V, C) and `t_weights` (N, W), each None if zero."""
     if t_rows is None:
         out[...] = 0
     else:
@@ -74,7 +74,7 @@ def pull(
     count: int,
     affine: bool,
 ) -> None:
-    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), and fill `g_weights` (N, W)."""
+    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), fill `g_weights` (N, W); skip None."""
     if g_rows is not None:
         if affine and count == 3:
             _scatter(ids, column, weights, g, g_rows)

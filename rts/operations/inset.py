@@ -16,15 +16,15 @@ def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:
     Args:
         image: (H, W, C).
         fine: (h · side, w · side, C), of the dtype of the image.
-        pixel: (H, W) integers, the index of a pixel among the h × w of the finer image, counted along its lines;
-            negative for none. No index appears twice.
+        pixel: (H, W) integers, the index of a pixel among the h × w of the finer image, counted row by row; negative
+            for none. No index appears twice.
         side: cells along each side of a pixel.
     """
     return INSET(image, fine, pixel, side=side)
 
 
 def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, side: int) -> Array:
-    """An image (H, W, C) as by `with_inset`, from one of a single colour on covered pixels and zeros elsewhere.
+    """`with_inset` for an image (H, W, C) that has one colour on covered pixels, and zeros elsewhere.
 
     Args:
         color: (C,).

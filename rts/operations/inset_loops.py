@@ -46,14 +46,14 @@ def _sum(fine, top, left, c, side, share):
 
 @compiled
 def _look(there, row, settled):
-    """Mark the covered cells in a row of cells."""
+    """Fill `there` with 1 for covered cells of a row, else 0."""
     for x in range(len(there)):
         there[x] = np.uint8(row[x] >= 0) | np.uint8(settled[x] >= 0)
 
 
 @compiled
 def _paint(out, c, value, there):
-    """Fill channel c of a row of an image."""
+    """Fill channel c of a row of an image: `value` in covered cells, else 0."""
     nothing = out.dtype.type(0)
     for x in range(len(there)):
         out[x, c] = value if there[x] else nothing
@@ -63,7 +63,7 @@ def _paint(out, c, value, there):
 def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
     """Fill the gradients `image` and `fine`, given as zeros, from rows [start, stop) of the result's gradient `g`.
 
-    Gradients without rows are skipped. `sums` (H, C) receives the colour's gradient, summed over each row.
+    Empty gradients are skipped. `sums` (H, C) receives the colour's gradient, summed over each row.
     """
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)

@@ -77,7 +77,7 @@ AFFINE = Operation.of_loops("rts.affine", specified_affine_map, (2, 2), _shape, 
 
 
 def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
-    """Points (N, 3) of several views under the affine map of each: (N, R).
+    """Points (N, 3) of several views, each under the affine map of its view: (N, R).
 
     Args:
         rows: (B, R, 4), the affine map of each view.
@@ -106,7 +106,7 @@ def _shape_of_views(rows: tuple[int, ...], points: tuple[int, ...], view: tuple[
 
 
 def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
-    """Index, range of points, and operands of each view."""
+    """For each view its index, the slice of its points, and its operands of `AFFINE`."""
     rows, points, view = operands
     if rows.shape[2] != 4 or points.shape != (len(view), 3):
         shapes = ", ".join(str(x.shape) for x in operands)

@@ -10,14 +10,14 @@ from rts.operations.projection_loops import CHUNK
 
 
 def forward(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (N, R)."""
+    """Fill `out` (N, R) with the mapped points."""
     parallel(_affine, len(out), rows, points, out, work=len(rows) * len(out))
 
 
 def push(
     rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, R) with the tangent along `t_rows` and `t_points`, or None for zeros."""
+    """Fill `out` (N, R) with the derivative along `t_rows` (R, 4) and `t_points` (N, 3), each None if zero."""
     if t_rows is None:
         out[...] = 0
     else:

@@ -121,14 +121,14 @@ class Operation:
     ) -> Operation:
         """An operation of three functions that take arrays one by one, such as compiled loops.
 
-        Arrays that these read are C-contiguous and read-only, tangents and the gradient too: each loop is compiled
-        once for each dtype of the floats.
+        Input arrays are C-contiguous and read-only, tangents and the gradient too: each loop is compiled once for each
+        dtype of the floats.
 
         Args:
-            name: see the attributes, as of specification, ranks and shape.
-            specification: in array code.
-            ranks: of the operands.
-            shape: of the result.
+            name: as the attribute.
+            specification: as the attribute.
+            ranks: as the attribute.
+            shape: as the attribute.
             loops: () → (forward, push, pull); called each time, so that it may import numba on first use.
                 forward(*operands, out, **params) and push(*operands, *tangents, out, **params) fill `out`;
                 pull(*operands, gradient, *results, **params) fills the results, of which not all are None.
@@ -316,7 +316,7 @@ class Operation:
             )
 
     def _refused(self, function: str, shapes: Sequence[tuple[int, ...]], error: Exception) -> Exception:
-        """The error to raise if a function fails."""
+        """The error to raise after `function` failed: errors of the library as they are, others as `InputError`."""
         if isinstance(error, RtsError):
             return error
         return InputError(

@@ -15,9 +15,9 @@ from rts.operations.operation import Arrays, Operation, Some
 
 
 def projective_map(rows: Array, points: Array) -> Array:
-    """Four affine maps (4, 4) of points (N, 3), as (N, 3): the first two over the third, and the fourth.
+    """Points (N, 3) under four affine maps (4, 4), as (N, 3): the first two coordinates over the third, and the fourth.
 
-    A point where the third is zero has no image; its result is finite.
+    A point whose third coordinate is zero has no image; its result is finite.
     """
     if is_plain_product(rows, points):
         PROJECTION.check_ranks((rows, points))
@@ -91,7 +91,7 @@ def _shape_of_views(rows: tuple, points: tuple[int, ...], view: tuple, places: t
 
 
 def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays, np.ndarray]]:
-    """Index, range of points, operands and place of each view."""
+    """For each view its index, the slice of its points, its operands of `PROJECTION`, and its row of `places`."""
     rows, points, view, places = operands
     if rows.shape[1:] != (4, 4) or points.shape != (len(view), 3) or places.shape != (len(rows), 3):
         shapes = ", ".join(str(x.shape) for x in operands)

@@ -1,7 +1,7 @@
 """Perspective projection of points, and its derivatives: one compiled loop each, on NumPy arrays.
 
-Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two over the third, and the fourth. A point where the
-third is zero has no image; its result is finite. All floats are of one dtype.
+Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two coordinates over the third, and the fourth. A point
+whose third coordinate is zero has no image; its result is finite. All floats are of one dtype.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ CHUNK = 4096
 
 
 def forward(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (N, 3)."""
+    """Fill `out` (N, 3) with the projected points."""
     parallel(_project, len(out), rows, points, out, work=4 * len(out))
 
 
 def push(
     rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, 3) with the tangent along `t_rows` (4, 4) and `t_points` (N, 3), or None for zeros."""
+    """Fill `out` (N, 3) with the derivative along `t_rows` (4, 4) and `t_points` (N, 3), each None if zero."""
     turn = read_only(np.zeros_like(rows)) if t_rows is None else t_rows
     move = read_only(np.empty((0, 3), points.dtype)) if t_points is None else t_points
     parallel(_push, len(out), rows, points, turn, move, out, work=8 * len(out))

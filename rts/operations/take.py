@@ -15,12 +15,12 @@ from rts.operations.operation import Arrays, Operation, Some, known_value
 
 
 def take(rows: Array, index: Array) -> Array:
-    """Rows (M, C) of (V, C) by an index (M,). Gradients are added up in the order of the index."""
+    """Rows (M, C) of an array (V, C), by their indices (M,). Gradients are added up in the order of the indices."""
     return TAKE(rows, index)
 
 
 def take_shifted(rows: Array, index: Array, shift: Array) -> Array:
-    """Rows (M, C) of (V, C) by an index (M,), plus a constant shift (M, C), which has no derivative."""
+    """Rows (M, C) of an array (V, C), by their indices (M,), plus a shift (M, C) that has no derivative."""
     return SHIFTED(rows, index, shift)
 
 

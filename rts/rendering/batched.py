@@ -1,4 +1,4 @@
-"""Several views of one scene."""
+"""Several views of one scene rendered in one call, side by side in pictures where possible."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def render_views(
     threshold for equal depths is set by the farthest view, and is up to twice that of a single view.
 
     Views lie side by side in one picture of at most 1024² cells. Python's overhead, results for the whole of θ such as
-    smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`; the built-in
-    shaders without mipmaps do. With jax, and under `torch.func`, this needs shaders that take views, or parts of one
-    colour, and views that fit into one picture. Otherwise views are rendered one after another, as with `layers="auto"`
-    and in bands. NumPy views that are too large for a picture are rendered one on each core. With torch and jax all
-    views are in memory at once, with a gradient or without.
+    smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
+    shaders without mipmaps do. With jax, and under `torch.func`, views share a picture only if all fit into one, and if
+    each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are with
+    `layers="auto"`, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one
+    on each core. With torch and jax all views are in memory at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
@@ -97,7 +97,7 @@ def render_views(
 
 
 def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:
-    """The background as an array: one for all views, or (B, H, W, ·), one for each."""
+    """The background as an array: one for all views, or (B, H, W, ·), one for each view; None stays None."""
     if background is None or len(shape_of(background)) < 4:
         return check_background(background, size, channels)
     if shape_of(background)[0] != count:
@@ -151,7 +151,7 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
 
 
 def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
-    """The images (B, H, W, C + 1) of sampled views, by a splat for each view."""
+    """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
     pairs = zip(views, scenes, strict=True)
     images = [splatted(own, scene, scene.camera, context, settings.reader) for own, scene in pairs]
     return namespace(*images).stack(images)
@@ -160,7 +160,7 @@ def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Cont
 def _as_pictures(
     pictures: Sequence[Views], scenes: Sequence[Scene], context: Context, settings: RenderSettings
 ) -> Array:
-    """The images (B, H, W, C + 1) of sampled views, by a splat for each picture."""
+    """The images (B, H, W, C + 1) of sampled views, splatted picture by picture."""
     images, cameras = [], [scene.camera for scene in scenes]
     for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
         cells = views.picture.apart(cropped_image(settings.reader, splats), views.sampled.apron)

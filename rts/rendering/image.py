@@ -62,7 +62,7 @@ def render(
             beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them. If the
             image is rendered in bands, each band has this capacity. With `rts.Adaptive` the fine samples have as many
             rows again, `layers` for each fine cell of active pixels and their aprons. Pixels that find no room stay
-            coarse, and are counted.
+            coarse, and `overflow` counts them, too.
         engine: name of the engine to compute with, "torch" or "jax". Needed where all arrays are NumPy, but a shader
             holds a network. None for the engine of the arrays.
 
@@ -92,7 +92,7 @@ def image_over(scene: Scene, size: tuple[int, int], background: Array | None, se
 
 
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image (H, W, C + 1) of a checked scene, without a background; `context` is for the differentiable half."""
+    """The image (H, W, C + 1) of a checked scene, without a background; `context` is that of `splatted`."""
     if settings.contrast is not None:
         return _of_contrast(scene, size, context, settings)
     bands, reader = settings.bands(size), settings.reader
@@ -123,7 +123,7 @@ def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: Rend
 
 
 def _of_contrast(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image with fine samples where the colours of coarse samples change, too."""
+    """The image with fine samples at outlines, and at contrasts between the colours of coarse samples."""
     coarse = coarse_scene(scene, scene.camera, size, settings)
     splats = to_splats(coarse, scene.parts, scene.camera, scene.camera, context)
     colors = value_of(splats.rgba)
@@ -150,7 +150,8 @@ def render_samples(
 
     Args:
         sampled: the result of `sample` for these parts. θ, transform and camera may have other values now, with one
-            exception: a surface whose θ is NumPy, beside torch or jax arrays, was evaluated when it was sampled.
+            exception: if a part's θ is NumPy, beside torch or jax arrays, `sample` may have evaluated its surface, and
+            new values have no effect.
         parts: as in `render`.
         camera: as in `render`.
         splatter: as in `render`.
@@ -211,15 +212,15 @@ def splatted(
     splatter: Splatter,
     splats: Splats | None = None,
 ) -> Array:
-    """The image (H, W, 4) of samples of a window of the camera's image.
+    """The image (H, W, C + 1) of a window, a rectangle of the camera's image, from the samples in it.
 
     Args:
         sampled: the samples.
-        scene: checked; shaders see the camera of the whole image.
-        window: the camera of the samples.
+        scene: the checked scene; shaders see its camera, that of the whole image.
+        window: the camera of the window.
         context: the engine to compute with, and an exemplar of its constants.
         splatter: a splatter.
-        splats: the splats of the coarse samples, if computed already.
+        splats: the splats of the coarse samples; None if not yet computed.
     """
     fine = sampled.fine
     if fine is None or not fine.flat:
@@ -253,7 +254,7 @@ def seen(image: Array, scene: Scene, name: str = "the image") -> Array:
 
 
 def over_background(image: Array, background: Array | None) -> Array:
-    """Images (..., H, W, 4) composited onto a background."""
+    """Images (..., H, W, C + 1) composited onto a background of C or C + 1 channels, opaque if C; None for none."""
     if background is None:
         return image
     over: Array = constants(background, engine_of(image), image)

@@ -18,9 +18,10 @@ from rts.scene.parts import Part
 
 
 class PreparedParts(Prepared):
-    """Parts with structures that their samplers built; `render` and `sample` take it in place of parts.
+    """Parts with structures that their samplers built, for `render` and `sample` in place of parts.
 
-    The argument `sampler` of these functions has no effect then. Functions given to `jax.jit` close over the object.
+    The argument `sampler` of these functions has no effect then. Let a function under `jax.jit` close over this object
+    rather than take it as an argument.
     """
 
     def renderer(self, camera: Camera, size: tuple[int, int], **settings: Any) -> Renderer:
@@ -59,7 +60,8 @@ def prepare(
         size: (height, width); needed for the same surfaces.
 
     Returns:
-        A handle. Later changes to vertices have no effect; `replace` changes transforms, shaders and the rest of θ.
+        The parts with their structures. Later changes to vertices have no effect; `replace` changes transforms, shaders
+        and the rest of θ.
     """
     return PreparedParts.of(parts, sampler, camera, size)
 
@@ -90,7 +92,7 @@ class Renderer:
         """The image of `render`, with some fields of one part changed.
 
         Args:
-            index: the part.
+            index: the index of the part.
             **changes: its `transform`, `theta`, `shader` or `cull`, for this call alone.
 
         Returns:

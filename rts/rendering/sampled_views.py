@@ -44,7 +44,7 @@ class Views(NamedTuple):
         picture: the layout of the views.
         view: for each part (N,) int32, the number of each row's view, from 1 on; 0 for unused rows.
         counts: for each part (B,), the number of rows of each view; None if unknown, as in traced programs.
-        scales: (B,) factors on depths, with which splatters compare them.
+        scales: (B,) for each view the factor on its depths, with which splatters compare depths.
     """
 
     sampled: Sampled
@@ -61,7 +61,7 @@ class Sampling(NamedTuple):
         scenes: the scene with the camera of each view, for images of the size.
         picture: the layout of the views.
         size: (height, width) of each view, pixels.
-        settings: with numbers for layers and for cells along each side of a pixel; the capacity is of each view.
+        settings: those of each view; `layers` and `supersample` are numbers.
     """
 
     scenes: Sequence[Scene]
@@ -171,7 +171,7 @@ def sampled_as_one(sampling: Sampling) -> Views:
 
 
 def _views_of(samples: Samples, picture: Picture) -> Array:
-    """The view (N,) of each row in the table of a part, in which every sample has one cell; 0 for unused rows."""
+    """The view (N,) of each row in the table of a part whose samples have one cell each; 0 for unused rows."""
     size = samples.ids.shape[0]
 
     def host(row: np.ndarray) -> tuple[np.ndarray]:
@@ -181,7 +181,7 @@ def _views_of(samples: Samples, picture: Picture) -> Array:
 
 
 def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
-    """The view (size,) int32 of each row, from 1 on, given the rows of each view; then 0 for unused rows."""
+    """The view (size,) int32 of each row, from 1 on, given the number of rows of each view; 0 for unused rows."""
     numbers = np.zeros(size, np.int32)
     numbers[: counts.sum()] = np.repeat(np.arange(1, len(counts) + 1), counts)
     return numbers
@@ -258,7 +258,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
-    """Samples of one part in several views as one table, one after the other, with the grids of the first."""
+    """Samples of one part in several views as one table, view after view; cells are those of the first view alone."""
     if len(samples) == 1:
         return samples[0]
     first, xp = samples[0], namespace(samples[0].ids)
@@ -313,7 +313,7 @@ def _drawn(
 
 
 def decided_in_views(hidden: HiddenRule | None, picture: Picture, question: Question) -> tuple[Decision, np.ndarray]:
-    """Decide on the samples (K, height, width) of views; also the scales (B,) with which depths are compared.
+    """The decision on the samples (K, height, width) of all views, and the scales (B,) to compare depths with.
 
     Args:
         hidden: the rule for one view; None to keep all.
@@ -343,7 +343,7 @@ def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:
 
 
 def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
-    """The largest depth (B,) of each view, from depths (K, height, width) of the picture."""
+    """The largest absolute depth (B,) of each view, from depths (K, height, width) of the picture."""
     layers, (height, width) = len(depth), picture.view
     lines = depth.reshape(-1, width)
     sizes = np.maximum(lines.max(axis=1, initial=0), -lines.min(axis=1, initial=0))
@@ -360,7 +360,7 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
-    """The number (B,) of rows of each view, in which every sample has one cell; at least `rows` in all."""
+    """The number (B,) of samples of each view, which have one cell each; rows beyond all go to the first view."""
     from rts.sampling import packing_loops
 
     assert row is not None

@@ -56,8 +56,8 @@ def sample(
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
-        settles: leave out samples of cells whose colour cannot change, inside a single part of one colour. Render the
-            samples with the same values of θ, transform and camera, as `render` does. See `Cells.settled`.
+        settles: whether to leave out samples of cells whose colour cannot change, inside a single part of one colour.
+            Render the samples with the same values of θ, transform and camera, as `render` does. See `Cells.settled`.
 
     Returns:
         Samples for `render_samples`, which may be handed to a function under `jax.jit`.
@@ -124,7 +124,10 @@ def _on_one_grid(
 
 
 def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidden | None) -> Sampled:
-    """The needed samples of a grid of cells, or of the cells listed in the request."""
+    """The samples of all parts, `count` layers of a grid of cells or of the cells listed in the request.
+
+    `hidden` tells which samples to drop; traced ones may stay.
+    """
     samples, alone, listed = [], len(scene.parts) == 1, request.cells
     for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
         camera = grid.camera.within(part.transform)

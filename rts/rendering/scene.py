@@ -26,7 +26,7 @@ class Scene(NamedTuple):
         camera: the camera of the whole image.
         samplers: the sampler of each part, as the user chose it.
         entries: the structure that each sampler has built for its part, or None.
-        sizes: for each part the largest number that its surface reads; None if unknown.
+        sizes: for each part the largest absolute number in the θ that its surface reads; None if unknown.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
     """
 
@@ -66,7 +66,7 @@ class Scene(NamedTuple):
         return self._replace(camera=self.camera.for_size(size))
 
     def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenRule | None:
-        """The decider on hidden samples; None to keep all. See `rts.sampling.hidden.hidden_by`."""
+        """The rule that tells which samples are hidden; None to keep all. See `rts.sampling.hidden.hidden_by`."""
         return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
 
     def chosen(self) -> list[Sampler]:
@@ -75,7 +75,7 @@ class Scene(NamedTuple):
         return [suited_sampler(sampler, part, self.camera) for sampler, part in pairs]
 
     def context_with(self, *others: Tree) -> Context:
-        """As `context`, with further arrays in the scene."""
+        """The context of the scene with further arrays, such as a background."""
         context = context_of_scene(self.parts, self.camera, *others)
         return context if context.engine.differentiates else self.context
 
@@ -93,7 +93,7 @@ class Grid(NamedTuple):
 
     @classmethod
     def sampled(cls, scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
-        """As `around`, for sampling a scene: the camera is a constant of the scene's engine."""
+        """The grid `around` an image, for sampling a scene: the camera is a constant of the scene's engine."""
         # One engine samples every part, through the same matrices that later project the samples.
         wide = cls.around(camera, size, apron)
         if not scene.context.engine.differentiates:

@@ -23,7 +23,7 @@ from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
-    """The part's G-buffer in local space."""
+    """The part's G-buffer at the samples, local space; not evaluated anew if the samples carry all of it."""
     theta = _read(part)
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
@@ -53,7 +53,7 @@ def shaded_at_once(part: CheckedPart) -> bool:
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
-    """The θ that a part's shader sees."""
+    """The θ that a part's shader sees; entries that the surface does not read become constants of the engine."""
     reads = part.surface.reads(part.theta)
     return {k: v if k in reads else context.constants(v) for k, v in part.theta.items()}
 
@@ -66,7 +66,10 @@ def add_footprint(
     grid: tuple[int, int],
     context: Context,
 ) -> None:
-    """Add "uv_footprint" to the G-buffer of samples in one view, if it has uv; arguments as in `uv_footprint`."""
+    """Defer "uv_footprint" in the G-buffer `local` of samples in one view, if it has "uv".
+
+    Arguments are as in `uv_footprint`; `own` is its camera.
+    """
     if "uv" in local and FOOTPRINT not in local:
         local.defer(FOOTPRINT, partial(uv_footprint, part.surface, _read(part), samples, local, own, grid, *context))
 
@@ -146,7 +149,7 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
 
 
 class _UnreadError(Exception):
-    """A shader reads an attribute that it did not read before."""
+    """A shader reads an attribute that it did not read in its first call."""
 
 
 def _colors(
@@ -181,7 +184,7 @@ def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
-    """Positions and normals moved by the part's transform."""
+    """The G-buffer with positions and normals moved by the part's transform."""
     if transform is None:
         return gbuffer
     world = GBuffer()

@@ -52,7 +52,7 @@ def _owned(tree: Tree, row: Array, context: Context) -> Tree:
 
 
 def _of_inputs(context: Context) -> Context:
-    """The context of inputs; an engine without derivatives keeps their dtypes."""
+    """The context that converts inputs; for an engine without derivatives, they keep their dtypes."""
     return context if context.engine.differentiates else context._replace(like=None)
 
 
@@ -107,7 +107,7 @@ def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
 
 
 def _places_of(pictures: Sequence[Views], context: Context) -> Array:
-    """(B, 3) for each view the offsets of columns and lines in its picture, and the factor on depth."""
+    """(B, 3) for each view its offsets along x and y in its picture, in cells, and the factor on depth."""
     corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
     scales = [context.constants(picture.scales) for picture in pictures]
     xp = namespace(*scales)
@@ -156,7 +156,7 @@ def _shown(
 
     Args:
         sampled: the samples of each part.
-        row: integers, the numbers of the visible samples.
+        row: integers, the indices of the visible samples, counted over all parts; −1 for none.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
         grid: the cells of the samples, and their camera.

@@ -490,7 +490,7 @@ class Camera:
         """Matrices (modelview, projection) for nvdiffrast.
 
         Args:
-            top_down: whether row 0 of its image is to be the top, as here.
+            top_down: whether row 0 of nvdiffrast's image is to be the top, as in this library.
             size: as in `to_opengl`.
         """
         camera = self if size is None else self.for_size(size)
@@ -642,7 +642,7 @@ class Camera:
             )
 
     def depth_range(self) -> tuple[Array, Array]:
-        """Linear depths of the near and the far plane, in either direction of clip z; infinity for a missing plane."""
+        """Linear depths () of the near and the far plane, whichever way clip z runs; infinity for a missing plane."""
         xp, (p,) = promote(self.projection)
         depths = []
         for a, b in ((p[2, 3] + p[3, 3], p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3], p[2, 2] - p[3, 2])):
@@ -694,7 +694,7 @@ class Camera:
 
 
 def toward_rows(view: Array, projection: Array) -> Array:
-    """The affine maps (…, 3, 4) of `Camera.toward`, of matrices (…, 4, 4)."""
+    """The affine maps (…, 3, 4) from points to `Camera.toward`, for matrices (…, 4, 4)."""
     xp, rotation = namespace(view), view[..., :3, :3]
     at = xp.sum(rotation[..., :, :, None] * view[..., :3, None, :], axis=-3) * projection[..., 3:, 2:3]
     axis = projection[..., 3, 3:] * rotation[..., 2, :]
@@ -707,7 +707,7 @@ def world_vectors(view: Array, direction: Sequence[float]) -> Array:
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
-    """View and projection in one engine and dtype. The matrix that is not constant decides them."""
+    """View and projection in one engine and dtype; if only one is a constant, those of the other."""
     _, (view, projection) = promote(view, projection)
     return view, projection
 

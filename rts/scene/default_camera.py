@@ -34,7 +34,11 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(parts: Sequence[Part]) -> Bounds:
-    """The bounding sphere of parts of NumPy arrays, whose surfaces can become meshes."""
+    """The bounding sphere of parts of NumPy arrays, whose surfaces can become meshes.
+
+    Raises:
+        InputError: all vertices are in one point.
+    """
     points = []
     for part in parts:
         vertices = np.asarray(part.surface.tessellate(part.theta, ROUGHLY)[0], np.float64)
@@ -49,10 +53,10 @@ def bounds_of(parts: Sequence[Part]) -> Bounds:
 
 
 def default_camera(parts: Sequence[Part], size: tuple[int, int]) -> Camera:
-    """The camera that commands have unless told otherwise: it sees all of the parts, from above and aside.
+    """The default camera of commands: it sees all parts, from 30° to the right and 20° above.
 
     Args:
-        parts: of NumPy arrays, of whose surfaces a mesh can be made.
+        parts: parts of NumPy arrays, whose surfaces can become meshes.
         size: (height, width) of the image.
     """
     return orbit(bounds_of(parts), size, 30, 20)
@@ -70,7 +74,7 @@ def orbit(
     """A camera on a sphere around an object, looking at its centre.
 
     Args:
-        bounds: the object.
+        bounds: the sphere around the object.
         size: (height, width) of the image.
         azimuth: degrees about the upright axis; 0 looks from +z (from −y if z is up), 90 from +x.
         elevation: degrees above the horizon, −90 to 90.

@@ -1,4 +1,4 @@
-"""Part, one object of a scene: a surface, its numbers θ, a shader and a place."""
+"""Part, one object of a scene: a surface, its numbers θ, a shader and a transform."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix, and its Jacobian (16, 9), float64."""
+    """The matrix (4, 4), and its Jacobian (16, 9) by pose and centre; float64."""
     from rts.scene import rigid_loops
 
     pose, center = operands

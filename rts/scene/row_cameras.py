@@ -17,7 +17,7 @@ from rts.scene.camera import Camera, toward_rows, world_vectors
 class RowCameras:
     """A camera for each of N samples, for shaders that promise `takes_views`.
 
-    The methods are named as in `Camera`, and return a row for each sample. Arguments are points of the N samples.
+    The methods are named as in `Camera`, and return a row for each sample. Row n of `points` is seen by camera n.
 
     Attributes:
         views: (B, 4, 4) camera-from-world, of each view.
@@ -36,7 +36,7 @@ class RowCameras:
         return cls(stacked.view, stacked.projection, number)
 
     def of_rows(self, number: Array) -> RowCameras:
-        """Cameras of other samples, from these views."""
+        """The cameras of other samples in these views; `number` (N,) is the view of each."""
         return RowCameras(self.views, self.projections, number)
 
     def toward(self, points: Array) -> Array:

@@ -111,7 +111,7 @@ def orthographic(
 def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     """(4, 4) view matrix of a camera at `eye` (3,) that faces `target` (3,), world space.
 
-    Where the direction of view is parallel to `up`, +x points to the right; +y where `up` is along x.
+    If the camera looks along `up`, or against it, +x is to the right in the image; +y if `up` is along x.
 
     Raises:
         InputError: eye and target coincide, or `up` is zero.
@@ -155,7 +155,7 @@ def _level_up(up: Array, back: Array) -> Array:
 
 
 PARALLEL = 1e-12
-"""Largest slope of w, relative to the slopes of x and y, of a projection with parallel rays."""
+"""Largest slope of clip w, relative to the slopes of clip x and y, of a projection with parallel rays."""
 ROUNDING = 1e-5
 """Rounding allowed in matrix entries that should be zero or one."""
 RADIANS = 2.0
@@ -210,7 +210,7 @@ def _is_unscaled(matrix: np.ndarray) -> bool:
 
 
 def _planes(matrix: np.ndarray) -> tuple[float, float] | None:
-    """Depths at which clip z is −w and w, in units of w's slope; None where z and w do not grow along one axis."""
+    """World depths of the planes where clip z is −w and w; None if z and w do not grow along one axis."""
     z, w = matrix[2], matrix[3]
     length = np.linalg.norm(w[:3])
     if not length or np.linalg.norm(np.cross(z[:3], w[:3])) > ROUNDING * np.linalg.norm(z[:3]) * length:

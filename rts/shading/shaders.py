@@ -118,7 +118,7 @@ class Unlit(Shader):
         return self.premultiplied(color, alpha)
 
     def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
-        """Colour (N, 3), not premultiplied, and alpha (N, 1)."""
+        """The base colour (N, 3) times θ["color"], not premultiplied, and alpha (N, 1)."""
         position = gbuffer["position"]
         xp = namespace(position)
         if "texture" in theta and "uv" in gbuffer:
@@ -216,7 +216,7 @@ def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array
 
 
 def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
-    """(N, 1) bool, true where a sample's normal points away from the viewer."""
+    """(N, 1) bool, true where a sample's normal points away from the viewer; without derivative."""
     arrays = gbuffer["position"], gbuffer["normal"], camera
     engine = engine_of(arrays)
     position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), arrays)

@@ -27,6 +27,9 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
 
     Returns:
         (N, C).
+
+    Raises:
+        InputError: the texture has another shape, or no floating numbers.
     """
     shape = shape_of(texture)
     if len(shape) != 3 or shape[2] not in (1, 3, 4) or 0 in shape:
@@ -58,7 +61,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
 def mip_levels(texture: Array) -> list[Array]:
     """The texture (h, w, C) and its averages, each of half the previous height and width, down to a single texel.
 
-    An odd number of lines n is halved to (n − 1) / 2. Each of these averages n / ((n − 1) / 2) lines, by the shares
+    An odd number n of rows or columns becomes (n − 1) / 2. Each new one averages 2 n / (n − 1) old ones, by the shares
     that it covers, so that all levels have the mean of the texture. Differentiable.
     """
     levels = [texture]
@@ -88,20 +91,20 @@ def level_of(footprint: Array, size: tuple[int, int]) -> Array:
 
 
 def _halved(x: Array) -> Array:
-    """The averages (max(n // 2, 1), …) of the lines of (n, …)."""
+    """An array (n, …) with half as many rows, max(n // 2, 1), each an average of neighbouring rows."""
     n = shape_of(x)[0]
     if n == 1:
         return x
     if n % 2 == 0:
         return 0.5 * (x[0::2, ...] + x[1::2, ...])
-    # Line j covers the lines from j n / m to (j + 1) n / m.
+    # New row j covers the old rows from j n / m to (j + 1) n / m.
     xp, m = namespace(x), n // 2
     part = xp.reshape(engine_of(x).constant(np.arange(m) / n, x), (m, 1, 1))
     return (m / n - part) * x[0:-1:2, ...] + m / n * x[1::2, ...] + (part + 1 / n) * x[2::2, ...]
 
 
 def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first: Array | None = None) -> Array:
-    """Bilinear lookup (N, C) in a table of texels: of one texture, line by line, or of several, one after the other.
+    """Bilinear lookup (N, C) in a table of texels: of one texture, row by row, or of several, one after the other.
 
     Args:
         flat: (M, C).
@@ -127,7 +130,7 @@ def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first:
 
 
 def _wrapped(index: Array, count: Any, wrap: str) -> Array:
-    """Whole-numbered floats as indices in [0, count)."""
+    """Whole-numbered floats as indices in [0, count); `wrap` tells how those outside continue."""
     xp = namespace(index)
     index = xp.where(index == index, index, 0.0)  # NaN has no texel; as an index it would be out of range.
     if wrap == "repeat":

@@ -15,7 +15,7 @@ from rts.shading.uv_footprints import FOOTPRINT
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
 SHADER_ENTRIES = ("color", "texture", "light", "specular", "shininess", "depth_range", "weights")
-"""Names that built-in surfaces and shaders read. Files contain them, and not every shader reads them."""
+"""Names that built-in surfaces and shaders read. They cause no warning: files hold them for any shader."""
 
 ATTRIBUTES = ("position", "normal", "uv", FOOTPRINT)
 """Names that are attributes of the G-buffer only; "color" may be an entry of θ, too."""
@@ -34,7 +34,7 @@ def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]
 
     Args:
         part: the part.
-        shaded: the entries that its shader reads; None if unknown, and then no entry counts as unread.
+        shaded: the entries that its shader reads; None if unknown, for which the result is empty.
     """
     if shaded is None:
         return ()
@@ -43,7 +43,7 @@ def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]
 
 
 def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | None:
-    """The name that an unread entry was probably meant to have, or None; arguments as in `unread`."""
+    """The name that the unread entry `name` was probably meant to have, or None; other arguments as in `unread`."""
     rest = dict(part.theta)
     value = rest.pop(name)
     shaped = (n for n in SURFACE_ENTRIES if n in part.surface.reads({**rest, n: value}))
@@ -72,7 +72,7 @@ class Observed(Shader):
     """A wrapper of a shader that records the entries of θ that it reads.
 
     Attributes:
-        read: the names so far.
+        read: the names of entries read so far.
     """
 
     def __init__(self, shader: Shader):

@@ -18,7 +18,7 @@ from rts.scene.camera import Camera
 FOOTPRINT = "uv_footprint"
 """Name of the attribute in the G-buffer."""
 LEAST = 1e-30
-"""Smallest divisor; smaller numbers are replaced by it."""
+"""Smallest divisor; numbers of smaller absolute value are replaced by it."""
 
 
 def uv_footprint(
