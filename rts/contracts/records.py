@@ -353,8 +353,6 @@ class Splats(_OnCells):
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
         part: (K, H, W) int32, the part of each sample, or −1; None if unknown, or if all samples are of `one_part`.
             See `parts`.
-        sentinel: () float, the depth that stands for empty layers, beyond all samples; None for a depth of the scene's
-            scale.
         wanted: (H, W) bool, the cells whose colour is used; others may get any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
         one_part: whether all samples are of one part.
@@ -365,7 +363,6 @@ class Splats(_OnCells):
     rgba: Array
     cells: Cells
     part: Array | None = None
-    sentinel: Array | None = None
     wanted: Array | None = None
     border: int = 0
     one_part: bool = False
