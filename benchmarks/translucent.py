@@ -9,8 +9,10 @@ Derivatives are low-passed and compared with differences of area-sampled renders
 from __future__ import annotations
 
 import argparse
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +27,7 @@ from rts.diagnostics.example_shapes import icosphere
 from rts.diagnostics.smoothing import low_pass
 from rts.rendering.scene import Scene
 from rts.rendering.splats import to_splats
+from rts_compare.other_renderers.mitsuba_renderer import emitter, mitsuba, sensor
 
 CAMERA = rts.Camera.look_at((0.1, 0.2, 6), (0, 0, 0), (0.21, 1, 0), fov_y=30)
 """Edges of upright cards are aslant in its images."""
@@ -145,6 +148,42 @@ def derivative_rows() -> Iterator[list[str]]:
             change = Change(parts(), index, mode)
             true = change.truth()
             yield [name, mode, *(score(change.derivative(*method), true) for method in METHODS)]
+
+
+def by_mitsuba(change: Change, samples: int, seed: int) -> np.ndarray:
+    """The derivative (H, W, 3) in position by Mitsuba's `prb_projective`; parts emit on their fronts alone.
+
+    A part emits its colours times alpha, and a mask lets the other light pass.
+    """
+    import drjit as dr
+
+    mi, meshes = mitsuba(), {}
+    view = np.asarray(CAMERA.view)
+    with tempfile.TemporaryDirectory() as folder:
+        for i, part in enumerate(change.parts):
+            vertices, colors = part.theta["vertices"] @ view[:3, :3].T + view[:3, 3], part.theta["colors"]
+            mesh = emitter(vertices, part.surface.faces, f"{folder}/{i}.ply", colors[:, :3] * colors[:, 3:])
+            if colors[0, 3] < 1:
+                mesh["bsdf"] = {"type": "mask", "opacity": float(colors[0, 3]), "nested": mesh["bsdf"]}
+            meshes[f"part{i}"] = mesh
+        scene = mi.load_dict({"type": "scene", "sensor": sensor(SIZE, 30.0, (0.1, 100.0)), **meshes})
+    integrator = mi.load_dict({"type": "prb_projective", "max_depth": 8, "rr_depth": 50, "sppi": samples})
+    parameters, key, t = mi.traverse(scene), f"part{change.index}.vertex_positions", mi.Float(0.0)
+    rest = mi.Float(parameters[key])
+    velocity = np.broadcast_to(view[:3, :3] @ [PIXEL, PIXEL / 2, 0], (len(rest) // 3, 3))
+    dr.enable_grad(t)
+    parameters[key] = rest + t * mi.Float(np.ravel(velocity).astype(np.float32))
+    parameters.update()
+    dr.forward(t, dr.ADFlag.ClearEdges)
+    image = mi.render(scene, parameters, integrator=integrator, spp=samples, seed=seed)
+    return np.array(dr.forward_to(image))
+
+
+def peer_rows(samples: int = 64) -> Iterator[list[str]]:
+    for name, (parts, index) in SCENES.items():
+        if parts is cards:
+            change = Change(parts(), index, "position")
+            yield [name, score(by_mitsuba(change, samples, 0), change.truth())]
 
 
 # --------------------------------------------------------------------------------------------------------- time
@@ -337,7 +376,7 @@ def fit_pictures(folder: Path, steps: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=["derivatives", "time", "fits", "pictures"])
+    parser.add_argument("--only", nargs="+", choices=["derivatives", "peers", "time", "fits", "pictures"])
     parser.add_argument("--rounds", type=int, default=15, help="turns of each call that is timed")
     parser.add_argument("--steps", type=int, default=300, help="of each fit")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/translucent"))
@@ -346,17 +385,19 @@ def main() -> None:
     warnings.simplefilter("ignore", rts.errors.LayersWarning)  # Of `multi`, which is measured on purpose.
     sections = {
         "derivatives": (["scene", "changes", *(f"{name}, {s} × {s}" for name, s in METHODS)], derivative_rows()),
+        "peers": (["scene", "Mitsuba, prb_projective, 64 spp"], peer_rows()),
         "time": (["K", "", "opaque, ms", "translucent, ms", "ratio"], time_rows(args.rounds)),
         "fits": (["fit", "splatter", "result"], fit_rows(args.steps)),
     }
+    chosen = args.only or [name for name in (*sections, "pictures") if name != "peers" or find_spec("mitsuba")]
     for name, (header, rows) in sections.items():
-        if not args.only or name in args.only:
+        if name in chosen:
             lines = []
             for line in rows:
                 print(*line, sep=" | ", flush=True)
                 lines.append(line)
             (args.output / f"{name}.md").write_text(table(header, lines))
-    if not args.only or "pictures" in args.only:
+    if "pictures" in chosen:
         pictures(args.output)
         fit_pictures(args.output, args.steps)
 
