@@ -85,14 +85,14 @@ def data_file(scene: str, file: str) -> Path:
 
 
 def _with_exact(part: Part) -> tuple[Part, Part]:
-    """A part of patches, and the same with triangles so small that its outlines are exact."""
+    """A part of patches, and a copy with triangles so small that its outlines are off by at most `EXACT` pixels."""
     surface = copy.copy(part.surface)
     surface.tolerance = EXACT
     return part, part.replace(surface=surface)
 
 
 def _upright(points: np.ndarray, ax: float, ay: float) -> np.ndarray:
-    """Points of what stands along z, float64: normalised, standing along y, and turned."""
+    """Points (V, 3) float64 of an object that stands along z: scaled to a usual size, stood along y, and turned."""
     return normalised(np.asarray(points, np.float64)[:, [0, 2, 1]] * [1, 1, -1]) @ rotation_xy(ax, ay).T
 
 
@@ -113,19 +113,19 @@ def _bunny_and_square(scene: str) -> list[Part]:
 
 
 def bunny_over_black() -> Scene:
-    """Case A of derivatives."""
+    """The bunny before nothing: case A of the table of derivatives."""
     name = "bunny over black"
     return _scene(name, _bunny_and_square(name)[0])
 
 
 def square_behind_bunny() -> Scene:
-    """Case B of derivatives."""
+    """A square that moves behind the bunny: case B of the table of derivatives."""
     name = "square behind bunny"
     return _scene(name, _bunny_and_square(name), moves=[1])
 
 
 def bunny_before_square() -> Scene:
-    """Case C of derivatives."""
+    """The bunny moves before the square: case C of the table of derivatives."""
     name = "bunny before square"
     return _scene(name, _bunny_and_square(name), moves=[0])
 
@@ -190,7 +190,7 @@ def vase() -> Scene:
 
 
 def _standing(part: Part, entry: str, color: Sequence[float]) -> Part:
-    """A part of control points as `_upright` has them, shaded, in one color."""
+    """The part with its control points placed by `_upright`, shaded, in one colour."""
     theta = {entry: _upright(part.theta[entry], 0.35, 0.5), "color": np.array(color)}
     return part.replace(theta=theta, shader="lambert")
 
@@ -234,7 +234,7 @@ def _torus_by_ray() -> Part:
 
 
 def torus_by_lattice() -> Scene:
-    """A torus on a lattice of 0.05; the exact one is met by rays."""
+    """A torus of values on a lattice with steps of 0.05; its exact counterpart is the field that rays meet."""
     bounds = (-1.0, -0.4, -1.0), (1.0, 0.4, 1.0)
     surface = plugin("rts.surfaces", "isosurface")(bounds, f=torus, shape=(41, 17, 41), lipschitz=1.0, reads=("radii",))
     return _scene("torus by lattice", _torus(surface), exact=_torus_by_ray())

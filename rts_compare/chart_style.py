@@ -39,7 +39,7 @@ OTHER_FILLS = ("-open-dot", "-dot")
 
 
 def assigned(names: Iterable[str], fixed: Mapping[str, str], others: Sequence[str]) -> dict[str, str]:
-    """The look of each name: its own where it has one, else one of `others` by the order of the names.
+    """The look (a colour or symbol) of each name: its fixed look if it has one, else the next of `others`.
 
     Args:
         names: any; some may occur often.
@@ -86,7 +86,7 @@ class Looks:
 
 
 def drawn(row: Row) -> bool:
-    """True where a row has a place on logarithmic axes."""
+    """True if a row's time and error are positive numbers, which logarithmic axes can show."""
     return timed(row) and milliseconds(row) > 0 and row["error"] > 0
 
 
@@ -122,7 +122,7 @@ def label(row: Row) -> str:
 
 
 def arguments(row: Row) -> str:
-    """A row's settings as keyword arguments to copy, and in a comment what is set elsewhere: engine and rate."""
+    """A row's settings as keyword arguments of `rts.render` to copy; a comment names engine and rate, set elsewhere."""
     settings = row["settings"]
     if "peer" in row:
         return "# " + ", ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
@@ -133,6 +133,6 @@ def arguments(row: Row) -> str:
 
 
 def environment_line(environment: Mapping[str, Any]) -> str:
-    """Where and when a comparison was made, in one line."""
+    """The date, machine and versions of a comparison, in one line."""
     versions = ", ".join(f"{name} {version}" for name, version in environment.get("versions", {}).items() if version)
     return "; ".join(filter(None, [environment.get("date"), environment.get("machine"), versions]))

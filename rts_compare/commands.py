@@ -146,7 +146,7 @@ def summary(comparison: Comparison) -> Table:
 
 
 def _missing_charts() -> str | None:
-    """A line that names the charts that cannot be drawn for want of a package; None where all can."""
+    """A line that names the charts whose package is not installed; None if none is missing."""
     kinds = {"matplotlib": "PNG", "plotly": "HTML"}
     missing = [package for package in kinds if find_spec(package) is None]
     if not missing:
@@ -158,7 +158,7 @@ def _missing_charts() -> str | None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """(height, width) of "256" or "480x640"."""
+    """(height, width) of a text: "256" for a square, or "480x640"."""
     parts = text.lower().split("x")
     if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
         raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")

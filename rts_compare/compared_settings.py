@@ -30,9 +30,9 @@ class Setting(NamedTuple):
         splatter: its name.
         layers: K, or "auto".
         supersample: samples along each side of a pixel; or, where outlines are, such as "adaptive:4" (`rts.Adaptive`).
-        rate: what differs of the surfaces, such as "tolerance=0.4"; "" for nothing.
-        sampler: its name; "" where only the error is meant.
-        engine: its name; "" likewise.
+        rate: how finely surfaces are sampled, such as "tolerance=0.4" (`Surface.rates`); "" for their own fineness.
+        sampler: its name; "" in settings whose errors alone are measured.
+        engine: its name; "" in such settings, too.
     """
 
     splatter: str
@@ -50,29 +50,29 @@ class Setting(NamedTuple):
 
     @property
     def side(self) -> float:
-        """The square root of the samples a pixel; of those at outlines alone, about what they cost."""
+        """Samples along a side of a pixel; for `rts.Adaptive`, the side of a full grid that costs about as much."""
         found = samples_of(self.supersample)
         return math.sqrt(SHARE * found.samples) if isinstance(found, Adaptive) else found
 
 
 def samples_of(supersample: int | str) -> int | Adaptive:
-    """Samples a pixel as `rts.render` takes them, of a setting's number or text."""
+    """The `supersample` of `rts.render` for `Setting.supersample`: a number, or an `rts.Adaptive`."""
     return Adaptive.of_text(supersample) if isinstance(supersample, str) else int(supersample)
 
 
 def as_text(supersample: Adaptive) -> str:
-    """Samples at outlines as settings hold them: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
+    """`Setting.supersample` of an `rts.Adaptive`: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
     given = {"dilated": supersample.dilated, "contrast": supersample.contrast}
     return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
 
 
 def finest(supersample: Any) -> Any:
-    """Samples along each side of a pixel, where there are most; what is neither is returned as it is."""
+    """The most samples along a side of a pixel, of a number or an `rts.Adaptive`; other values are returned as is."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 
 
 def in_python(supersample: int | str) -> str:
-    """Samples a pixel as a user writes them."""
+    """Python code for a `supersample`, as a user writes it."""
     if not isinstance(supersample, str):
         return str(supersample)
     _, side, *options = supersample.split(":")
@@ -80,7 +80,7 @@ def in_python(supersample: int | str) -> str:
 
 
 def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
-    """The plugins of a group that load, "auto" and further names of one class left out; and why others are not there.
+    """The plugins of a group that load, each class once and without "auto"; and for others the reason why not.
 
     Args:
         group: such as "rts.splatters".
@@ -106,7 +106,7 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
 
 
 def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
-    """The engines that have derivatives, the one that errors are measured with first; and why others are not there."""
+    """The engines with derivatives, first the one that measures errors; and for others the reason why not."""
     names, left_out = usable("rts.engines", chosen)
     loaded = [engine_named(name) for name in names]
     found = [engine for engine in loaded if engine.differentiates]
@@ -126,11 +126,11 @@ def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str
 
 
 def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tuple[float, ...]]) -> list[Setting]:
-    """The settings that no cheaper one betters, nor an equal one before it: the front of errors, with work for time.
+    """The settings worth timing: no cheaper setting has a smaller error, nor an equally cheap one listed before.
 
     Args:
         errors: setting → error.
-        work: setting → what it costs in several respects.
+        work: setting → its costs, several numbers, each the less the better.
     """
     found: list[Setting] = []
     for setting in sorted(errors, key=lambda s: (work(s), errors[s])):
@@ -144,5 +144,5 @@ def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tupl
 
 
 def _no_worse(error: float, other: float) -> bool:
-    """True where an error is not much larger than another one, and within all `LEVELS` that the other is within."""
+    """True if an error is not much larger than another, and below all of `LEVELS` that the other is below."""
     return error <= ALIKE * other and not any(other <= level < error for level in LEVELS)

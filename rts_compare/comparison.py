@@ -41,12 +41,12 @@ PACKAGES = ("rasterize-then-splat", "numpy", "numba", "torch", "jax", "embreex",
 
 @dataclass(frozen=True)
 class Comparison:
-    """Settings on one scene, with the error of their derivatives and their time.
+    """Results of settings on one scene: the errors of their derivatives, and their times.
 
     Attributes:
         scene: "name", "note" and "size" (height, width).
         environment: date, machine and versions.
-        modes: mode → {"truth_error": error of the truth itself}.
+        modes: mode → {"truth_error": estimated error of the reference derivative itself}.
         rows: one for each mode and setting: "mode", "settings", "error" (relative L2 through a Gaussian of 2 pixels),
             "gain", "loss_error", "ms" (median, quartiles and number of calls, or None where only the error was
             measured) and "front", whether nothing is both faster and more accurate. Rows of other renderers have
@@ -103,7 +103,7 @@ def file_name(scene: str) -> str:
 
 
 class Plan(NamedTuple):
-    """A plan of measurements.
+    """The settings to measure.
 
     Attributes:
         splatters: names.
@@ -287,7 +287,7 @@ def _compared(measured: Measurements, plan: Plan, phase: Phase) -> Comparison:
 
 
 def _counted(f: Callable, *args: Any, done: Callable[[], None]) -> Any:
-    """The result of a call, counted as a step of progress."""
+    """The result of `f`; `done` is called afterwards, to move a progress bar on."""
     result = f(*args)
     done()
     return result

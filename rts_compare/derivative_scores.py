@@ -13,7 +13,7 @@ LOSSES, LOSS_SCALE = 16, 8.0
 
 
 def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
-    """Norm of the difference over that of `scale`."""
+    """The norm of x − y over the norm of `scale`."""
     return float(np.linalg.norm(x - y) / max(float(np.linalg.norm(scale)), 1e-30))
 
 

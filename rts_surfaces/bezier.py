@@ -81,11 +81,11 @@ class Bezier(Patches):
         return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
 
     def bezier_rows(self, values: Array) -> Array:
-        """The control points, which are Bézier's already."""
+        """See `Patches`: the rows as they are, since control points are Bézier points already."""
         return values
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """One row for each control point."""
+        """See `Patches`: one row for each control point."""
         return None if len(shape) == 1 and shape[0] >= self._least else f"(m, C) with m of at least {self._least}"
 
 
@@ -94,7 +94,7 @@ def _range(indices: np.ndarray) -> str:
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices and points of an .npz."""
+    """Indices (n, 16) and points (m, 3) of an .npz."""
     try:
         with np.load(path, allow_pickle=False) as file:
             indices, points = np.asarray(file["indices"]), np.asarray(file["points"], np.float64)

@@ -18,7 +18,7 @@ other."""
 
 
 def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
-    """(N, C): patches at samples.
+    """Points or attributes (N, C) of patches, at the parameters of samples.
 
     Args:
         rows: (V, C) float, control points or attributes of theirs; differentiable.
@@ -30,7 +30,7 @@ def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
 
 
 def normals(rows: Array, table: Array, patch: Array, params: Array) -> Array:
-    """(N, 3) unit normals: of the derivatives along u and v, in this order; arguments as for `values`, C = 3.
+    """Unit normals (N, 3): the product of the derivatives along u and v; arguments as for `values`, C = 3.
 
     Where one side of a patch is a single point, one derivative is zero there, and rounding beside it. It grows as the
     mixed derivative: that has its direction. Where there is no normal, it is zero.

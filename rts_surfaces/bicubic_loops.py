@@ -100,7 +100,7 @@ def pull_values(
 def normals(
     collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, 3) with unit normals; tangents below this share of the other one are taken for zero."""
+    """Fill `out` (N, 3) with unit normals; a tangent shorter than `collapsed` times the other one counts as zero."""
     given = _nets(rows, table), patch, params, rows.dtype.type(collapsed)
     parallel(_fill_normals, len(out), *given, out, work=60 * len(out))
 
@@ -217,7 +217,7 @@ def _pull_values(start, stop, patch, params, g, found):
 
 @compiled
 def _tangents(net, u, v, collapsed, work):
-    """Fill `work` (7, 4): weights along u, their derivatives, along v, theirs; the tangents along u and v, the mixed.
+    """Fill `work` (7, 4): weights along u and their derivatives, those along v; tangents along u and v, the mixed one.
 
     Where one side of a patch is a single point, one tangent is zero there, and rounding beside it. It grows as the
     mixed derivative, which then stands for it. Returned are the factors of that, zero where it does not.

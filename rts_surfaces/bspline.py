@@ -74,7 +74,7 @@ class BSpline(Patches):
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """One row for each control point of the grid."""
+        """See `Patches`: one row for each control point of the grid."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
 
 

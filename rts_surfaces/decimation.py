@@ -17,8 +17,8 @@ class Decimated(NamedTuple):
 
     Attributes:
         faces: (T', 3) int32.
-        vertices: (V', 3) in the dtype of the vertices that there were.
-        nearest: (V',) int32, for each the nearest of the vertices that were merged into it.
+        vertices: (V', 3) in the dtype of the old vertices.
+        nearest: (V',) int32, for each new vertex the nearest of the old ones that were merged into it.
     """
 
     faces: np.ndarray
@@ -27,7 +27,7 @@ class Decimated(NamedTuple):
 
 
 def fewer_faces(vertices: np.ndarray, faces: np.ndarray) -> Iterator[Decimated]:
-    """The mesh with a sixteenth, and with a quarter of its faces; nothing where they are few, or without the package.
+    """Copies of the mesh with 1/16, then 1/4 of its faces; none if it has fewer than `FEWEST` faces.
 
     Args:
         vertices: (V, 3).

@@ -62,8 +62,7 @@ class Parametric(TriangleSurface):
     Attributes:
         whole: the patches as tiles.
         tiles: the same, in smaller tiles where they are few.
-        coarse: how many times as much they may be off elsewhere: samples find the surface from afar, since Newton's
-            method needs no better start.
+        coarse: how many tolerances triangles may be off away from outlines: Newton's method needs no better start.
         beside: how far from the border of a tile to look at its shape, a share of its size: where second derivatives
             have no bound at the border, or are large on very little of a tile.
     """
@@ -95,7 +94,7 @@ class Parametric(TriangleSurface):
         return rates
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rates of the edges of `whole` and within it, for so many cuts along each side of a patch."""
+        """The numbers of pieces of `whole`, along edges and inside, with `rate` pieces along each side of a patch."""
         return uniform(self.whole, rate)
 
     @abc.abstractmethod

@@ -26,8 +26,8 @@ class Bicubic(Geometry):
 
     Args:
         nets: the control points.
-        across: (n, 4), what `across` gives.
-        flips: (n, 4), those of the patches as tiles.
+        across: (n, 4), the side beyond each side; see `across`.
+        flips: (n, 4), see `Tiles`.
     """
 
     def __init__(self, nets: np.ndarray, across: np.ndarray, flips: np.ndarray):
@@ -63,13 +63,13 @@ class Patches(Parametric):
     """Base of surfaces of bicubic patches.
 
     Args:
-        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v; they name rows of
-            what `bezier_rows` gives.
+        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v: rows of the
+            result of `bezier_rows`.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
         used: see `Parametric`.
 
     Attributes:
-        shaped_by: the entries of θ that control points are made of.
+        shaped_by: the entries of θ from which control points are made.
     """
 
     shaped_by: tuple[str, ...] = ("points",)

@@ -34,7 +34,7 @@ class _Posed(NamedTuple):
         parts: all of them.
         camera: the camera.
         moves: the indices of those that move.
-        center: (3,) of rotations.
+        center: (3,), the point about which rotations turn.
     """
 
     parts: Sequence[Part]
@@ -64,12 +64,12 @@ def posed(
     Args:
         name: of the scene.
         parts: without transforms.
-        axes: in which ways, of `AXES`.
+        axes: names of motions, out of `AXES`.
         moves: the indices of the parts that move.
         size: (height, width).
         camera: None for that of built-in scenes.
-        depth: at which a translation of one unit is a pixel; None for that of the middle of what moves.
-        unit: how long a unit of the world is.
+        depth: the depth at which a translation by one unit is a pixel; None for the middle of the moving parts.
+        unit: the length of one unit in the world.
     """
     parts = [parts] if isinstance(parts, Part) else list(parts)
     points = np.concatenate([np.asarray(parts[i].theta["vertices"], np.float64) for i in moves])
@@ -109,7 +109,7 @@ def box_pose() -> Scene:
 
 
 def colored_box() -> Scene:
-    """That box with a colour a corner, its eight corners shared, as other renderers want them."""
+    """The box of `box_pose` with a colour a corner. Its faces share eight corners, as other renderers need."""
     vertices, faces = example_shapes.box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
     corners, became = np.unique(vertices, axis=0, return_inverse=True)
     hues = 0.5 + 0.45 * np.cos(np.arange(8)[:, None] * [1.7, 2.6, 4.1] + [0, 2, 4])
@@ -243,7 +243,7 @@ def grazing() -> Scene:
 
 
 def leaving() -> Scene:
-    """A sphere that is larger than the image on three of its sides."""
+    """A sphere that reaches beyond three sides of the image."""
     return posed("leaving the image", sphere(0.95, (0.55, 0.35, 0), detail=4))
 
 
@@ -260,7 +260,7 @@ def past_camera() -> Scene:
 
 
 def empty() -> Scene:
-    """A sphere beside what is seen."""
+    """A sphere outside of the image."""
     return posed("empty view", sphere(0.3, (4.0, 0, 0)))
 
 
@@ -297,7 +297,7 @@ def plain() -> Scene:
 
 
 def scaled(factor: float, away: float = 0.0) -> Scene:
-    """As `plain`, all lengths times a factor, in float64; and all of it far from the origin."""
+    """The scene `plain` with all lengths times a factor, in float64, and moved by `away` from the origin."""
     offset = np.array([away, 0.0, 0.0])
 
     def moved(part: Part) -> Part:
@@ -312,7 +312,7 @@ def scaled(factor: float, away: float = 0.0) -> Scene:
 
 
 def offset(away: float) -> Scene:
-    """As `plain`, with vertices near the origin of parts whose transforms are far from that of the world."""
+    """The scene `plain`: vertices lie near their parts' origins, and transforms move the parts far from the world's."""
     scene, still = plain(), np.eye(4)
     still[0, 3] = away
 
@@ -329,7 +329,7 @@ def offset(away: float) -> Scene:
 
 
 def with_slivers(shader: str = "unlit") -> Scene:
-    """As `plain`, the sphere with triangles of no area and needles that a float can hardly tell from it."""
+    """The scene `plain`, its sphere with additional triangles of no area, and needles of next to none."""
     sphere_, far = parts_of(plain().at(plain().parameters))
     vertices, faces = sphere_.theta["vertices"], np.asarray(sphere_.surface.faces)
     extra = [[i, i, j] for i, j in faces[:40, :2]] + [[i, i, i] for i in range(20)]

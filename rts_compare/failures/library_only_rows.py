@@ -46,7 +46,7 @@ def _image(values: Array, method: Method, shader: str = "lambert") -> Array:
 
 
 def _gradient(values: np.ndarray, method: Method) -> tuple[float, int]:
-    """The largest derivative of the images' mean square in a value of the lattice, and how many are not finite."""
+    """The largest derivative of the image's mean square by a lattice value; and how many derivatives are not finite."""
     engine = engine_named("torch")
     largest, nan = 0.0, 0
     for shader in ("lambert", "silhouette"):
@@ -62,7 +62,7 @@ def _gradient(values: np.ndarray, method: Method) -> tuple[float, int]:
 
 
 def _of_values(values: np.ndarray, usual: np.ndarray, limits: tuple[float, float], method: Method) -> Outcome:
-    """Compare the largest gradient with that of usual values."""
+    """The outcome of comparing the largest gradient at `values` with that at `usual` values."""
     try:
         own(method)
     except Unable:
@@ -167,7 +167,7 @@ def swept_trap(method: Method, context: Context) -> Outcome:
 
 
 def swept_turned(method: Method, context: Context) -> Outcome:
-    """As `swept_trap`, seen from aside."""
+    """The fit of `swept_trap` seen obliquely, where symmetry no longer hides the hole."""
     if method.peer:
         return cannot("it has no isosurfaces")
     return _swept(method, context, ((0.9, 2.2, 2.4), (0, 1, 0)))

@@ -32,12 +32,12 @@ JUMP = 1e3
 
 
 class Unable(Exception):
-    """Why a method cannot do what a row asks; a clause."""
+    """Raised if a method cannot measure a row; the message is a clause that says why."""
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without the library's warnings: views here are empty, and layers too few, on purpose."""
+    """A context in which the library does not warn: some views are empty, and layers too few, on purpose."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RtsWarning)
         yield
@@ -65,7 +65,7 @@ def shifted(scene: Scene, amounts: Array) -> Tree:
 
 
 class Renderer(abc.ABC):
-    """A method, with a scene."""
+    """A method of the table, ready to differentiate one scene."""
 
     @abc.abstractmethod
     def derivative(self, mode: str) -> np.ndarray:
@@ -81,7 +81,7 @@ class Renderer(abc.ABC):
 
 
 def renderer(scene: Scene, method: Method, dtype: Any = np.float32) -> Renderer:
-    """A method with a scene.
+    """The `Renderer` of a method for a scene.
 
     Raises:
         Unable: another renderer is not installed, or cannot render the scene.
@@ -90,12 +90,12 @@ def renderer(scene: Scene, method: Method, dtype: Any = np.float32) -> Renderer:
 
 
 class Own(Renderer):
-    """The library's own, by torch.
+    """A `Renderer` by this library, with torch.
 
     Args:
         scene: the scene.
         options: of `render`.
-        dtype: of the numbers along which it moves, float32 or float64.
+        dtype: of the parameters, float32 or float64.
     """
 
     def __init__(self, scene: Scene, options: Mapping[str, Any], dtype: Any = np.float32):
@@ -150,7 +150,7 @@ class Own(Renderer):
 
 
 class Other(Renderer):
-    """Another renderer.
+    """A `Renderer` by DEODR or Mitsuba.
 
     Raises:
         Unable: it is not installed, or cannot render the scene.

@@ -39,7 +39,7 @@ class Derivative(NamedTuple):
     Attributes:
         scene: () → the scene, at rest where the derivative is taken.
         reference: () → another scene of the same image, whose truth is compared with; None for the scene's own.
-        pixel: the result of `pixel_of`, if that cannot be computed.
+        pixel: the step that moves the fastest point by a pixel; None to compute it by `pixel_of`.
         double: whether the library computes in float64.
         mode: the scene's mode to measure; None for the first.
     """
@@ -159,7 +159,7 @@ class Fitted(NamedTuple):
     blur: float = 0.0
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The share of fits that converge."""
+        """The share of fits that converge, and the verdict by `SHARES`; "failed" if any slope is not finite."""
         scene = self.scene()
         still = parts_of(scene.at(scene.parameters)), scene.at(scene.parameters)[1]
         with quiet():
@@ -232,7 +232,7 @@ def _on_screen(scene: Scene, amounts: np.ndarray) -> list[np.ndarray]:
 
 
 def own(method: Method) -> None:
-    """Refuse other renderers.
+    """Refuse methods that are other renderers.
 
     Raises:
         Unable: the method is one.

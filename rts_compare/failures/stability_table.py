@@ -25,7 +25,7 @@ PACKAGES = ("rasterize-then-splat", "numpy", "torch", "deodr", "mitsuba")
 
 
 class Stability(NamedTuple):
-    """The table.
+    """The table of ways to fail against methods.
 
     Attributes:
         methods: the names of the columns.
@@ -142,7 +142,7 @@ def stability(
 
 
 def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) -> list[Any]:
-    """The known things of these names."""
+    """The values of `known` under the names `wanted`, all for None; refused, as `what`, if a name is unknown."""
     if wanted is None:
         return list(known.values())
     wanted = [wanted] if isinstance(wanted, str) else wanted
@@ -159,7 +159,7 @@ def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) ->
 
 
 def _measured(row: Row, method: Method, context: Context, measured: KeptMeasurements) -> Outcome:
-    """A cell, measured once."""
+    """A cell, measured, or read from what an earlier run has kept."""
     key = (row.name, method.name, context.seeds, context.steps, context.samples)
     kept = measured.get(*key)
     if kept is None:

@@ -14,7 +14,7 @@ VERDICTS = ("ok", "degraded", "failed", "cannot")
 
 
 class Outcome(NamedTuple):
-    """A cell.
+    """A cell of the table: how a method did on a way to fail.
 
     Attributes:
         verdict: "ok", "degraded", "failed", or "cannot" where the method does not apply.
@@ -47,7 +47,7 @@ class Row(NamedTuple):
     """A way to fail.
 
     Attributes:
-        name: of it.
+        name: of the row.
         note: what is done, what the figure is, and from where on it counts as degraded and as failed.
         measure: (method, context) → the cell.
         why: why our own cells fail or are degraded, and what helps; "" where none are.

@@ -131,14 +131,14 @@ class FunctionOnLattice(Field):
     # ------------------------------------------------------------------------------------------------ samples
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """The lattice points that samples share, by number, if there is to be such a table."""
+        """The spec of the table of lattice points that samples share; empty if the surface wants no table."""
         if not self.table:
             return {}
         room = 6 * rows if capacity is None else 2 * capacity if self.table is True else int(self.table)
         return {"points": ArraySpec((min(room, self._lattice.count),), np.int32, packed=capacity is None)}
 
     def tabled(self, samples: Samples) -> Samples:
-        """Samples whose ids are rows of a table of lattice points, if there is to be one."""
+        """Samples whose ids are rows of a table of lattice points; unchanged if the surface wants no table."""
         if not self.table:
             return samples
         from rts_surfaces.implicit.distinct_loops import distinct
@@ -155,7 +155,7 @@ class FunctionOnLattice(Field):
         return samples.replace(ids=ids, row=row, overflow=overflow, tables={"points": points[:room].astype(np.int32)})
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """Levels (M,), differentiable; and which rows of them (N, 6) int32 the six values of each sample are."""
+        """Levels (M,), differentiable; and for each sample the rows (N, 6) int32 of its six values in them."""
         if self.table:
             if "points" not in samples.tables:
                 raise InputError("the samples have no table of lattice points, and the surface has one; sample it anew")

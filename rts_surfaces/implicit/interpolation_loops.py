@@ -11,7 +11,7 @@ Numbers = tuple[float, ...]
 
 
 def forward(values: np.ndarray, points: np.ndarray, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
-    """Fill the differences (N, 3) at points (N, 3)."""
+    """Fill `out` (N, 3) with central differences of the values at points (N, 3)."""
     parallel(_value, len(points), values, points, low, step, out, work=150 * len(points))
 
 
@@ -25,7 +25,7 @@ def push(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    """Fill their derivatives (N, 3) along tangents of values (X, Y, Z) and points, or None for zeros."""
+    """Fill `out` (N, 3) with their derivatives along tangents of values (X, Y, Z) and points; None stands for zeros."""
     out[...] = 0
     if t_values is not None:
         forward(t_values, points, out, low=low, step=step)
@@ -43,7 +43,7 @@ def pull(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    """Pull back the gradient `g` (N, 3): add to that of the values, and fill that of the points, where wanted."""
+    """Pull back the gradient `g` (N, 3) of the differences: add to `g_values`, fill `g_points`; either may be None."""
     if g_values is not None:
         _pull_values(points, g, low, step, g_values)
     if g_points is not None:

@@ -284,7 +284,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         )
 
     def _capped(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The level, and beyond the bounds no less than what grows with the distance to them as fast as it may."""
+        """The level; beyond the bounds at least their distance times `lipschitz`, so that rays meet the caps."""
         xp, level = namespace(points), self.field.level(theta, points)
         for axis, (low, high) in enumerate(np.stack(self.bounds, axis=1).tolist()):
             beyond = xp.maximum(low - points[:, axis], points[:, axis] - high)
@@ -292,7 +292,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return level
 
     def _caps(self, points: Array) -> Array:
-        """(M, 3): 1 or −1 for the axis across which a point lies in the bounds' side, where they are capped; else 0."""
+        """(M, 3): for points in a capped side of the bounds, 1 or −1 on the axis across that side; else 0."""
         xp, (low, high) = namespace(points), self.bounds
         columns = []
         for axis in range(3):

@@ -37,7 +37,7 @@ class Lattice:
 
     @classmethod
     def of(cls, shape: tuple[int, ...], low: tuple[float, ...], step: tuple[float, ...]) -> Lattice:
-        """The lattice whose `fixed` these are."""
+        """The lattice of a shape, a first point and a step, as `fixed` gives them."""
         self = cls.__new__(cls)
         self.shape, self.low, self.step = shape, np.array(low), np.array(step)
         return self

@@ -64,11 +64,11 @@ class LatticeField(ScalarField):
                 yield Resampled(shape, field, partial(_every, stride))
 
     def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """The values."""
+        """The values, as `Looked`; no function is evaluated."""
         return Looked({"values": theta["values"]}, 0)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """No tables: samples refer to the values themselves."""
+        """Empty: the ids of samples are indices of the lattice's values, so no table is needed."""
         return {}
 
     def tabled(self, samples: Samples) -> Samples:
@@ -76,7 +76,7 @@ class LatticeField(ScalarField):
         return samples
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """All values (M,), and the indices (N, 6) of those that belong to each sample."""
+        """All values (M,), and for each sample the indices (N, 6) of its six values."""
         values = self.suited(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 
@@ -104,5 +104,5 @@ class LatticeField(ScalarField):
 
 
 def _every(stride: int, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-    """θ with some of its values."""
+    """θ with every `stride`-th value along each axis."""
     return {**theta, "values": theta["values"][::stride, ::stride, ::stride]}
