@@ -167,7 +167,7 @@ def swept_trap(method: Method, context: Context) -> Outcome:
 
 
 def swept_turned(method: Method, context: Context) -> Outcome:
-    """As `swept_trap`, seen from aside."""
+    """The fit of `swept_trap` seen obliquely, where symmetry no longer hides the hole."""
     if method.peer:
         return cannot("it has no isosurfaces")
     return _swept(method, context, ((0.9, 2.2, 2.4), (0, 1, 0)))

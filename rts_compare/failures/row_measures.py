@@ -159,7 +159,7 @@ class Fitted(NamedTuple):
     blur: float = 0.0
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The share of fits that converge."""
+        """The share of fits that converge, and the verdict by `SHARES`; "failed" if any slope is not finite."""
         scene = self.scene()
         still = parts_of(scene.at(scene.parameters)), scene.at(scene.parameters)[1]
         with quiet():

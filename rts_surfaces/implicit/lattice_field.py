@@ -68,7 +68,7 @@ class LatticeField(ScalarField):
         return Looked({"values": theta["values"]}, 0)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """No tables: samples refer to the values themselves."""
+        """Empty: the ids of samples are indices of the lattice's values, so no table is needed."""
         return {}
 
     def tabled(self, samples: Samples) -> Samples:
