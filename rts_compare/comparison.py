@@ -33,9 +33,9 @@ from rts_compare.true_derivatives import SAMPLES
 LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4, Adaptive(4))
 QUICK_CELLS = 40
-"""The most settings that are measured with `quick`."""
+"""Largest number of settings that are measured with `quick`."""
 PEER_ROUNDS = 2
-"""Turns of other renderers."""
+"""Number of rounds in which other renderers are timed."""
 PACKAGES = ("rasterize-then-splat", "numpy", "numba", "torch", "jax", "embreex", "moderngl", "deodr", "mitsuba")
 
 
@@ -47,10 +47,10 @@ class Comparison:
         scene: "name", "note" and "size" (height, width).
         environment: date, machine and versions.
         modes: mode → {"truth_error": estimated error of the reference derivative itself}.
-        rows: one for each mode and setting: "mode", "settings", "error" (relative L2 through a Gaussian of 2 pixels),
-            "gain", "loss_error", "ms" (median, quartiles and number of calls, or None where only the error was
-            measured) and "front", whether nothing is both faster and more accurate. Rows of other renderers have
-            "peer", too.
+        rows: one for each mode and setting: "mode", "settings", "error" (relative L2, both smoothed by a Gaussian of
+            standard deviation 2 pixels), "gain" and "loss_error" (see `derivative_scores.scores`), "ms" (median,
+            quartiles and number of calls, or None where only the error was measured) and "front", True if no row is
+            both faster and more accurate. Rows of other renderers name theirs in "peer".
         left_out: a line for each measurement that failed, with the reason.
     """
 

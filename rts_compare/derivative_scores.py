@@ -13,7 +13,7 @@ LOSSES, LOSS_SCALE = 16, 8.0
 
 
 def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
-    """The norm of x − y over the norm of `scale`."""
+    """The norm of x − y divided by the norm of `scale`."""
     return float(np.linalg.norm(x - y) / max(float(np.linalg.norm(scale)), 1e-30))
 
 
@@ -46,7 +46,7 @@ def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Score a derivative image (H, W, 3) beside the true one, in more ways.
 
     Returns:
-        relative_l2, cosine, gain: raw.
+        relative_l2, cosine, gain: of the images as they are.
         low_relative_l2, low_cosine, low_gain: the same through the low-pass.
         spurious: share of the derivative's energy farther than 3 pixels from where the truth is not zero.
         loss_error: as of `scores`.

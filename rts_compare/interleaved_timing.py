@@ -1,4 +1,4 @@
-"""Times of functions that take turns, each turn kept as it is made."""
+"""Times of functions that are called in turns; the times of each turn are kept on disk at once."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ LONGEST = 120.0
 """Seconds after which a function that is to be timed is left out."""
 
 WARM = 0.5
-"""Seconds that a first call may always take: it loads what the next ones find."""
+"""Seconds that a first call may always take, since it also loads and compiles."""
 
 Calls = Mapping[tuple, Callable[[], Callable[[], Any]]]
 """The key of a time → a function that makes the function to be timed."""
 
 
 class InterleavedTiming:
-    """Functions whose times are taken.
+    """A timer of several functions, which take turns.
 
     Args:
-        kept: where times are kept.
+        kept: the store of times.
         calls: the functions.
-        key: what to keep each time under, of a key of `calls`.
+        key: function from a key of `calls` to the key in the store.
 
     Attributes:
-        failed: key → why it could not be timed, a line.
+        failed: key → the reason why the function could not be timed, one line.
     """
 
     def __init__(self, kept: KeptMeasurements, calls: Calls, key: Callable[[tuple], tuple]):
@@ -53,13 +53,13 @@ class InterleavedTiming:
         late: Callable[[], bool] = lambda: False,
         hopeless: float = math.inf,
     ) -> dict[tuple, dict[str, float]]:
-        """Let them take turns in shuffled order, each after a call to warm up.
+        """Time all functions in turns, in shuffled order, each after a call to warm up.
 
         Args:
-            rounds: turns of each; those of earlier runs count.
+            rounds: turns of each function, kept turns of earlier runs included.
             done: called for each turn.
-            late: whether to end, once something is known.
-            hopeless: what takes so many times as long as the fastest is called once.
+            late: returns True to skip all further turns; ignored until one function has a time.
+            hopeless: a function that takes more than this many times the fastest one's time is called only once.
 
         Returns:
             Milliseconds under each name that could be timed: "median", quartiles "low" and "high", number of "calls".
@@ -101,7 +101,7 @@ class InterleavedTiming:
         return found
 
     def _most(self) -> float:
-        """Seconds of a first call after which there is no other."""
+        """Seconds; a function whose first call takes longer is not called again."""
         known = [float(np.median(times)) for times in self._times.values() if times]
         return max(WARM, self._hopeless * min(known)) if known else math.inf
 

@@ -94,14 +94,15 @@ def moving(
     note: str = "",
     exact: Part | Sequence[Part] | None = None,
 ) -> Scene:
-    """The scene of parts in NumPy that move in up to five ways, each by a parameter of its own, linearly.
+    """A scene of NumPy parts that change in up to five modes, each linearly in one number of its own.
 
     - translation: to the right of the image;
-    - rotation: about the upright axis of the camera, through the middle of what moves;
-    - shape: the points that the surface is made of swell, unevenly, about their middle; what it reads and is no points,
-      such as radii or values on a lattice, changes by one number;
-    - color: the base colour of the parts, which `rts.shading.shaders` describes, changes, each channel in another way;
-    - camera: it moves ahead.
+    - rotation: about the camera's up axis, through the middle of what moves; along the tangent, so true to first order
+      only;
+    - shape: points in θ that make the surface swell, unevenly, about their middle; its other numbers, such as radii or
+      values on a lattice, all grow at one rate;
+    - color: the base colour of the parts, see `rts.shading.shaders`, changes, each channel at its own rate;
+    - camera: the camera moves ahead.
 
     Args:
         name: of the scene.
@@ -109,13 +110,13 @@ def moving(
         camera: the camera.
         size: (height, width).
         moves: the indices of the parts that translations, rotations and shapes move; None for all.
-        modes: some of the ways. Those that change nothing are left out.
+        modes: names from `MODES`. Modes that change nothing are left out.
         note: what is hard about the scene.
         exact: the same parts as exact surfaces, with the same transforms. Modes that change entries of θ which these
             lack, or have in another shape, are left out.
 
     Raises:
-        InputError: another number of exact parts, or modes and indices that there are not.
+        InputError: not as many exact parts as parts, an unknown mode, or an index out of range.
     """
     parts = [parts] if isinstance(parts, Part) else list(parts)
     true = parts if exact is None else [exact] if isinstance(exact, Part) else list(exact)

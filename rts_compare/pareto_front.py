@@ -14,7 +14,7 @@ from typing import Any
 Row = Mapping[str, Any]
 
 LEVELS = (0.1, 0.03, 0.01)
-"""Errors that summaries name the fastest row for."""
+"""Bounds on the error; summaries name the fastest row within each."""
 
 
 def timed(row: Row) -> bool:
@@ -30,14 +30,14 @@ def milliseconds(row: Row) -> float:
 def front(rows: Sequence[Row]) -> list[bool]:
     """Find the rows on the Pareto front of error and time of their mode.
 
-    A row is on it unless another of its mode has neither more error nor more time, and less of one of them. Equal rows
-    are on it together.
+    A row is on the front unless another row of its mode has no more error and no more time, and less of either. Equal
+    rows are both on the front.
 
     Args:
         rows: of any modes.
 
     Returns:
-        For each row, whether it is on the front.
+        For each row, True if it is on the front.
     """
     found = [False] * len(rows)
     order = [(row["mode"], milliseconds(row), row["error"], index) for index, row in enumerate(rows) if timed(row)]
@@ -54,20 +54,20 @@ def front(rows: Sequence[Row]) -> list[bool]:
 
 
 def marked(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """A comparison whose rows say whether they are on the front; the one given is left as it is."""
+    """A copy of a comparison in which "front" of each row is True on the Pareto front."""
     rows = comparison["rows"]
     return {**comparison, "rows": [{**row, "front": on} for row, on in zip(rows, front(rows), strict=True)]}
 
 
 def best_within(rows: Iterable[Row], error: float) -> Row | None:
-    """The fastest row whose error is at most `error`; of equally fast ones that with the least error.
+    """The fastest row whose error is at most `error`; of equally fast rows the one with the least error.
 
     Args:
-        rows: of one mode, or of those that are to be compared.
+        rows: the rows to choose from, usually of one mode.
         error: relative, such as 0.03.
 
     Returns:
-        One of the rows, or None where none is as accurate.
+        One of the rows; None if no timed row is accurate enough.
     """
     within = [row for row in rows if timed(row) and row["error"] <= error]
     return min(within, key=lambda row: (milliseconds(row), row["error"]), default=None)

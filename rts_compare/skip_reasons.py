@@ -1,4 +1,4 @@
-"""Reasons why something was left out: what took too long, and errors in one line."""
+"""Reasons why a measurement was left out: a time limit, and errors in one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 LONGEST = 200
-"""Characters of a reason."""
+"""Largest number of characters of a reason."""
 
 
 def one_line(text: str) -> str:
@@ -19,7 +19,7 @@ def one_line(text: str) -> str:
 
 
 class TooSlow(Exception):
-    """Something took longer than it was given."""
+    """A block of code took longer than its limit."""
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
-"""The true derivative of an image, by differences of area-sampled renders that know nothing of splatting.
+"""The true derivative of an image, by differences of area-sampled renders without splatting.
 
 The differences are central, over a quarter of a pixel, on two grids of points in the pixel that have nothing in
-common: what they disagree on tells their error. They are kept on disk by a key of the scene.
+common: their disagreement measures the error. Derivatives are kept on disk by a key of the scene.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from rts_compare.measurement_keys import layers_of, state_key
 from rts_compare.moving_scenes import Scene, parts_of
 
 SAMPLES = 16
-"""Points a pixel, along x and along y."""
+"""The square root of the number of points a pixel."""
 STEP = 0.25
 """Length of the difference, pixels."""
 AT_ONCE = 8
-"""Points of all pixels that are rendered by one call."""
+"""Number of points of each pixel that one call renders."""
 
 Grids = Callable[[int], tuple[np.ndarray, np.ndarray]]
 """The square root of the number of points a pixel → two grids of points (S, 2)."""
@@ -42,8 +42,8 @@ class Truth(NamedTuple):
 
     Attributes:
         derivative: (H, W, 3) a pixel of motion, the mean of the two grids'.
-        error: half of what the grids disagree on, relative L2 through the low-pass of `scores`: how far the mean of
-            two that err alike, and independently, is off.
+        error: estimated error of `derivative`, relative L2 through the low-pass of `scores`: half the difference of
+            the grids, as if both erred equally and independently.
         grids: (2, H, W, 3) the derivative on each of the grids.
     """
 
@@ -53,7 +53,7 @@ class Truth(NamedTuple):
 
     @property
     def noise(self) -> dict[str, float]:
-        """Relative L2 of what the grids disagree on: raw, and through the low-pass."""
+        """Relative L2 of the difference of both grids: raw, and through the low-pass."""
         return {
             "relative_l2": relative_l2(self.grids[0], self.grids[1], self.derivative),
             "low_relative_l2": 2 * self.error,
@@ -88,7 +88,7 @@ def area_image(
         parts: without derivatives.
         camera: the camera.
         size: (height, width).
-        points: of the pixel's centre, x right and y down, pixels.
+        points: offsets from the pixel's centre, x right and y down, pixels.
         done: called after each point.
     """
     total, layers, seen = np.zeros((*size, 4)), layers_of(parts, camera), camera.for_size(size)
@@ -112,7 +112,7 @@ def area_image(
 def truth_key(
     scene: Scene, mode: str, step: float, samples: int, engine: Engine | None, grids: Grids = lattices
 ) -> str:
-    """A hash of all that the truth depends on: the exact scene at the ends of the difference, and the grids."""
+    """A hash of everything that determines the truth: the exact scene at the ends of the difference, and the grids."""
     states = [state_key(*shown(scene, mode, by, engine), scene.size) for by in (-step / 2, step / 2)]
     points = () if grids is lattices else (fingerprint(grids(samples)),)
     return hashlib.sha256(repr((samples, states, *points)).encode()).hexdigest()[:20]
@@ -154,7 +154,7 @@ def truth(
         grids: `samples` → two grids of points (S, 2) of a pixel.
         engine: as in `shown`.
         folder: where truths are kept; None for the folder of caches.
-        done: called `samples`² times four, or as if, where it is known.
+        done: called 4 `samples`² times, also where the truth is read from disk.
     """
     length = step * pixel
     folder = (kept_folder() if folder is None else folder) / "truths"
@@ -186,7 +186,7 @@ def _kept_image(
     path: Path,
     done: Callable[[], None],
 ) -> np.ndarray:
-    """One of the four images of a difference, which a run that is interrupted has not made in vain."""
+    """One of the four images of a difference, kept on disk so that an interrupted run can go on."""
     kept = _read(path)
     if kept is not None:
         for _ in points:
@@ -198,7 +198,7 @@ def _kept_image(
 
 
 def kept_folder() -> Path:
-    """The folder of caches, or one of this process alone where nothing can be kept."""
+    """The folder of caches, or a temporary one of this process if that cannot be written."""
     try:
         return output_folder(cache_folder())
     except InputError:
@@ -207,12 +207,12 @@ def kept_folder() -> Path:
 
 @cache
 def _own_folder() -> tempfile.TemporaryDirectory:
-    """A folder of this process alone, which is removed at its end."""
+    """A temporary folder, removed when this process ends."""
     return tempfile.TemporaryDirectory(prefix="rts-truths-")
 
 
 def _read(path: Path) -> np.ndarray | None:
-    """An array that was written; None where there is none, or a damaged one, which is made anew."""
+    """The array in a file; None if the file is missing or damaged."""
     try:
         return np.load(path)
     except (OSError, ValueError, EOFError):
@@ -220,7 +220,7 @@ def _read(path: Path) -> np.ndarray | None:
 
 
 def _write(path: Path, array: np.ndarray) -> None:
-    """Write an array: all of it, or nothing, whatever interrupts, and whoever else does the same."""
+    """Write an array to a file atomically, also if several processes write the same file."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:

@@ -20,7 +20,7 @@ class Bezier(Patches):
     """Bicubic Bézier patches on control points that they may share.
 
     θ["points"] (m, 3) are the control points. "colors" (m, 1, 3 or 4) and "uv" (m, 2) are attributes of control points,
-    interpolated as they are. The normal is that of the derivatives along u and v, in this order: it points outside
+    interpolated as they are. The normal is the cross product of the derivatives along u and v: it points outside
     where u, v and the outward normal are right-handed.
 
     Args:
@@ -81,11 +81,11 @@ class Bezier(Patches):
         return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
 
     def bezier_rows(self, values: Array) -> Array:
-        """See `Patches`: the rows as they are, since control points are Bézier points already."""
+        """The values unchanged: control points are in Bézier form already."""
         return values
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """See `Patches`: one row for each control point."""
+        """None for a leading shape (m,), one row a control point; else the right shape in words."""
         return None if len(shape) == 1 and shape[0] >= self._least else f"(m, C) with m of at least {self._least}"
 
 
@@ -94,7 +94,7 @@ def _range(indices: np.ndarray) -> str:
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, 16) and points (m, 3) of an .npz."""
+    """Indices (n, 16), from 0 on, and points (m, 3) of an .npz."""
     try:
         with np.load(path, allow_pickle=False) as file:
             indices, points = np.asarray(file["indices"]), np.asarray(file["points"], np.float64)
@@ -107,7 +107,7 @@ def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices, from 0 on, and points of a text of patches."""
+    """Indices (n, 16), from 0 on, and points (m, 3) of a text in the format of Newell's teapot."""
     lines = [(i, t) for i, t in enumerate(path.read_bytes().decode(errors="replace").splitlines(), 1) if t.strip()]
     at = 0
 

@@ -13,33 +13,32 @@ from rts.plugin_api.arrays import Array, unit
 from rts.plugin_api.operations import Operation, combine
 
 COLLAPSED = 1e-4
-"""A tangent is taken for zero, and the normal from the mixed derivative, where it is less than this share of the
-other."""
+"""A tangent shorter than this share of the other tangent is taken for zero; the mixed derivative replaces it."""
 
 
 def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
-    """Points or attributes (N, C) of patches, at the parameters of samples.
+    """Values (N, C) of patches at samples, such as points.
 
     Args:
-        rows: (V, C) float, control points or attributes of theirs; differentiable.
+        rows: (V, C) float, control points or their attributes; differentiable.
         table: (n, 16) integers, the rows of each patch, first along u, then along v.
-        patch: (N,) integers.
+        patch: (N,) integers, rows of `table`.
         params: (N, 2), u and v; of the dtype of the rows, constant.
     """
     return VALUES(rows, params, patch, table)
 
 
 def normals(rows: Array, table: Array, patch: Array, params: Array) -> Array:
-    """Unit normals (N, 3): the product of the derivatives along u and v; arguments as for `values`, C = 3.
+    """Unit normals (N, 3): the cross product of the derivatives along u and v; arguments as for `values`, C = 3.
 
-    Where one side of a patch is a single point, one derivative is zero there, and rounding beside it. It grows as the
-    mixed derivative: that has its direction. Where there is no normal, it is zero.
+    Where one side of a patch is a single point, the derivative along that side is zero, or mere rounding. The mixed
+    derivative has its direction and replaces it. Where the surface has no normal, zeros are returned.
     """
     return NORMALS(rows, params, patch, table)
 
 
 def _bernstein(t: Array) -> tuple[Array, Array]:
-    """The four cubic Bernstein polynomials (N, 4) at (N,), and their derivatives."""
+    """The four cubic Bernstein polynomials (N, 4) at t (N,), and their derivatives (N, 4)."""
     xp, s = namespace(t), 1 - t
     value = xp.stack([s * s * s, 3 * s * s * t, 3 * s * t * t, t * t * t], axis=-1)
     slope = xp.stack([-3 * s * s, 3 * s * (s - 2 * t), 3 * t * (2 * s - t), 3 * t * t], axis=-1)
@@ -47,7 +46,7 @@ def _bernstein(t: Array) -> tuple[Array, Array]:
 
 
 def _sum(rows: Array, ids: Array, a: Array, b: Array) -> Array:
-    """Sums of the rows (N, 16), weighted by the products of weights along u (N, 4) and along v (N, 4)."""
+    """Sums of rows, named by ids (N, 16), times weights a along u (N, 4) and b along v (N, 4)."""
     return combine(rows, ids, namespace(a).reshape(a[:, :, None] * b[:, None, :], (-1, 16)))
 
 
@@ -110,4 +109,4 @@ VALUES = Operation.of_loops(
 NORMALS = Operation.of_loops(
     "rts_surfaces.bicubic_normals", _specified_normals, (2, 2, 1, 2), _normal_shape, _normal_loops, _check, **_PACKED
 )
-"""Both on rows, params, patch and table."""
+"""The operands of `VALUES` and `NORMALS`: rows, params, patch and table."""

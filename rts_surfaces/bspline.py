@@ -21,7 +21,7 @@ class BSpline(Patches):
     """A uniform bicubic B-spline surface.
 
     θ["points"] (nu, nv, 3) are the control points. "colors" (nu, nv, 1, 3 or 4) and "uv" (nu, nv, 2) are attributes of
-    control points, interpolated as they are. The normal is that of the derivatives along u and v, in this order.
+    control points, interpolated as they are. The normal is the cross product of the derivatives along u and v.
 
     Args:
         shape: (nu, nv), the numbers of control points, at least 4 in each direction.
@@ -74,7 +74,7 @@ class BSpline(Patches):
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """See `Patches`: one row for each control point of the grid."""
+        """None for the leading shape (nu, nv) of the grid; else the right shape in words."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
 
 

@@ -17,8 +17,8 @@ class Decimated(NamedTuple):
 
     Attributes:
         faces: (T', 3) int32.
-        vertices: (V', 3) in the dtype of the old vertices.
-        nearest: (V',) int32, for each new vertex the nearest of the old ones that were merged into it.
+        vertices: (V', 3) in the dtype of the original vertices.
+        nearest: (V',) int32, for each vertex the index of the nearest original vertex merged into it.
     """
 
     faces: np.ndarray
@@ -27,7 +27,7 @@ class Decimated(NamedTuple):
 
 
 def fewer_faces(vertices: np.ndarray, faces: np.ndarray) -> Iterator[Decimated]:
-    """Copies of the mesh with 1/16, then 1/4 of its faces; none if it has fewer than `FEWEST` faces.
+    """Copies of the mesh with 1/16, then 1/4 of its faces; none below `FEWEST`, or without fast-simplification.
 
     Args:
         vertices: (V, 3).
@@ -44,7 +44,7 @@ def fewer_faces(vertices: np.ndarray, faces: np.ndarray) -> Iterator[Decimated]:
         simplified: Any = fast_simplification.simplify(points, triangles, 1 - share, return_collapses=True)
         merged, left, became = fast_simplification.replay_simplification(points, triangles, simplified[2])
         distance = np.linalg.norm(points - merged[became], axis=1)
-        # The nearest comes last, and so is what remains.
+        # The nearest vertex is written last, over the others.
         order = np.argsort(-distance, kind="stable")
         nearest = np.zeros(len(merged), np.int32)
         nearest[became[order]] = order

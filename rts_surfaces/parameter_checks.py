@@ -8,16 +8,16 @@ from rts import InputError, namespace
 from rts.plugin_api.arrays import Tree, shape_of
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
-"""Names in the G-buffer of entries of θ that have another name there."""
+"""Entry of θ → its name in the G-buffer, where the two names differ."""
 WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
-"""Numbers for each vertex or control point."""
+"""Entry of θ → allowed numbers of channels C for each vertex or control point."""
 
 RESERVED = ("vertices", "points", "position", "normal")
-"""Names that no further attribute may have."""
+"""Names that a user's attribute must not have."""
 
 
 def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
-    """Refuse names of attributes that mean something else, or are taken."""
+    """Raise `InputError` if the name of an attribute is in `RESERVED` or in `taken`."""
     for name in names:
         if name in RESERVED or name in taken:
             raise InputError(f"indices declares {name!r}, which is no further attribute; expected another name")
@@ -26,13 +26,13 @@ def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
 def check_entry(
     who: str, theta: Mapping[str, Tree], name: str, expected: Callable[[tuple[int, ...]], str | None]
 ) -> None:
-    """Refuse an entry that is missing, of another shape, or of no floating numbers.
+    """Raise `InputError` for an entry of θ that is missing, has a wrong shape, or is not floating.
 
     Args:
-        who: the surface, as an error calls it.
+        who: the surface's name in error messages.
         theta: θ; values may be traced.
-        name: of the entry.
-        expected: (shape) → the shape that it is to have, in words; None if it has it.
+        name: the entry's name.
+        expected: function of the entry's shape: None if the shape is right, else the right shape in words.
     """
     if name not in theta:
         raise InputError(f"theta of {who} has no {name!r}; it has {sorted(theta)}")
@@ -45,7 +45,7 @@ def check_entry(
 
 
 def check_rows(who: str, theta: Mapping[str, Tree], name: str, rows: int) -> None:
-    """Refuse an entry that is not (V, C) with at least so many rows, C as in `WIDTHS`; see `check_entry`."""
+    """Raise `InputError` unless an entry of θ is (V, C), V at least `rows`, C as in `WIDTHS`; see `check_entry`."""
     widths = WIDTHS.get(name)
 
     def expected(shape: tuple[int, ...]) -> str | None:

@@ -1,6 +1,6 @@
 """Surfaces of parametric patches: triangles as fine as the view asks for, samples moved onto the true surface.
 
-A sample is the number of its patch and (u, v) in it.
+A sample consists of a patch's number and the coordinates (u, v) in that patch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOLERANCES = (0.8, 0.3, 0.1, 0.05)
 
 RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS = 1e-4, 6, 0.25, 0.02, 8
 """Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, how far a sample may lie
-beyond the edge of its patch, in units of the patch, and how many edges of patches may be crossed."""
+beyond the edge of its patch, where a patch is 1 wide, and how many edges of patches may be crossed."""
 LIMITS = np.array([RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS])
 
 
@@ -40,11 +40,11 @@ class Geometry(abc.ABC):
 
     @abc.abstractmethod
     def meet(self, samples: Samples, rays: Rays) -> Samples:
-        """Samples on their rays, by Newton's method with `LIMITS`.
+        """Move samples onto their rays, by Newton's method with `LIMITS`.
 
         Args:
-            samples: ids (N, 1), params (N, 2), row and depth (K, H, W), where to start.
-            rays: of each row, float64.
+            samples: the starts: ids (N, 1), params (N, 2), row and depth (K, H, W).
+            rays: the ray of each row, float64.
 
         Returns:
             Samples whose `row` is −1, and whose params are zero, where a ray does not meet the surface.
@@ -57,14 +57,14 @@ class Parametric(TriangleSurface):
     Args:
         tiles: all patches.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
-        used: the control points that patches have, as rows of all; None for all of them.
+        used: indices of the control points that patches refer to; None for all of them.
 
     Attributes:
         whole: the patches as tiles.
-        tiles: the same, in smaller tiles where they are few.
-        coarse: how many tolerances triangles may be off away from outlines: Newton's method needs no better start.
-        beside: how far from the border of a tile to look at its shape, a share of its size: where second derivatives
-            have no bound at the border, or are large on very little of a tile.
+        tiles: the patches as tiles, each cut into several where patches are few.
+        coarse: factor on the tolerance away from outlines: Newton's method reaches the surface from such distances.
+        beside: the distance from a tile's border, as a share of the tile, at which its shape is first measured. It is
+            positive where second derivatives at the border are unbounded, or large in a small area only.
     """
 
     sample_widths = (1, 2)
@@ -94,7 +94,7 @@ class Parametric(TriangleSurface):
         return rates
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
-        """The numbers of pieces of `whole`, along edges and inside, with `rate` pieces along each side of a patch."""
+        """Rates of edges (E,) and tiles (n, 2) of `whole`, for `rate` pieces along each side of a patch."""
         return uniform(self.whole, rate)
 
     @abc.abstractmethod
@@ -103,14 +103,14 @@ class Parametric(TriangleSurface):
 
     @abc.abstractmethod
     def geometry(self, points: np.ndarray) -> Geometry:
-        """The patches of control points, which are finite."""
+        """The patches of finite control points."""
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
         """The control points."""
         return self.control_points(theta)
 
     def proxy_key(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """The cell of views, so that images do not depend on earlier renders."""
+        """The key of the camera's cell of views, so that images do not depend on earlier renders."""
         return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
@@ -130,8 +130,8 @@ class Parametric(TriangleSurface):
         """A mesh whose vertices lie on the surface.
 
         Args:
-            theta: θ, with values that are known.
-            rate: a whole number, the cuts along each side of a patch, at most `tiles.MOST`; or a float, the largest
+            theta: θ, with concrete values, not traced ones.
+            rate: a whole number, the pieces along each side of a patch, at most `tiles.MOST`; or a float, the largest
                 distance of triangles from the surface, in the units of θ.
 
         Returns:

@@ -18,7 +18,7 @@ from rts_surfaces.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.tiles import Tiles
 
 ATTRIBUTES = ("colors", "uv")
-"""Entries of θ for control points."""
+"""Entries of θ that are attributes of control points."""
 
 
 class Bicubic(Geometry):
@@ -26,8 +26,8 @@ class Bicubic(Geometry):
 
     Args:
         nets: the control points.
-        across: (n, 4), the side beyond each side; see `across`.
-        flips: (n, 4), see `Tiles`.
+        across: (n, 4) int32, the side beyond each side; see the function `across`.
+        flips: (n, 4) bool, the `Tiles.flips` of the patches.
     """
 
     def __init__(self, nets: np.ndarray, across: np.ndarray, flips: np.ndarray):
@@ -63,13 +63,13 @@ class Patches(Parametric):
     """Base of surfaces of bicubic patches.
 
     Args:
-        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v: rows of the
-            result of `bezier_rows`.
+        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v: indices of the
+            rows that `bezier_rows` returns.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
         used: see `Parametric`.
 
     Attributes:
-        shaped_by: the entries of θ from which control points are made.
+        shaped_by: the entries of θ from which control points are computed.
     """
 
     shaped_by: tuple[str, ...] = ("points",)
@@ -81,28 +81,28 @@ class Patches(Parametric):
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:
-        """Rows of an entry of θ for the control points of the Bézier patches: (M, C), linear in the values.
+        """Bézier control points (M, C) of all patches, linear in the values: an entry of θ, or `control_points`.
 
-        It is asked of NumPy arrays in float64, too.
+        The values may also be NumPy arrays in float64.
         """
 
     @abc.abstractmethod
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """The shape expected of an entry of θ without its last axis, in words; None if it is right."""
+        """None if `shape`, of an entry of θ without its last axis, is right; else the right shape in words."""
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
-        """The control points, as `bezier_rows` takes them."""
+        """The control points of the surface, in the form that `bezier_rows` takes."""
         return theta["points"]
 
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
-        """The shape expected of an entry of θ, in words; None if it is right."""
+        """None if `shape`, of the entry `name` of θ, is right; else the right shape in words."""
         wrong = self.control_shape(shape[:-1]) if shape else "an array"
         if wrong is None and shape[-1] not in WIDTHS[name]:
             return f"a last axis of {' or '.join(map(str, WIDTHS[name]))}"
         return wrong
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ whose entries have wrong shapes or dtypes."""
+        """Raise `InputError` if an entry of θ has a wrong shape or dtype."""
         for name in self.reads(theta):
             check_entry(repr(self), theta, name, partial(self.expected, name))
 
@@ -142,8 +142,8 @@ class Patches(Parametric):
 def across(sides: np.ndarray) -> np.ndarray:
     """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
 
-    Where more than two patches share an edge, the one half way round follows. So a side that is a single point leads
-    to the patch on the other side of the point.
+    Where more than two sides share an edge, the side half way round their list is taken. So a side that is a single
+    point leads to a patch opposite, beyond that point.
 
     Args:
         sides: (n, 4), the edges of `Tiles`.
@@ -163,7 +163,7 @@ def _tiles(table: np.ndarray) -> Tiles:
     net, count = table.reshape(-1, 4, 4), len(table)
     # Sides run around the patch: v = 0, u = 1, v = 1 backwards, u = 0 backwards.
     sides = np.stack([net[:, :, 0], net[:, 3, :], net[:, ::-1, 3], net[:, 0, ::-1]], axis=1).reshape(-1, 4)
-    # One direction for both patches beside an edge: that of the lesser control point first.
+    # Both patches beside an edge need one direction: the one that begins with the lesser control point.
     back = sides[:, ::-1]
     place = (sides != back).argmax(axis=1)[:, None]
     flips = np.take_along_axis(sides, place, 1)[:, 0] > np.take_along_axis(back, place, 1)[:, 0]

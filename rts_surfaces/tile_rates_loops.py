@@ -12,7 +12,7 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 
 COLLAPSED = 1e-6
-"""Derivatives that are parallel but for this share have no normal."""
+"""Derivatives define no normal where the sine of the angle between them is below this."""
 
 
 @compiled
@@ -25,7 +25,7 @@ def _dot(a, b):
 
 @compiled
 def _slopes(found, frame, slopes):
-    """Derivatives along s and t (2, 3), from derivatives in parameters of the patch."""
+    """Fill `slopes` (2, 3), derivatives along s and t, from derivatives in parameters of the patch."""
     for k in range(2):
         for c in range(3):
             slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
@@ -33,13 +33,13 @@ def _slopes(found, frame, slopes):
 
 @compiled
 def _second(found, a, b, c):
-    """The component c of the second derivative along two directions in parameters of the patch."""
+    """The component c of the second derivative along directions a and b, in parameters of the patch."""
     return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
 
 
 @compiled
 def _normal(slopes, out):
-    """Fill the unit normal and return True; fill zeros and return False if there is none."""
+    """Fill `out` (3,) with the unit normal and return True; zeros and False where slopes (2, 3) define none."""
     for c in range(3):
         x, y = (c + 1) % 3, (c + 2) % 3
         out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
@@ -60,9 +60,9 @@ def shapes(start, stop, found, frames, normals, places, bends):
         found: (n, G G, 6, 3) float64, points and derivatives in parameters of patches, on a grid of G points a side.
         frames: (n, 3, 2) float64.
         normals: (n, G, G, 3), of unit length, or zero.
-        places: (n, G, G, 3), where these are.
+        places: (n, G, G, 3), the points of the grid.
         bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; without a normal, their
-            lengths. Chords are off by those alone: what lies along the surface only moves points within it.
+            lengths. Components along the surface are ignored: they do not move chords off the surface.
     """
     grid, slopes = normals.shape[1], np.empty((2, 3))
     for n in range(start, stop):
@@ -85,7 +85,7 @@ def shapes(start, stop, found, frames, normals, places, bends):
 
 @loop
 def curves(start, stop, found, frames, along, out):
-    """Fill out (E,), the largest second derivatives of edges across themselves.
+    """Fill out (E,), the largest second derivative of each edge at right angles to the edge.
 
     Args:
         start: first edge.
@@ -128,14 +128,14 @@ def outlines(
         eye: (3,), or the direction towards the viewer if `parallel`.
         toward: (3,) unit, from the middle of the surface to the eye.
         parallel: True if rays are parallel.
-        aside: how far the eye may be off sideways; where parallel, how far the direction.
-        depth: how far it may be off along `toward`.
-        spread: (2,), width of a pixel at depth z.
-        cone: (5,): the axis of the view, sine and cosine of its half angle with what the view may be off.
-        wanted: (2,) pixels: where a tile may have an outline, and elsewhere.
-        chord: (n,), of each tile.
-        edge: (n,), of its edges, should they be outlines.
-        facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
+        aside: largest deviation of the eye sideways; where parallel, of the direction.
+        depth: largest deviation of the eye along `toward`.
+        spread: (2,), a pixel at distance d is `spread[0] + spread[1] d` wide.
+        cone: (5,): the axis of the view, sine and cosine of its half angle, for the whole cell of views.
+        wanted: (2,) allowed pixels: where a tile may have an outline, and elsewhere.
+        chord: (n,), to be filled with the allowed distance of each tile.
+        edge: (n,), to be filled with that of the tile's edges, should they be outlines.
+        facing: (n,) int8: 1 where the whole tile faces the viewer, −1 where no point of it does, else 0.
     """
     grid, move = places.shape[1], aside + depth
     faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
@@ -189,14 +189,14 @@ def outlines(
 
 @loop
 def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
-    """Fill the numbers of cuts of tiles and their sides: inner (n, 2) along s and t, edges (E,).
+    """Fill the rates, numbers of pieces, of tiles and edges: inner (n, 2) along s and t, edges (E,).
 
     Args:
-        bends: (n, 3).
-        curves: (E,).
-        chord: (n,), how far triangles of a tile may be off; infinity where out of view.
-        edge: (n,), how far those at its edges may be, should they be outlines.
-        facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
+        bends: (n, 3), as `shapes` fills them.
+        curves: (E,), the output of `curves`.
+        chord: (n,), allowed distance of a tile's triangles from the surface; infinity where out of view.
+        edge: (n,), allowed distance at the tile's edges, should they be outlines.
+        facing: (n,) int8: 1 where the whole tile faces the viewer, −1 where no point of it does, else 0.
         sides: (n, k) int32, the edge of each side.
         least: the least rate of a tile that is cut.
         most: the largest rate.

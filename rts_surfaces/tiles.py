@@ -18,22 +18,22 @@ from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.view_cells import View
 
 MOST = 256
-"""The largest number of cuts along a side of a tile."""
+"""The largest number of pieces along a side of a tile."""
 MOST_TRIANGLES = 2**27
 """The largest number of triangles: 8 GiB."""
 LEAST = {4: 2, 3: 3}
-"""Least number of cuts of a tile of so many sides, if it is cut at all, so that points lie within it."""
+"""Number of sides of a tile → least number of pieces along s and t if it is cut, so that points lie within."""
 AT_ONCE = 2048
 """Tiles whose shapes are computed together."""
 GRID = {4: 3, 3: 5}
-"""Points along each side of a tile of so many sides at which its shape is measured."""
+"""Number of sides of a tile → points along each side of the grid on which its shape is measured."""
 ENOUGH, FINEST = 500, 4
-"""Patches that are fewer than this are split into smaller tiles, at most so many along a side. So only tiles at
-outlines need to be fine."""
+"""Fewer than `ENOUGH` patches are split into smaller tiles, at most `FINEST` along a side. So only tiles at outlines
+need to be fine."""
 
 Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-"""(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), these and
-derivatives in u, v, uu, uv, vv."""
+"""(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), points
+and derivatives in u, v, uu, uv, vv."""
 
 _CORNERS = {4: np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64), 3: np.array([(0, 0), (1, 0), (0, 1)], float)}
 
@@ -42,13 +42,13 @@ class Tiles(NamedTuple):
     """The tiles of a surface; k is 4, or 3. Host arrays, read-only.
 
     Attributes:
-        patch: (n,) int32, the patch that each tile is of.
-        frames: (n, 3, 2) float64: its parameters are `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
+        patch: (n,) int32, the patch that contains each tile.
+        frames: (n, 3, 2) float64: local (s, t) are the patch's `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
         corners: (n, k) int32, the numbers of the tile's corners, counter-clockwise from (0, 0).
         sides: (n, k) int32, the edge from each corner to the next.
-        flips: (n, k) bool, whether a side, which runs around the tile, runs against its edge.
-        corner_tiles: (C, 2) int32, for each corner a tile, and which of its corners it is.
-        edge_tiles: (E, 2) int32, for each edge a tile, and which of its sides it is.
+        flips: (n, k) bool, True for a side whose direction around the tile is opposite to its edge's.
+        corner_tiles: (C, 2) int32, for each corner number a tile with this corner, and its index there.
+        edge_tiles: (E, 2) int32, for each edge a tile beside it, and the index of its side there.
     """
 
     patch: np.ndarray
@@ -63,7 +63,7 @@ class Tiles(NamedTuple):
     def of(
         cls, patch: np.ndarray, frames: np.ndarray, corners: np.ndarray, sides: np.ndarray, flips: np.ndarray
     ) -> Tiles:
-        """Tiles whose corners and edges have any integers for names."""
+        """Tiles from corners (n, k) and sides (n, k) named by any integers, which are renumbered from 0."""
         corners, corner_tiles = _numbered(corners)
         sides, edge_tiles = _numbered(sides)
         patch, frames, flips = patch.astype(np.int32), frames.astype(np.float64), np.array(flips, bool)
@@ -80,9 +80,9 @@ class Shapes(NamedTuple):
 
     Attributes:
         normals: (n, G, G, 3) of unit length, or zero, at a grid of points.
-        places: (n, G, G, 3), where these are.
+        places: (n, G, G, 3), the points of the grid.
         bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t.
-        curves: (E,), the largest second derivatives of edges across themselves.
+        curves: (E,), the largest second derivative of each edge at right angles to the edge.
     """
 
     normals: np.ndarray
@@ -92,14 +92,14 @@ class Shapes(NamedTuple):
 
 
 def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Names (n, k) as numbers from 0 on, and for each number a place (row, column) where it is."""
+    """Names (n, k) replaced by numbers from 0 on; and for each number the first (row, column) that holds it."""
     _, place, numbers = np.unique(names, return_index=True, return_inverse=True)
     where = np.stack(np.divmod(place, names.shape[1]), axis=1).astype(np.int32)
     return numbers.reshape(names.shape).astype(np.int32), where
 
 
 def split(tiles: Tiles) -> Tiles:
-    """Tiles of quadrilaterals cut into smaller ones, all alike, if they are few; triangles stay."""
+    """Cut fewer than `ENOUGH` quadrilaterals into smaller tiles, all alike; triangular tiles are returned unchanged."""
     count, width = tiles.corners.shape
     cuts = int(np.clip(np.sqrt(ENOUGH / count), 1, FINEST))
     if width == 3 or cuts == 1:
@@ -112,7 +112,7 @@ def split(tiles: Tiles) -> Tiles:
 
 
 def _pieces(tiles: Tiles, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners, sides and flips (n cuts², 4) of so many tiles along each side of quadrilaterals, by any names."""
+    """Corners, sides and flips (n cuts², 4) of quadrilaterals cut into cuts² tiles, named by any integers."""
     count, points, edges, steps = len(tiles.corners), len(tiles.corner_tiles), len(tiles.edge_tiles), np.arange(cuts)
     # Points: the corners, those within edges, those within tiles.
     corner = points + edges * (cuts - 1) + np.arange(count * (cuts + 1) ** 2).reshape(count, cuts + 1, cuts + 1)
@@ -145,11 +145,11 @@ def _pieces(tiles: Tiles, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
     """The shapes of tiles and of their edges.
 
-    In triangles the grid is drawn together into the corner (1, 0): its points are (s, t (1 − s)).
+    In triangles one side of the grid shrinks to the corner (1, 0): its points are (s, t (1 − s)).
 
     Args:
         tiles: the tiles.
-        points: the surface.
+        points: function that evaluates the surface.
         beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
     from rts_surfaces import tile_rates_loops
@@ -194,7 +194,7 @@ class Allowed(NamedTuple):
     Attributes:
         chord: (n,), of each tile.
         edge: (n,), at the edges of each tile, should these be outlines.
-        facing: (n,) int8: 1 where all of a tile faces the viewer, −1 where none does, else 0.
+        facing: (n,) int8: 1 where the whole tile faces the viewer, −1 where no point of it does, else 0.
     """
 
     chord: np.ndarray
@@ -203,7 +203,7 @@ class Allowed(NamedTuple):
 
     @classmethod
     def everywhere(cls, count: int, chord: float) -> Allowed:
-        """One distance for `count` tiles."""
+        """The distance `chord` for all of `count` tiles, and their edges, none known to face the viewer."""
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 
@@ -211,10 +211,10 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
     """The allowed distances of triangles from the surface in a view.
 
     Args:
-        view: the camera's view.
+        view: the cell of views.
         tile_shapes: the shapes of the tiles.
-        fine: pixels, where a tile or an edge may have an outline.
-        coarse: pixels elsewhere.
+        fine: allowed pixels where a tile or an edge may be an outline.
+        coarse: allowed pixels elsewhere.
     """
     from rts_surfaces import tile_rates_loops
 
@@ -228,7 +228,7 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
 
 
 def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, so that triangles are off by no more than is allowed."""
+    """Rates of edges (E,) and of tiles (n, 2), int32, for which triangles keep to the allowed distances."""
     from rts_surfaces import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
@@ -239,7 +239,7 @@ def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.nd
 
 
 def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, where all is cut alike."""
+    """Rates of edges (E,) and of tiles (n, 2), int32: `rate` everywhere, or `LEAST` within tiles that are cut."""
     edges = np.full(len(tiles.edge_tiles), rate, np.int32)
     least = 1 if rate == 1 else max(rate, LEAST[tiles.corners.shape[1]])
     return edges, np.full((len(tiles.patch), 2), least, np.int32)
@@ -253,16 +253,16 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
 
     Args:
         tiles: the tiles.
-        points: the surface.
+        points: function that evaluates the surface.
         edges: (E,) int32, into how many pieces each edge is cut.
-        inner: (n, 2) int32, into how many each tile is cut along s and t; of triangles the first counts. Where an edge
-            of a tile is cut they are at least those of `LEAST`; also where one of the two is more than 1.
+        inner: (n, 2) int32, into how many pieces each tile is cut along s and t; triangular tiles use the first alone.
+            Where a tile or an edge of it is cut at all, each number used is at least `LEAST` for its number of sides.
 
     Returns:
-        Vertices; ids (T, 1) are patches, parameters (T, 3, 2) those in the patch.
+        Vertices and faces; ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2), (u, v) in that patch.
 
     Raises:
-        InputError: so many triangles that memory would not do.
+        InputError: more than `MOST_TRIANGLES` triangles.
     """
     from rts_surfaces import tiles_loops
 
@@ -286,7 +286,7 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
 def _places(
     tiles: Tiles, edges: np.ndarray, edge_first: np.ndarray, inner: np.ndarray, inner_first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Patches (V,) and parameters (V, 2) of vertices: of corners, within edges, within tiles."""
+    """Patches (V,) and parameters (V, 2) of vertices: first tiles' corners, then within edges, then within tiles."""
     from rts_surfaces import tiles_loops
 
     shape = _CORNERS[tiles.corners.shape[1]]

@@ -16,9 +16,9 @@ def within_edges(owner, starts, ends, edges, edge_first, patch, params):
 
     Args:
         owner: (E,) int32, the patch that each edge is evaluated on.
-        starts: (E, 2) float64, its parameters where the edge starts.
-        ends: (E, 2) float64.
-        edges: (E,) int32, how often each edge is cut.
+        starts: (E, 2) float64, the patch's parameters where the edge starts.
+        ends: (E, 2) float64, where the edge ends.
+        edges: (E,) int32, into how many pieces each edge is cut.
         edge_first: (E + 1,) int32, the first of the points within each edge.
         patch: (V,) int32.
         params: (V, 2) float64.
@@ -39,7 +39,7 @@ def _put(frame, s, t, out):
 
 @loop
 def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within tiles: first along t, then along s."""
+    """Fill patch (V,) and params (V, 2) of the points within quadrilaterals; t varies fastest."""
     for n in range(len(inner)):
         v, rs, rt = inner_first[n], inner[n, 0], inner[n, 1]
         for i in range(1, rs):
@@ -51,7 +51,7 @@ def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
 
 @loop
 def within_triangles(owner, frames, inner, inner_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within triangular tiles: first along s, then along t."""
+    """Fill patch (V,) and params (V, 2) of the points within triangular tiles; s varies fastest."""
     for n in range(len(inner)):
         v, r = inner_first[n], inner[n, 0]
         for j in range(1, r):
@@ -84,7 +84,7 @@ def counted(inner, sides, edges):
 
 @loop
 def counts(inner, sides, edges, first):
-    """Fill first (n + 1,): the number of the first triangle of each tile."""
+    """Fill first (n + 1,): the index of each tile's first triangle, then the number of all triangles."""
     first[0] = 0
     for n in range(len(inner)):
         first[n + 1] = first[n] + _count(inner[n], sides[n], edges)
@@ -102,7 +102,7 @@ def _set(faces, params, t, place, vertex, frame, x, y):
 
 @compiled
 def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
-    """The point number k of a side."""
+    """Fill a triangle's corner `place` with point k, from 0 to `cuts`, of a side."""
     width = corners.shape[1]
     if k == 0 or k == cuts:
         vertex = corners[n, side if k == 0 else (side + 1) % width]
@@ -123,7 +123,7 @@ def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
 
 @compiled
 def _square(faces, params, t, i, j, rs, rt, frame, base):
-    """Both triangles of a cell of a tile; the number of the next."""
+    """Fill both triangles of a cell of a tile's grid. Return the index of the next triangle."""
     for half in range(2):
         for k in range(3):
             # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
@@ -135,7 +135,7 @@ def _square(faces, params, t, i, j, rs, rt, frame, base):
 
 @compiled
 def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
-    """The point number m, from 1 on, of the ring within a tile, along a side."""
+    """Fill a triangle's corner `place` with point m, from 1 on, along a side of the ring next to the tile's border."""
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
     j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
     _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
@@ -201,7 +201,7 @@ def _triangle_point(faces, params, t, place, i, j, r, frame, base):
 
 @compiled
 def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
-    """The point number m, from 1 on, of the ring within a triangular tile, along a side."""
+    """Fill corner `place` with point m, from 1 on, along a side of the ring next to a triangular tile's border."""
     i = m if side == 0 else r - 1 - m if side == 1 else 1
     j = 1 if side == 0 else m if side == 1 else r - 1 - m
     _triangle_point(faces, params, t, place, i, j, r, frame, base)

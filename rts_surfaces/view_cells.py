@@ -1,4 +1,4 @@
-"""Cells of views: triangles are made for a whole cell, so that images do not depend on earlier ones."""
+"""Cells of views: all views of a cell share triangles, so that images do not depend on earlier renders."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ STEP, CELLS = 1.1, 16
 """Views whose distances and widths of pixels differ by less than this factor, and whose directions are in one cell of a
 cube's sides (`CELLS` from the middle of a side to its edge), have the same triangles."""
 EVEN = 0.5
-"""Views that scale axes more differently than by this factor have finer triangles."""
+"""Views whose smallest scale is below this share of their largest have finer triangles."""
 
 
 class View(NamedTuple):
-    """The cell of views that triangles are made for: its middle, and the largest deviations of a view from it.
+    """A cell of views, for which triangles are made: its middle, and the largest deviations from the middle.
 
     Attributes:
-        eye: (3,), or where rays are parallel the direction towards the viewer.
+        eye: (3,) its position; where rays are parallel, the direction towards the viewer.
         parallel: True if rays are parallel.
         aside: largest deviation of the eye sideways, local units; if parallel, of the direction.
         along: largest deviation of the eye towards the surface and away from it.
         toward: (3,) unit, from the surface to the eye.
-        spread: (2,): at distance d from the eye a pixel is `spread[0] + spread[1] d` wide, at its least.
+        spread: (2,): at distance d from the eye a pixel is at least `spread[0] + spread[1] d` wide.
         axis: (3,) the direction in which the camera looks.
-        angle: half the angle of a cone around the axis that holds the view, radians.
+        angle: half the angle of a cone around the axis that contains the image, radians.
     """
 
     eye: np.ndarray
@@ -41,12 +41,12 @@ class View(NamedTuple):
 
 
 def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple:
-    """The cell of views that a camera belongs to, as whole numbers.
+    """The integer coordinates of the cell that contains a camera's view; equal cells have equal triangles.
 
     Args:
         camera: NumPy, in the surface's local space.
         size: (height, width).
-        center: (3,), of the surface.
+        center: (3,), the middle of the surface.
     """
     inverse = np.linalg.inv(camera.view)
     spread, axis = camera.spread(size), -inverse[:3, 2]
@@ -66,7 +66,7 @@ def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple
 
 
 def view_of(key: tuple, center: np.ndarray) -> View:
-    """The view in the middle of a cell."""
+    """The `View` of a key of `view_key`; `center` (3,) is the middle of the surface."""
     parallel, toward, distance, width, axis, wide = key
     direction, half = _direction(toward), 0.75 / CELLS  # Of a cell's diagonal, the tangent at most.
     narrow = STEP ** (width - 0.5)
@@ -83,7 +83,7 @@ def _power(x: float) -> int:
 
 
 def _cell(vector: np.ndarray) -> tuple[int, int, int]:
-    """The cell of a direction on the sides of a cube."""
+    """Integer point, on the surface of a cube of half width `CELLS`, nearest to a direction (3,)."""
     largest = float(np.abs(vector).max())
     x, y, z = (round(CELLS * c / largest) for c in vector.tolist()) if largest > 0 else (0, 0, CELLS)
     return x, y, z

@@ -151,7 +151,7 @@ class Field(ScalarField):
 
 
 class Implicit(Surface):
-    """Base class of surfaces of a field: the entries of θ that they read, and their G-buffer.
+    """Base class of surfaces of a field: it collects the entries of θ that are read, and makes the G-buffer.
 
     Args:
         field: the field.
@@ -159,7 +159,7 @@ class Implicit(Surface):
             computed if the shader reads them. They may read any entry of θ.
 
     Raises:
-        InputError: an attribute has no function, or a name that means something else.
+        InputError: an attribute is no function, or its name is in `RESERVED`.
     """
 
     def __init__(self, field: ScalarField, attributes: Mapping[str, Function] | None = None):
@@ -176,7 +176,7 @@ class Implicit(Surface):
         return tuple(theta) if self.attributes else self.field.names(theta)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ that lacks an entry which the field reads."""
+        """Raise `InputError` if θ lacks an entry that the field reads."""
         self.field.check(theta)
 
     def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
@@ -189,7 +189,7 @@ class Implicit(Surface):
         """
         params = self.field.suited(theta, samples.params)
         xp = namespace(params)
-        # At the origin, where rows that only pad would lie, many a function has no derivative: they do as the first.
+        # Rows of padding would lie at the origin, where many functions have no derivative: they copy the first row.
         used = xp.any(params != 0, axis=1, keepdims=True)
         params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
         points, along = params[:, :3], params[:, 3:6]
@@ -212,7 +212,7 @@ class Implicit(Surface):
 
 
 def check_isovalue(isovalue: Any) -> float:
-    """The isovalue; refused where it is no number of single precision, or an array whose derivative would be lost."""
+    """The isovalue; refused beyond single precision, or as a framework's array, whose derivative would be lost."""
     value = known_number("isovalue", check_numbers("isovalue", isovalue, ()))
     if exemplar(isovalue) is not None:
         raise InputError(
@@ -225,14 +225,14 @@ def check_isovalue(isovalue: Any) -> float:
 
 
 def known_number(name: str, value: np.ndarray | None) -> float:
-    """A number that `rts.arrays.argument_checks` checked; refused where it is traced."""
+    """A number as returned by `rts.plugin_api.checks.check_numbers`; refused if traced, which is None."""
     if value is None:
         raise InputError(f"{name} is traced; expected a known number: surfaces do not change with theta")
     return float(value)
 
 
 def check_function(name: str, f: Any) -> None:
-    """Refuse anything but a function of θ and points; a class is none, its objects may be."""
+    """Raise `InputError` unless f is a function, or callable object, of θ and points; a class is refused."""
     if not callable(f) or isinstance(f, type):
         raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
     try:
@@ -249,7 +249,7 @@ def check_function(name: str, f: Any) -> None:
 
 
 def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:
-    """Refuse a function's result for points (M, 3) that is not (M,), or (M, C), in their engine and dtype."""
+    """Raise `InputError` unless a result for points (M, 3) is (M,), or (M, C), in the points' engine and dtype."""
     engine, count = engine_of(points), points.shape[0]
     expected = f"({count}, C)" if columns else f"({count},)"
     try:

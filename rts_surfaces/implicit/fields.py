@@ -1,6 +1,6 @@
-"""Ready-made fields f(θ, points (M, 3)) → (M,): signed distances, negative inside, and how fields are joined.
+"""Ready-made fields f(θ, points (M, 3)) → (M,): signed distances, negative inside, and unions of fields.
 
-Each reads entries of θ by fixed names. Of two that share a name, give each its own dict:
+Each field reads entries of θ by fixed names. If two fields share a name, give each its own dict in θ:
 `union(lambda theta, p: sphere(theta["left"], p), lambda theta, p: sphere(theta["right"], p))`.
 All have finite derivatives everywhere, in θ as in points.
 """
@@ -18,7 +18,7 @@ from rts_surfaces.implicit.field import Function, check_function
 from rts_surfaces.parameter_checks import check_entry
 
 BLOCK = 2048
-"""Points whose distances to all spheres are in memory at once."""
+"""Number of points whose distances to all spheres are in memory at once."""
 
 
 def sphere(theta: Mapping[str, Tree], points: Array) -> Array:
@@ -40,8 +40,8 @@ def swept_sphere(theta: Mapping[str, Tree], points: Array) -> Array:
 def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
     """The least distance (M,) of points (M, 3) to n spheres, whose centers lie in the plane y = 0.
 
-    θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. Which this
-    is is sought without derivatives, in blocks of `BLOCK` points, or sphere by sphere: memory is of the order of M.
+    θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. The
+    search for it has no derivative and goes by blocks of `BLOCK` points, or sphere by sphere: memory is O(M).
     """
     xp, centers = namespace(points), _entry(theta, "centers", ("n", 2))
     radii = _entry(theta, "radii", (centers.shape[0],))
@@ -53,10 +53,10 @@ def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
 
 
 def union(*fields: Function) -> Function:
-    """The field of all that is inside any of the fields: their least value.
+    """The minimum of fields: inside is every point that is inside at least one.
 
     Raises:
-        InputError: there is none, or one is no function.
+        InputError: no field is given, or one is no function.
     """
     _check_fields(fields)
 
@@ -69,7 +69,7 @@ def union(*fields: Function) -> Function:
 def smooth_union(sharpness: float, *fields: Function) -> Function:
     """The `union` of n fields with a fillet where they meet: −log(Σ exp(−s fᵢ)) / s for a sharpness s.
 
-    It is at most log(n) / s less than the union, and its slope nowhere exceeds the steepest of theirs.
+    It is at most log(n) / s less than the union, and its slope nowhere exceeds the steepest field's.
 
     Args:
         sharpness: s, in units of one over those of the fields; positive.

@@ -1,7 +1,7 @@
 """Isosurfaces of values on a lattice, and of functions: sampled on the triangles of marching cubes (paper §3.1.3).
 
 A sample lies on a triangle whose corners lie on three edges of the lattice. Only the values at the ends of these edges
-are differentiated: nothing knows of the triangles, so that the topology may change.
+are differentiated. Derivatives do not depend on the triangles, whose topology may change.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
 from rts_surfaces.implicit.narrow_band import Band, NarrowBand
 
 NEAR_SINGULAR = 1e-3
-"""An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
+"""An edge is near-singular if its ends' values differ by less than this share of the median over crossed edges."""
 
 BESIDE = 1e-3
 """Distance before the bounds at which rays begin, if the surface is capped, to meet the caps; a share of the bounds."""
@@ -43,7 +43,7 @@ ON_SIDE = 1e-6
 """Largest distance of a cap's points from the bounds' side, as a share of the bounds."""
 
 KEPT = 4
-"""Fields whose usual differences are remembered."""
+"""Number of fields whose median differences over crossed edges are remembered."""
 
 MOTIONS, ENDS, SINGULAR = ("normal", "edge"), ("capped", "open"), ("bound", "drop", "keep")
 
@@ -55,7 +55,7 @@ class Extracted(NamedTuple):
         vertices: (V, 3) float32, on edges of the lattice.
         faces: (T, 3) int32, counter-clockwise seen from outside.
         near_singular: the number of crossed edges that are near-singular.
-        evaluations: the number of points at which the function was evaluated; 0 where values are given.
+        evaluations: the number of points at which the function was evaluated; 0 if θ holds the values.
     """
 
     vertices: np.ndarray
@@ -69,32 +69,32 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     A sample's ids are the numbers of six lattice points, the ends of three edges; point (x, y, z) has the number
     (x Y + y) Z + z. The first three of its parameters are the barycentrics in the triangle between these edges.
-    Nothing but the field at these six points moves it. Values equal to the isovalue are outside.
+    A sample moves with the field at these six points alone. Values equal to the isovalue are outside.
 
-    Samplers of triangles see the triangles of marching cubes; the sampler "rays" meets the field itself, for given
-    values interpolated along each axis.
+    Samplers of triangles see the triangles of marching cubes; the sampler "rays" intersects the field itself, where
+    θ["values"] are interpolated trilinearly.
 
     Args:
         bounds: two corners ((x0, y0, z0), (x1, y1, z1)) of the lattice, the lower one first.
-        isovalue: the value.
+        isovalue: the field's value on the surface.
         f: (θ, points (M, 3)) → (M,), in array code or for one engine; None for θ["values"].
-        shape: (X, Y, Z), lattice points along each axis. Needed with `f`; else that of the values.
+        shape: (X, Y, Z), lattice points along each axis. Required with `f`; else the shape of θ["values"].
         motion: how samples move with the field. "normal": along its gradient, by its change there. "edge": their
             triangle's corners slide along the edges of the lattice, as in the paper.
         inside: "below" or "above" the isovalue.
         at_bounds: "capped": where the inside reaches the bounds, it is closed there; or "open".
-        near_singular: the rule where an edge's ends are so much alike that its corner would move without bound.
-            "bound": derivatives are bounded. "drop": there is no surface, as in the paper. "keep": nothing.
-        table: for a costly `f`. It is called once for each lattice point, not once for each sample that has it. A
-            number says for how many to allot room where shapes must be known, as in `jax.jit`; else there is room for
-            twice as many as for samples.
-        band: a `NarrowBand`: `f` is evaluated at no more of the lattice than needed. θ must have known values, then.
-        lipschitz: the most that `f` changes over a unit of length, for the sampler "rays"; None if unknown.
+        near_singular: the rule where an edge's ends differ so little that its corner would move without bound.
+            "bound": derivatives are bounded. "drop": no triangle there, as in the paper. "keep": no change.
+        table: True for a costly `f`, which is then called once for each lattice point, not for each sample. A
+            number is the capacity of the table, in points, where shapes must be known, as in `jax.jit`; else the
+            capacity is twice that of the samples.
+        band: a `NarrowBand`: `f` is evaluated at no more of the lattice than needed. θ must not be traced then.
+        lipschitz: the largest change of `f` over a unit of length, for the sampler "rays"; None if unknown.
         reads: the entries of θ that `f` reads; None for all.
         attributes: name → function (θ, positions (N, 3)) → (N, C), further entries of the G-buffer.
 
     Raises:
-        InputError: something of another kind than these.
+        InputError: an argument of another kind, or outside its range.
     """
 
     refine_moves = False
@@ -159,7 +159,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return Part(surface, {"values": values.astype(np.float32)}, "normals")
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Coarser lattices, and of functions a finer one."""
+        """The surface on coarser lattices, and for a function also on a finer one."""
         count, rates = self.field.lattice(theta).count, []
         for shape, field, change in self.field.resampled(theta):
             other = copy.copy(self)
@@ -170,14 +170,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ----------------------------------------------------------------------------------- triangles and samples
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """Values at lattice points: θ's, or levels of the function, everywhere or in its band."""
+        """Values at lattice points: those of θ, or levels of the function on the whole lattice or in its band."""
         return self.field.look(theta, self.closed).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
         """The triangles of marching cubes, dropped ones included, and their cost.
 
         Args:
-            theta: θ, with values that are known.
+            theta: θ, with concrete values, not traced ones.
 
         Raises:
             InputError: the field is NaN or infinite somewhere.
