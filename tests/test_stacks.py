@@ -76,7 +76,9 @@ def test_splatters_for_opaque_layers_warn_of_translucent_ones(name, target):
 @pytest.mark.parametrize("name", ["none", "visible"])
 def test_light_behind_the_last_layer_is_told(name):
     parts = [card(0.5, (1, 0, 0), 0.25), card(0, (0, 1, 0), 0.5), card(-0.5, (0, 0, 1), 1)]
-    with pytest.warns(rts.errors.LayersWarning, match="the last of 2 layers.*'auto'"):
+    with pytest.warns(
+        rts.errors.LayersWarning, match="up to 40 % of the light passes through the last of 2 layers.*'auto'"
+    ):
         rts.render(parts, CAMERA, (8, 8), splatter=name)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from rts.arrays.array_functions import described, shape_of
 from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array
@@ -48,8 +50,8 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
 
 def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
     """Warn if samples are translucent under a splatter that takes them to be opaque, or if the last layer's are."""
-    alpha, last = value_of(splats.rgba[:, -1]), value_of(splats.row[-1])
-    if alpha is None or last is None or not len(alpha):
+    alpha, row = value_of(splats.rgba[:, -1]), value_of(splats.row)
+    if alpha is None or row is None or not len(alpha):
         return
     if not promised(splatter, "translucent"):
         if alpha.min() < 1 - LOST:
@@ -58,10 +60,13 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
                 f"use splatter='visible'",
                 LayersWarning,
             )
-    elif (last >= 0).any() and alpha[last[last >= 0]].min() < 1 - LOST:
+        return
+    light = (1 - alpha[row[:, row[-1] >= 0]]).prod(axis=0).max(initial=0)
+    if light > LOST:
+        # In tens, so that a loop does not repeat the warning in other words.
         warn(
-            f"light passes through the last of {len(splats.row)} layers, and surfaces farther back, if any, are left "
-            f"out; give a larger number of layers, or layers='auto'",
+            f"up to {10 * math.ceil(10 * light)} % of the light passes through the last of {len(row)} layers, and "
+            f"surfaces farther back, if any, are left out; give a larger number of layers, or layers='auto'",
             LayersWarning,
         )
 
