@@ -68,7 +68,18 @@ class Rays(Sampler):
             ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
         followed = () if request.cells is None else ("cells",)
-        return Samples(ids, params, Cells(row, depth), overflow, followed=followed)
+        facing = None
+        if request.facing and hits.entering is not None:
+            facing = _facing(xp.reshape(hits.entering, (layers, *size)), row)
+        return Samples(ids, params, Cells(row, depth, facing), overflow, followed=followed)
+
+
+def _facing(entering: Array, row: Array) -> Array:
+    """`Cells.facing` of a solid of one piece, from `RayHits.entering` and `Cells.row`, (K, H, W) each."""
+    xp = namespace(row)
+    more = xp.concat([xp.zeros_like(row[:-1]), xp.full_like(row[-1:], Cells.MORE_BEHIND)])
+    sides = xp.where(entering, 1 + more, -1 - more)
+    return xp.astype(xp.where(row >= 0, sides, xp.zeros_like(sides)), xp.int16)
 
 
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
@@ -78,12 +89,16 @@ def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, 
     grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths
     shapes = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
     expected = grid, grid, (*grid, p), *([] if hits.ids is None and i == 0 else [(*grid, i)])
+    if hits.entering is not None:
+        shapes, expected = (*shapes, shape_of(hits.entering)), (*expected, grid)
     if shapes != expected:
         raise InputError(
-            f"intersect of {surface!r} gave shapes {shapes}; expected {expected}: hit, distance, params, ids"
+            f"intersect of {surface!r} gave shapes {shapes}; expected {expected}: hit, distance, params, ids, entering"
         )
-    if not namespace(hits.hit).isdtype(hits.hit.dtype, "bool"):
-        raise InputError(f"intersect of {surface!r} gave hit of dtype {hits.hit.dtype}; expected bool")
+    for name in ("hit", "entering"):
+        marks = getattr(hits, name)
+        if marks is not None and not namespace(marks).isdtype(marks.dtype, "bool"):
+            raise InputError(f"intersect of {surface!r} gave {name} of dtype {marks.dtype}; expected bool")
     return hits
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, splats_of, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, splats_of, to_numpy
 
 import rts
 from rts import splatting
@@ -87,6 +87,27 @@ def leaf():
     """A closed flat ellipsoid that stands askew: near its rim backs are nearer to a neighbour's front than fronts."""
     vertices, faces = icosphere(3)
     return (vertices * (0.8, 0.5, 0.08) @ rotation((1, 2, 0), 60)).astype(np.float32), faces
+
+
+def flat(theta, points):
+    """The level of a flat ellipsoid that stands askew."""
+    xp = rts.namespace(points)
+    x, y, z = (points @ rts.engine_of(points).constant(rotation((1, 2, 0), 60).T.astype(np.float32), points)).T
+    return xp.sqrt((x / 0.8) ** 2 + (y / 0.5) ** 2 + (z / theta["depth"]) ** 2 + 1e-12) - 1
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_rays_tell_where_they_enter_and_leave_a_solid(target):
+    part = rts.Part(rts.Sdf(flat, 1.0, lipschitz=None), arrays(target, {"depth": np.float32(0.08)}), "normals")
+    cells = to_numpy(rts.sample(part, CAMERA, SIZE, layers=3).cells)
+    covered = cells.row >= 0
+    assert covered[1].sum() > 20 and not covered[2].any()
+    np.testing.assert_array_equal(cells.facing, np.where(covered, np.array([1, -1, 0])[:, None, None], 0))
+    two = to_numpy(rts.sample(part, CAMERA, SIZE, layers=2).cells)
+    assert set(two.facing[1][two.row[1] >= 0]) == {-1 - Cells.MORE_BEHIND}
+    images = [to_numpy(rts.render(part, CAMERA, SIZE, layers=layers)) for layers in (1, 3)]
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
+    assert np.abs(images[0] - to_numpy(rts.render(part, CAMERA, SIZE, layers=3, splatter=BY_DEPTH))).max() > 1e-3
 
 
 @pytest.mark.parametrize("mesh", [icosphere(3, 0.9), leaf(), box(0.7)], ids=["sphere", "leaf", "box"])

@@ -73,12 +73,15 @@ class RayHits(NamedTuple):
         distance: (K, R) float: the hit is at `origin + distance * direction`; any finite number where there is none.
         params: (K, R, P) float, the `Samples.params` of each hit, for `evaluate`; finite where there is no hit, too.
         ids: (K, R, I) int32, or None for I = 0.
+        entering: (K, R) bool, true where the ray enters the inside of a solid at the hit; None for surfaces without an
+            inside. Splatters then tell fronts from backs (`Cells.facing`).
     """
 
     hit: Array
     distance: Array
     params: Array
     ids: Array | None = None
+    entering: Array | None = None
 
 
 ON_RAYS = "points on rays"

@@ -222,7 +222,7 @@ def _cast_some(
 
     distance, hit = t + xp.take(enter, cell % count, axis=0), xp.ones_like(cell, dtype=xp.bool)
     hit[0] = False
-    return RayHits(spread(hit), spread(distance), spread(describe(met.at(t), hit)))
+    return RayHits(spread(hit), spread(distance), spread(describe(met.at(t), hit)), entering=spread(bracket.below >= 0))
 
 
 def _cast_all(
@@ -258,7 +258,8 @@ def _cast_all(
     params = describe(met.at(t), xp.reshape(hit, (-1,)))
     params = xp.reshape(params, (*hit.shape, params.shape[-1]))
     distance = xp.reshape(t, hit.shape) + enter
-    return RayHits(hit, xp.where(hit, distance, 0.0), xp.where(hit[..., None], params, 0.0))
+    entering = state["below"] >= 0
+    return RayHits(hit, xp.where(hit, distance, 0.0), xp.where(hit[..., None], params, 0.0), entering=entering)
 
 
 def _roots(level: Callable, free: Callable, rays: _Rays, bracket: _Bracket) -> Array:
