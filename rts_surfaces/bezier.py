@@ -20,8 +20,8 @@ class Bezier(Patches):
     """Bicubic Bézier patches on control points that they may share.
 
     θ["points"] (m, 3) are the control points. "colors" (m, 1, 3 or 4) and "uv" (m, 2) are attributes of control points,
-    interpolated as they are. The normal is the cross product of the derivatives along u and v: it points outside
-    where u, v and the outward normal are right-handed.
+    interpolated as they are. The normal is the cross product of the derivatives along u and v, in this order: it points
+    outside where u, v and the outward normal are right-handed.
 
     Args:
         indices: (n, 16) integers into θ["points"]: the 4 × 4 points of each patch, first along u, then along v.
@@ -59,8 +59,8 @@ class Bezier(Patches):
 
         The text begins with the number of patches. For each follow 16 indices of points, from 1 on, separated by
         commas. Then come the number of points, and three coordinates for each. An .npz has "indices" (n, 16), from 0
-        on, and "points" (m, 3). Points that coincide exactly become one. In such files u × v points inwards: u and v
-        are exchanged.
+        on, and "points" (m, 3). Points that coincide exactly become one. In files of both kinds u × v points inwards,
+        so u and v are exchanged.
 
         Raises:
             InputError: the file is damaged, or its indices refer to points that it lacks.
@@ -81,11 +81,11 @@ class Bezier(Patches):
         return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
 
     def bezier_rows(self, values: Array) -> Array:
-        """The values unchanged: control points are in Bézier form already."""
+        """The values unchanged, since control points are those of Bézier patches already."""
         return values
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """None for a leading shape (m,), one row a control point; else the right shape in words."""
+        """See `Patches`: one axis, with at least as many rows as the indices need."""
         return None if len(shape) == 1 and shape[0] >= self._least else f"(m, C) with m of at least {self._least}"
 
 
@@ -94,7 +94,7 @@ def _range(indices: np.ndarray) -> str:
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, 16), from 0 on, and points (m, 3) of an .npz."""
+    """Indices, from 0 on, and points of an .npz."""
     try:
         with np.load(path, allow_pickle=False) as file:
             indices, points = np.asarray(file["indices"]), np.asarray(file["points"], np.float64)
@@ -107,7 +107,7 @@ def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, 16), from 0 on, and points (m, 3) of a text in the format of Newell's teapot."""
+    """Indices, from 0 on, and points of a text of patches."""
     lines = [(i, t) for i, t in enumerate(path.read_bytes().decode(errors="replace").splitlines(), 1) if t.strip()]
     at = 0
 

@@ -13,32 +13,33 @@ from rts.plugin_api.arrays import Array, unit
 from rts.plugin_api.operations import Operation, combine
 
 COLLAPSED = 1e-4
-"""A tangent shorter than this share of the other tangent is taken for zero; the mixed derivative replaces it."""
+"""A tangent shorter than this share of the other one counts as zero, and the mixed derivative replaces it in the
+normal."""
 
 
 def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
-    """Values (N, C) of patches at samples, such as points.
+    """Values (N, C) of patches at samples.
 
     Args:
         rows: (V, C) float, control points or their attributes; differentiable.
         table: (n, 16) integers, the rows of each patch, first along u, then along v.
-        patch: (N,) integers, rows of `table`.
+        patch: (N,) integers.
         params: (N, 2), u and v; of the dtype of the rows, constant.
     """
     return VALUES(rows, params, patch, table)
 
 
 def normals(rows: Array, table: Array, patch: Array, params: Array) -> Array:
-    """Unit normals (N, 3): the cross product of the derivatives along u and v; arguments as for `values`, C = 3.
+    """Unit normals (N, 3): cross products of the derivatives along u and v; arguments as for `values`, C = 3.
 
-    Where one side of a patch is a single point, the derivative along that side is zero, or mere rounding. The mixed
-    derivative has its direction and replaces it. Where the surface has no normal, zeros are returned.
+    Where one side of a patch is a single point, one of the two derivatives is zero, and beside it mostly rounding. The
+    mixed derivative has the direction in which that one grows, and replaces it. A normal that does not exist is zero.
     """
     return NORMALS(rows, params, patch, table)
 
 
 def _bernstein(t: Array) -> tuple[Array, Array]:
-    """The four cubic Bernstein polynomials (N, 4) at t (N,), and their derivatives (N, 4)."""
+    """The four cubic Bernstein polynomials (N, 4) at (N,), and their derivatives."""
     xp, s = namespace(t), 1 - t
     value = xp.stack([s * s * s, 3 * s * s * t, 3 * s * t * t, t * t * t], axis=-1)
     slope = xp.stack([-3 * s * s, 3 * s * (s - 2 * t), 3 * t * (2 * s - t), 3 * t * t], axis=-1)
@@ -46,7 +47,7 @@ def _bernstein(t: Array) -> tuple[Array, Array]:
 
 
 def _sum(rows: Array, ids: Array, a: Array, b: Array) -> Array:
-    """Sums of rows, named by ids (N, 16), times weights a along u (N, 4) and b along v (N, 4)."""
+    """Sums of the rows (N, 16), weighted by the products of weights along u (N, 4) and along v (N, 4)."""
     return combine(rows, ids, namespace(a).reshape(a[:, :, None] * b[:, None, :], (-1, 16)))
 
 
@@ -109,4 +110,4 @@ VALUES = Operation.of_loops(
 NORMALS = Operation.of_loops(
     "rts_surfaces.bicubic_normals", _specified_normals, (2, 2, 1, 2), _normal_shape, _normal_loops, _check, **_PACKED
 )
-"""The operands of `VALUES` and `NORMALS`: rows, params, patch and table."""
+"""The operations of `values` and `normals`, both of rows, params, patch and table."""

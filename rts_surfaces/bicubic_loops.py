@@ -18,14 +18,14 @@ compiled = partial(loops.compiled, fastmath={"contract"})
 loop = partial(loops.loop, fastmath={"contract"})
 
 SHARES = 4
-"""Number of parts of the samples whose gradients are summed separately: fixed, so that sums do not depend on the
-number of threads."""
+"""Number of parts into which samples are divided; the gradients of each part are added up separately. The number is
+fixed, so that sums do not depend on how many threads there are."""
 BEZIER = np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 """Coefficients of 1, t, t², t³ (rows) from Bézier control points (columns)."""
 
 
 def powers(nets: np.ndarray) -> np.ndarray:
-    """Powers of patches of Bézier control points (n, 4, 4, 3), first along u, then along v."""
+    """The powers (n, 3, 4, 4) of patches of Bézier control points (n, 4, 4, 3), first along u, then along v."""
     return np.ascontiguousarray(BEZIER @ nets.transpose(0, 3, 1, 2) @ BEZIER.T)
 
 
@@ -41,7 +41,7 @@ def _slope(a, t):
 
 @compiled
 def first(p, u, v):
-    """A coordinate at (u, v) from its powers p (4, 4), and its derivatives along u and v."""
+    """A coordinate of a patch with powers `p` (4, 4), and its derivatives along u and v."""
     a, b, c, d = _cubic(p[0], v), _cubic(p[1], v), _cubic(p[2], v), _cubic(p[3], v)
     along_v = _slope(p[0], v) + u * (_slope(p[1], v) + u * (_slope(p[2], v) + u * _slope(p[3], v)))
     return a + u * (b + u * (c + u * d)), b + u * (2 * c + 3 * u * d), along_v
@@ -49,7 +49,7 @@ def first(p, u, v):
 
 @compiled
 def _second(p, u, v):
-    """The second derivatives of a coordinate: in u, in u and v, in v."""
+    """The second derivatives of a coordinate of a patch: in u, in u and v, in v."""
     uu = 2 * _cubic(p[2], v) + 6 * u * _cubic(p[3], v)
     uv = _slope(p[1], v) + u * (2 * _slope(p[2], v) + 3 * u * _slope(p[3], v))
     a, b, c, d = 2 * p[0, 2], 2 * p[1, 2], 2 * p[2, 2], 2 * p[3, 2]
@@ -79,19 +79,19 @@ def expansions(start, stop, powers, patch, params, out):
 
 
 def values(rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (N, C) with values of patches at samples, from control points (V, C)."""
+    """Fill `out` (N, C) with patches of control points (V, C) at samples."""
     parallel(_sum_values, len(out), _nets(rows, table), patch, params, out, work=30 * len(out))
 
 
 def push_values(_: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray) -> None:
-    """Fill `moved[1]` (N, C) with the tangent of the values along `moved[0]`, that of the control points."""
+    """Fill the last array (N, C) with the tangent of the values; the array before it is that of the control points."""
     values(moved[0], params, patch, table, moved[1])
 
 
 def pull_values(
     _: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, g: np.ndarray, result: np.ndarray
 ) -> None:
-    """Add to `result` (V, C), the control points' gradient, the pullback of g (N, C), the values' gradient."""
+    """Add to `result` (V, C), the gradient of the control points, from g (N, C), the gradient of the values."""
     found = np.zeros((SHARES, len(table), 16, g.shape[1]), g.dtype)
     parallel(_pull_shares, SHARES, patch, params, g, found, work=30 * len(g))
     _scatter(table, found, result)
@@ -100,7 +100,7 @@ def pull_values(
 def normals(
     collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, 3) with unit normals; tangents shorter than `collapsed` times the other are taken for zero."""
+    """Fill `out` (N, 3) with unit normals; a tangent below the share `collapsed` of the other counts as zero."""
     given = _nets(rows, table), patch, params, rows.dtype.type(collapsed)
     parallel(_fill_normals, len(out), *given, out, work=60 * len(out))
 
@@ -108,7 +108,7 @@ def normals(
 def push_normals(
     collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray
 ) -> None:
-    """Fill `moved[1]` (N, 3) with the tangent of the normals along `moved[0]`, that of the control points."""
+    """Fill the last array (N, 3) with the tangent of the normals; the array before it is that of the control points."""
     tangents, out = moved
     given = _nets(rows, table), _nets(tangents, table), patch, params, rows.dtype.type(collapsed)
     parallel(_move_normals, len(out), *given, out, work=120 * len(out))
@@ -123,7 +123,7 @@ def pull_normals(
     g: np.ndarray,
     result: np.ndarray,
 ) -> None:
-    """Add to `result` (V, 3), the control points' gradient, the pullback of g (N, 3), the normals' gradient."""
+    """Add to `result` (V, 3), the gradient of the control points, from g (N, 3), the gradient of the normals."""
     nets = _nets(rows, table)
     found = np.zeros((SHARES, *nets.shape), nets.dtype)
     given = nets, patch, params, rows.dtype.type(collapsed), g, found
@@ -140,7 +140,7 @@ def _nets(rows: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 @compiled
 def _bernstein(t, value, slope):
-    """The cubic Bernstein polynomials (4,) and their derivatives, also beyond [0, 1]."""
+    """Fill `value` (4,) with the cubic Bernstein polynomials at t, also beyond [0, 1], and `slope` with derivatives."""
     one = value.dtype.type(1)
     three, two = one + one + one, one + one
     s = one - t
@@ -186,7 +186,7 @@ def _sum_values(start, stop, nets, patch, params, out):
 
 @loop
 def _pull_shares(start, stop, patch, params, g, found):
-    """Add to `found` (S, n, 16, C), for each of S shares of the samples, the pullback of g (N, C) to control points."""
+    """Add to `found` (S, n, 16, C) the gradients of control points from g (N, C), for each of S shares of samples."""
     for share in range(start, stop):
         _pull_values(*_share(share, len(found), len(patch)), patch, params, g, found[share])
 
@@ -217,10 +217,11 @@ def _pull_values(start, stop, patch, params, g, found):
 
 @compiled
 def _tangents(net, u, v, collapsed, work):
-    """Fill `work` (7, 4): weights and their derivatives along u, then along v; both tangents; the mixed derivative.
+    """Fill `work` (7, 4): weights along u, their derivatives; the same along v; tangents along u and v; mixed slope.
 
-    Where one side of a patch is a single point, the tangent along that side is zero, or mere rounding. The mixed
-    derivative, times a sign, replaces it. Return both tangents' signs; zero for a tangent that is kept.
+    Where one side of a patch is a single point, one tangent is zero, and beside it mostly rounding. The mixed slope,
+    the second derivative in u and v, has the direction in which that tangent grows. It replaces the tangent, times a
+    sign. Returned are the signs for both tangents; 0 for a tangent that stays.
     """
     a, da, b, db = work[0], work[1], work[2], work[3]
     _bernstein(u, a, da)
@@ -254,7 +255,7 @@ def _tangents(net, u, v, collapsed, work):
 
 @compiled
 def _unit_product(work, normal):
-    """Fill `normal` (3,) with the cross product of both tangents, scaled to length one or zero. Return the divisor."""
+    """Fill `normal` (3,) with the normalised cross product of both tangents, or zero. Returns its length, or 1."""
     for c in range(3):
         p, q = (c + 1) % 3, (c + 2) % 3
         normal[c] = work[4, p] * work[5, q] - work[4, q] * work[5, p]
@@ -267,7 +268,7 @@ def _unit_product(work, normal):
 
 @loop
 def _fill_normals(start, stop, nets, patch, params, collapsed, out):
-    """Fill `out` (N, 3) with unit normals; a tangent shorter than `collapsed` times the other is replaced."""
+    """Fill `out` (N, 3) with unit normals; `collapsed` as in `normals`."""
     work = np.zeros((7, 4), nets.dtype)
     for n in range(start, stop):
         _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)
@@ -301,7 +302,7 @@ def _move_normals(start, stop, nets, tangents, patch, params, collapsed, out):
 
 @loop
 def _pull_normal_shares(start, stop, nets, patch, params, collapsed, g, found):
-    """Add to `found` (S, n, 16, 3), for each of S shares of the samples, the pullback of g (N, 3) to control points."""
+    """Add to `found` (S, n, 16, 3) the gradients of control points from g (N, 3), for each of S shares of samples."""
     for share in range(start, stop):
         _pull_normals(*_share(share, len(found), len(patch)), nets, patch, params, collapsed, g, found[share])
 

@@ -21,11 +21,12 @@ class BSpline(Patches):
     """A uniform bicubic B-spline surface.
 
     θ["points"] (nu, nv, 3) are the control points. "colors" (nu, nv, 1, 3 or 4) and "uv" (nu, nv, 2) are attributes of
-    control points, interpolated as they are. The normal is the cross product of the derivatives along u and v.
+    control points, interpolated as they are. The normal is the cross product of the derivatives along u and v, in this
+    order.
 
     Args:
         shape: (nu, nv), the numbers of control points, at least 4 in each direction.
-        ends: "open", "clamped" or "periodic", or one for each direction. An open spline ends between its control
+        ends: "open", "clamped" or "periodic", or a pair of these for u and v. An open spline ends between its control
             points, a clamped one at its first and last, and a periodic one is closed.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
@@ -64,7 +65,7 @@ class BSpline(Patches):
         )
 
     def bezier_rows(self, values: Array) -> Array:
-        """Bézier control points of all patches, by knot insertion: sums of control points, no weight negative."""
+        """Values (M, C) at the Bézier control points of all patches, by knot insertion, whose weights are ≥ 0."""
         xp, engine = namespace(values), engine_of(values)
         a, b = (engine.constant(m, values) for m in self._along)
         (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
@@ -74,7 +75,7 @@ class BSpline(Patches):
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """None for the leading shape (nu, nv) of the grid; else the right shape in words."""
+        """See `Patches`: two axes (nu, nv), those of the grid."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
 
 
@@ -88,14 +89,14 @@ class Revolution(BSpline):
     """A profile curve swept around the y axis: a periodic B-spline, which is very nearly a surface of revolution.
 
     θ["radii"] (n,) are the distances of the profile's control points from the axis. In planes through the axis and
-    control points the surface is the B-spline of radii and heights; between them it is nearer to the axis, by 0.12 %
-    with 8 points around, by 0.007 % with 16. "colors" (n, count, 1, 3 or 4) and "uv" (n, count, 2) are attributes of
-    control points. Normals point away from the axis where heights grow.
+    control points the surface is the B-spline of radii and heights; between these planes it is nearer to the axis, by
+    0.12 % with 8 points around, by 0.007 % with 16. "colors" (n, count, 1, 3 or 4) and "uv" (n, count, 2) are
+    attributes of control points. Normals point away from the axis where heights grow.
 
     Args:
         heights: (n,) numbers, the y of the profile's control points, at least 4.
         count: the number of control points around the axis, at least 4.
-        ends: "clamped" or "open", of the profile.
+        ends: "clamped" or "open" for the ends of the profile.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
@@ -148,9 +149,9 @@ def _is_end(end: Any) -> bool:
 
 
 def extraction(count: int, ends: str) -> np.ndarray:
-    """Weights (M, count) from control points of a uniform cubic B-spline to those of its cubic Bézier pieces.
+    """Weights (M, count) that make the control points of cubic Bézier pieces from those of a uniform cubic B-spline.
 
-    Pieces share their ends: M is three times their number, and one more unless periodic.
+    Pieces share their end points: M is three times the number of pieces, and one more unless periodic.
 
     Args:
         count: the number of control points.
@@ -175,7 +176,14 @@ def extraction(count: int, ends: str) -> np.ndarray:
 
 
 def _blossom(knots: np.ndarray, span: int, arguments: list[int], count: int) -> np.ndarray:
-    """The weights (count,) of control points in the polar form of one piece, by de Boor's recursion."""
+    """The weights (count,) of control points in the polar form (blossom) of one piece, by de Boor's recursion.
+
+    Args:
+        knots: (count + 4,), the knots.
+        span: the number of the piece.
+        arguments: the three arguments of the polar form.
+        count: the number of control points.
+    """
     points = np.zeros((4, count))
     points[np.arange(4), span + np.arange(4)] = 1
     for level, t in enumerate(arguments, start=1):

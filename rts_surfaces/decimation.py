@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 FEWEST = 20_000
-"""Meshes of fewer faces are left as they are: their faces are not what takes time."""
+"""Meshes of fewer faces are left as they are: their faces take little of the time."""
 SHARES = (1 / 16, 1 / 4)
 
 
@@ -18,7 +18,7 @@ class Decimated(NamedTuple):
     Attributes:
         faces: (T', 3) int32.
         vertices: (V', 3) in the dtype of the original vertices.
-        nearest: (V',) int32, for each vertex the index of the nearest original vertex merged into it.
+        nearest: (V',) int32, for each vertex the nearest original one among those merged into it.
     """
 
     faces: np.ndarray
@@ -44,7 +44,7 @@ def fewer_faces(vertices: np.ndarray, faces: np.ndarray) -> Iterator[Decimated]:
         simplified: Any = fast_simplification.simplify(points, triangles, 1 - share, return_collapses=True)
         merged, left, became = fast_simplification.replay_simplification(points, triangles, simplified[2])
         distance = np.linalg.norm(points - merged[became], axis=1)
-        # The nearest vertex is written last, over the others.
+        # The nearest vertices come last, and overwrite the others.
         order = np.argsort(-distance, kind="stable")
         nearest = np.zeros(len(merged), np.int32)
         nearest[became[order]] = order

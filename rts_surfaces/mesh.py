@@ -24,17 +24,17 @@ class Mesh(TriangleSurface):
     """A triangle mesh.
 
     θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors" and
-    "uv" need no declaration and have one row a vertex (A = V). `indices` declares others, and attributes with other
-    faces than the vertices', such as a uv map with seams. In the G-buffer "normals" becomes "normal" and "colors"
-    becomes "color". Where θ has no normals, smooth ones are computed from the positions, differentiably, if the shader
-    reads them.
+    "uv" are known and have one row a vertex (A = V). `indices` declares attributes of other names, and tables for
+    attributes with other rows, such as a uv map with split seams. In the G-buffer "normals" becomes "normal" and
+    "colors" becomes "color". Where θ has no normals, smooth ones are computed from the positions, differentiably, if
+    the shader reads them.
 
     Args:
         faces: (T, 3) integers into θ["vertices"]; copied.
         indices: attribute name → (T, 3) integers into θ[name], or None for one row a vertex; copied.
 
     Raises:
-        InputError: a table that is not (T, 3), not of integers, or traced: topology must be concrete.
+        InputError: tables of another shape, of no integers, or traced: topology is known while Python runs.
     """
 
     proxy_is_cheap = True
@@ -89,7 +89,7 @@ class Mesh(TriangleSurface):
         return Part(cls(faces), theta, shader="lambert")
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Raise `InputError` if an entry of θ has a wrong shape or dtype."""
+        """Refuse θ whose entries have wrong shapes or dtypes."""
         for name in self.reads(theta):
             check_rows("a mesh", theta, name, self._extents[self._columns.get(name, 0) // 3])
 
@@ -105,7 +105,7 @@ class Mesh(TriangleSurface):
         return self._reads[names]
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Meshes of fewer faces; none if θ has normals, uv or further tables, or the vertices may have derivatives."""
+        """Meshes of fewer faces, by `rts_surfaces.decimation`; none for torch or jax vertices, normals, uv, tables."""
         from rts_surfaces.decimation import fewer_faces
 
         plain = len(self._tables) == 1 and "normals" not in theta and "uv" not in theta
@@ -118,7 +118,7 @@ class Mesh(TriangleSurface):
         return rates
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-        """θ with fewer vertices; each has the attributes of the nearest old vertex."""
+        """θ with fewer `vertices`; each has the attributes of an old vertex, whose index is in `nearest`."""
         kept = {name: theta[name] for name in self._attributes(theta)}
         attributes = {name: take(x, engine_of(x).constant(nearest, x)) for name, x in kept.items()}
         return {**theta, **attributes, "vertices": vertices}
@@ -132,7 +132,7 @@ class Mesh(TriangleSurface):
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """The consistently oriented piece of each face, as a number; computed once."""
+        """The number of the consistently oriented piece of each face, see `TriangleSurface.pieces`; computed once."""
         if self._pieces is None:
             self._pieces = pieces(self.faces)
         return self._pieces
@@ -151,7 +151,7 @@ class Mesh(TriangleSurface):
         return interpolate(rows, samples.ids, column, samples.params)
 
     def vertex_normals(self, vertices: Array) -> Array:
-        """Unit normals (V, 3), the area-weighted mean of the faces around each vertex; zero for a vertex of no face."""
+        """Unit normals (V, 3), the area-weighted mean of those of the faces around each vertex; zero without faces."""
         if exemplar(vertices) is not None:
             return self._vertex_normals(vertices)
         key, kept = fingerprint(vertices), self._normals

@@ -8,16 +8,16 @@ from rts import InputError, namespace
 from rts.plugin_api.arrays import Tree, shape_of
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
-"""Entry of θ → its name in the G-buffer, where the two names differ."""
+"""Entry of θ → its name in the G-buffer, where the two differ."""
 WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
-"""Entry of θ → allowed numbers of channels C for each vertex or control point."""
+"""Entry of θ → how many numbers a vertex or control point may have in it."""
 
 RESERVED = ("vertices", "points", "position", "normal")
-"""Names that a user's attribute must not have."""
+"""Names that attributes declared by users may not have."""
 
 
 def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
-    """Raise `InputError` if the name of an attribute is in `RESERVED` or in `taken`."""
+    """Refuse names of declared attributes that are `RESERVED` or `taken`."""
     for name in names:
         if name in RESERVED or name in taken:
             raise InputError(f"indices declares {name!r}, which is no further attribute; expected another name")
@@ -26,13 +26,13 @@ def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
 def check_entry(
     who: str, theta: Mapping[str, Tree], name: str, expected: Callable[[tuple[int, ...]], str | None]
 ) -> None:
-    """Raise `InputError` for an entry of θ that is missing, has a wrong shape, or is not floating.
+    """Refuse an entry that is missing, of another shape, or of no floating numbers.
 
     Args:
-        who: the surface's name in error messages.
+        who: the surface's name in errors.
         theta: θ; values may be traced.
-        name: the entry's name.
-        expected: function of the entry's shape: None if the shape is right, else the right shape in words.
+        name: the name of the entry.
+        expected: a function of the entry's shape: the expected shape, in words; None if the entry has it.
     """
     if name not in theta:
         raise InputError(f"theta of {who} has no {name!r}; it has {sorted(theta)}")
@@ -45,7 +45,7 @@ def check_entry(
 
 
 def check_rows(who: str, theta: Mapping[str, Tree], name: str, rows: int) -> None:
-    """Raise `InputError` unless an entry of θ is (V, C), V at least `rows`, C as in `WIDTHS`; see `check_entry`."""
+    """Refuse an entry that is not (V, C) with V of at least `rows`, and C as in `WIDTHS`; see `check_entry`."""
     widths = WIDTHS.get(name)
 
     def expected(shape: tuple[int, ...]) -> str | None:

@@ -1,6 +1,6 @@
-"""Surfaces of parametric patches: triangles as fine as the view asks for, samples moved onto the true surface.
+"""Surfaces of parametric patches: triangles as fine as the view needs, samples moved onto the true surface.
 
-A sample consists of a patch's number and the coordinates (u, v) in that patch.
+A sample is the number of a patch and (u, v) in this patch.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ TOLERANCE = 0.1
 """The largest distance of a triangle from the surface where there may be an outline, pixels."""
 
 TOLERANCES = (0.8, 0.3, 0.1, 0.05)
-"""Tolerances that `rates` offers."""
+"""Tolerances, in pixels, that `Parametric.rates` offers."""
 
 RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS = 1e-4, 6, 0.25, 0.02, 8
-"""Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, how far a sample may lie
-beyond the edge of its patch, where a patch is 1 wide, and how many edges of patches may be crossed."""
+"""Newton's method: distance in pixels that a sample may be off its ray; largest number of steps; largest step, and
+largest distance of a sample beyond the edge of its patch, both in parameters; and how many edges may be crossed."""
 LIMITS = np.array([RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS])
 
 
@@ -36,14 +36,14 @@ class Geometry(abc.ABC):
 
     @abc.abstractmethod
     def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
-        """Points and derivatives; see `rts_surfaces.tiles.Points`."""
+        """Points and derivatives of the surface, with arguments and results as in `rts_surfaces.tiles.Points`."""
 
     @abc.abstractmethod
     def meet(self, samples: Samples, rays: Rays) -> Samples:
-        """Move samples onto their rays, by Newton's method with `LIMITS`.
+        """Samples on their rays, by Newton's method with `LIMITS`.
 
         Args:
-            samples: the starts: ids (N, 1), params (N, 2), row and depth (K, H, W).
+            samples: ids (N, 1), params (N, 2), row and depth (K, H, W), from which the method starts.
             rays: the ray of each row, float64.
 
         Returns:
@@ -57,14 +57,15 @@ class Parametric(TriangleSurface):
     Args:
         tiles: all patches.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
-        used: indices of the control points that patches refer to; None for all of them.
+        used: rows of the control points that patches use; None for all rows.
 
     Attributes:
         whole: the patches as tiles.
-        tiles: the patches as tiles, each cut into several where patches are few.
-        coarse: factor on the tolerance away from outlines: Newton's method reaches the surface from such distances.
-        beside: the distance from a tile's border, as a share of the tile, at which its shape is first measured. It is
-            positive where second derivatives at the border are unbounded, or large in a small area only.
+        tiles: the patches in smaller tiles, if there are few patches.
+        coarse: how many times the tolerance triangles may be off the surface away from outlines: there they only give
+            Newton's method its start.
+        beside: distance from the border of a tile, as a share of its size, from which on its shape is measured. More
+            than 0 if second derivatives have no bound at the border, or are large on very little of a tile.
     """
 
     sample_widths = (1, 2)
@@ -94,7 +95,7 @@ class Parametric(TriangleSurface):
         return rates
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rates of edges (E,) and tiles (n, 2) of `whole`, for `rate` pieces along each side of a patch."""
+        """Rates of the edges (E,) and the insides (n, 2) of `whole`, for sides of patches cut into `rate` pieces."""
         return uniform(self.whole, rate)
 
     @abc.abstractmethod
@@ -103,14 +104,14 @@ class Parametric(TriangleSurface):
 
     @abc.abstractmethod
     def geometry(self, points: np.ndarray) -> Geometry:
-        """The patches of finite control points."""
+        """The patches of control points (..., 3) that are finite, float64."""
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
         """The control points."""
         return self.control_points(theta)
 
     def proxy_key(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """The key of the camera's cell of views, so that images do not depend on earlier renders."""
+        """The cell of views that holds the camera: all views in it have the same triangles."""
         return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
@@ -130,9 +131,9 @@ class Parametric(TriangleSurface):
         """A mesh whose vertices lie on the surface.
 
         Args:
-            theta: θ, with concrete values, not traced ones.
-            rate: a whole number, the pieces along each side of a patch, at most `tiles.MOST`; or a float, the largest
-                distance of triangles from the surface, in the units of θ.
+            theta: θ, not traced.
+            rate: a whole number of pieces into which each side of a patch is cut, at most `tiles.MOST`; or a float, the
+                largest distance of triangles from the surface, in the units of θ.
 
         Returns:
             Vertices (V, 3) float32 and faces (T, 3) int32, without cracks between patches that share control points.
@@ -158,7 +159,7 @@ class Parametric(TriangleSurface):
         return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:
-        """The control points in float64, refused where one is no number."""
+        """The control points in float64; an error is raised if one is NaN or infinite."""
         points = np.asarray(inputs, np.float64)
         if not np.isfinite(points).all():
             bad = np.argwhere(~np.isfinite(points).all(axis=-1))

@@ -18,7 +18,7 @@ from rts_surfaces.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.tiles import Tiles
 
 ATTRIBUTES = ("colors", "uv")
-"""Entries of θ that are attributes of control points."""
+"""Entries of θ for control points."""
 
 
 class Bicubic(Geometry):
@@ -26,8 +26,8 @@ class Bicubic(Geometry):
 
     Args:
         nets: the control points.
-        across: (n, 4) int32, the side beyond each side; see the function `across`.
-        flips: (n, 4) bool, the `Tiles.flips` of the patches.
+        across: (n, 4) int32, the result of the function `across`.
+        flips: (n, 4) bool, the `flips` of the patches as `Tiles`.
     """
 
     def __init__(self, nets: np.ndarray, across: np.ndarray, flips: np.ndarray):
@@ -63,8 +63,8 @@ class Patches(Parametric):
     """Base of surfaces of bicubic patches.
 
     Args:
-        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v: indices of the
-            rows that `bezier_rows` returns.
+        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v, as rows of the
+            result of `bezier_rows`.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
         used: see `Parametric`.
 
@@ -81,28 +81,28 @@ class Patches(Parametric):
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:
-        """Bézier control points (M, C) of all patches, linear in the values: an entry of θ, or `control_points`.
+        """Values (M, C) at the control points of the Bézier patches, from those of an entry of θ, linear in these.
 
-        The values may also be NumPy arrays in float64.
+        `values` may be a NumPy array in float64, too.
         """
 
     @abc.abstractmethod
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """None if `shape`, of an entry of θ without its last axis, is right; else the right shape in words."""
+        """The shape expected of an entry of θ without its last axis, in words; None if it is right."""
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
-        """The control points of the surface, in the form that `bezier_rows` takes."""
+        """The control points, as `bezier_rows` takes them."""
         return theta["points"]
 
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
-        """None if `shape`, of the entry `name` of θ, is right; else the right shape in words."""
+        """The shape expected of an entry of θ, in words; None if it is right."""
         wrong = self.control_shape(shape[:-1]) if shape else "an array"
         if wrong is None and shape[-1] not in WIDTHS[name]:
             return f"a last axis of {' or '.join(map(str, WIDTHS[name]))}"
         return wrong
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Raise `InputError` if an entry of θ has a wrong shape or dtype."""
+        """Refuse θ whose entries have wrong shapes or dtypes."""
         for name in self.reads(theta):
             check_entry(repr(self), theta, name, partial(self.expected, name))
 
@@ -142,11 +142,11 @@ class Patches(Parametric):
 def across(sides: np.ndarray) -> np.ndarray:
     """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
 
-    Where more than two sides share an edge, the side half way round their list is taken. So a side that is a single
-    point leads to a patch opposite, beyond that point.
+    Where m > 2 sides share an edge, in order of their numbers, each leads to the one m / 2 after it, cyclically. So a
+    side that is a single point leads to the patch on the other side of the point.
 
     Args:
-        sides: (n, 4), the edges of `Tiles`.
+        sides: (n, 4), the edge of each side, as in `Tiles`.
     """
     flat = sides.reshape(-1)
     order = np.argsort(flat, kind="stable")
@@ -159,11 +159,11 @@ def across(sides: np.ndarray) -> np.ndarray:
 
 
 def _tiles(table: np.ndarray) -> Tiles:
-    """Patches (n, 16) as tiles; edges are shared where their control points are."""
+    """Patches (n, 16) as tiles; two sides are one edge if they have the same control points, in either order."""
     net, count = table.reshape(-1, 4, 4), len(table)
     # Sides run around the patch: v = 0, u = 1, v = 1 backwards, u = 0 backwards.
     sides = np.stack([net[:, :, 0], net[:, 3, :], net[:, ::-1, 3], net[:, 0, ::-1]], axis=1).reshape(-1, 4)
-    # Both patches beside an edge need one direction: the one that begins with the lesser control point.
+    # An edge has one direction for both patches beside it: towards the greater control point, by number.
     back = sides[:, ::-1]
     place = (sides != back).argmax(axis=1)[:, None]
     flips = np.take_along_axis(sides, place, 1)[:, 0] > np.take_along_axis(back, place, 1)[:, 0]

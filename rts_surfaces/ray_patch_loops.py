@@ -12,7 +12,7 @@ from rts_surfaces.bicubic_loops import compiled, first, loop
 
 @loop
 def bounds(nets, out):
-    """Fill `out` (n, 3): bounds of the lengths of second derivatives: in u, in u and v, in v."""
+    """Fill `out` (n, 3) with upper bounds of the lengths of patches' second derivatives: in u, in u and v, in v."""
     for n in range(len(nets)):
         out[n] = 0
         for i in range(4):
@@ -25,7 +25,7 @@ def bounds(nets, out):
 
 @compiled
 def _differences(net, i, j):
-    """Squared lengths of second differences that start at a control point, or zero: in u, in u and v, in v."""
+    """Squared lengths of the second differences that begin at control point (i, j): in u, in u and v, in v; else 0."""
     uu, uv, vv = 0.0, 0.0, 0.0
     for c in range(3):
         if i < 2:
@@ -39,7 +39,10 @@ def _differences(net, i, j):
 
 @compiled
 def _crossed(across, flips, patch, u, v, inside):
-    """The patch across the side that (u, v) is farthest beyond, or -1; and u and v there, `inside` from its edge."""
+    """The patch across the side beyond which (u, v) lies farthest, and (u, v) in it, `inside` away from the side.
+
+    The patch is −1, and (u, v) unchanged, if (u, v) lies within its patch or nothing lies beyond the side.
+    """
     side, most = 0, -v
     if u - 1 > most:
         side, most = 1, u - 1
@@ -67,27 +70,28 @@ def _crossed(across, flips, patch, u, v, inside):
 
 @loop
 def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, origins, directions, spread, limits):
-    """Newton's method: move params so that points lie on their rays; see `rts_surfaces.parametric`.
+    """Newton's method: move params so that points lie on their rays; see `LIMITS` in `rts_surfaces.parametric`.
 
-    A search that ends beyond the edge of a patch goes on in the neighbouring patch. Triangles may be off the surface by
-    more than the width of a thin patch.
+    If the method ends beyond the edge of a patch, it goes on in the patch across this edge: triangles may be off the
+    surface by more than thin patches are wide.
 
     Args:
         start: first line of cells.
         stop: one after the last.
-        powers: (n, 3, 4, 4).
-        bounds: (n, 3), as `bounds` fills: where they prove that a step ends near enough, the point is not evaluated.
+        powers: (n, 3, 4, 4), the patches.
+        bounds: (n, 3), the result of `bounds`. Where they prove that a step ends near enough to the ray, the surface is
+            not evaluated again.
         across: (n, 4) int32, see `rts_surfaces.patches.across`.
         flips: (n, 4) bool, as in `rts_surfaces.tiles.Tiles`.
-        ids: (N, 1) int32, the patches; changed.
-        params: (N, 2) float32, where to start; changed.
-        row: (L, W) int32, the sample in each cell; becomes −1 where the ray misses the surface.
-        depth: (L, W) float32, changed.
+        ids: (N, 1) int32, the patch of each sample; changed.
+        params: (N, 2) float32, the samples' start; changed.
+        row: (L, W) int32, the sample in each cell; becomes −1 where the sample's ray does not meet the surface.
+        depth: (L, W) float32, to be filled with the depth of each hit; 0 without one.
         origins: (N, 3) float64.
         directions: (N, 3) float64; the point at depth z is `origin + z direction`.
         spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
         limits: (5,): residual in pixels, largest number of steps on a patch, largest step in params, largest distance
-            beyond the edge in params, largest number of edges crossed.
+            beyond the edge in params, how many edges may be crossed.
     """
     for y in range(start, stop):
         for x in range(row.shape[1]):
@@ -102,7 +106,7 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
 
 @compiled
 def _meet(n, powers, bounds, across, flips, ids, params, origins, directions, spread, limits):
-    """Move the params of a sample until its point lies on its ray. Return True on success, and the depth."""
+    """Move the params of sample n until its point lies on its ray. Returns True and the depth, or False and 0."""
     residual, steps, largest, beyond, crossings = limits[0], int(limits[1]), limits[2], limits[3], int(limits[4])
     patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
     dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]

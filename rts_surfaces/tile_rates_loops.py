@@ -12,7 +12,7 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 
 COLLAPSED = 1e-6
-"""Derivatives define no normal where the sine of the angle between them is below this."""
+"""Derivatives along s and t have no normal if the sine of their angle is at most this."""
 
 
 @compiled
@@ -25,7 +25,7 @@ def _dot(a, b):
 
 @compiled
 def _slopes(found, frame, slopes):
-    """Fill `slopes` (2, 3), derivatives along s and t, from derivatives in parameters of the patch."""
+    """Fill `slopes` (2, 3) with derivatives along s and t, from `found` (6, 3), those in the patch's parameters."""
     for k in range(2):
         for c in range(3):
             slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
@@ -33,13 +33,13 @@ def _slopes(found, frame, slopes):
 
 @compiled
 def _second(found, a, b, c):
-    """The component c of the second derivative along directions a and b, in parameters of the patch."""
+    """The component c of the second derivative along a (2,) and b (2,), directions in parameters of the patch."""
     return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
 
 
 @compiled
 def _normal(slopes, out):
-    """Fill `out` (3,) with the unit normal and return True; zeros and False where slopes (2, 3) define none."""
+    """Fill `out` (3,) with the unit normal and return True; if there is none, fill zeros and return False."""
     for c in range(3):
         x, y = (c + 1) % 3, (c + 2) % 3
         out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
@@ -62,7 +62,7 @@ def shapes(start, stop, found, frames, normals, places, bends):
         normals: (n, G, G, 3), of unit length, or zero.
         places: (n, G, G, 3), the points of the grid.
         bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; without a normal, their
-            lengths. Components along the surface are ignored: they do not move chords off the surface.
+            lengths. Triangles leave the surface by these components alone; the others move points within it.
     """
     grid, slopes = normals.shape[1], np.empty((2, 3))
     for n in range(start, stop):
@@ -85,13 +85,13 @@ def shapes(start, stop, found, frames, normals, places, bends):
 
 @loop
 def curves(start, stop, found, frames, along, out):
-    """Fill out (E,), the largest second derivative of each edge at right angles to the edge.
+    """Fill out (E,), the largest second derivatives of edges at right angles to the edge.
 
     Args:
         start: first edge.
         stop: one after the last.
-        found: (E, G, 6, 3) float64, points and derivatives in parameters of the patch of one of its tiles.
-        frames: (E, 3, 2) float64, of that tile.
+        found: (E, G, 6, 3) float64, points and derivatives in parameters of the patch of a tile beside each edge.
+        frames: (E, 3, 2) float64, the frame of that tile.
         along: (E, 2) float64, the direction of the edge in the tile's local coordinates.
         out: (E,) float64.
     """
@@ -122,20 +122,20 @@ def outlines(
     Args:
         start: first tile.
         stop: one after the last.
-        places: (n, G, G, 3), points at a grid.
-        normals: (n, G, G, 3).
+        places: (n, G, G, 3), points on a grid of each tile.
+        normals: (n, G, G, 3), unit normals at these points, or zero.
         bends: (n, 3), the largest second derivatives along the normal.
         eye: (3,), or the direction towards the viewer if `parallel`.
         toward: (3,) unit, from the middle of the surface to the eye.
         parallel: True if rays are parallel.
-        aside: largest deviation of the eye sideways; where parallel, of the direction.
-        depth: largest deviation of the eye along `toward`.
-        spread: (2,), a pixel at distance d is `spread[0] + spread[1] d` wide.
-        cone: (5,): the axis of the view, sine and cosine of its half angle, for the whole cell of views.
-        wanted: (2,) allowed pixels: where a tile may have an outline, and elsewhere.
-        chord: (n,), to be filled with the allowed distance of each tile.
-        edge: (n,), to be filled with that of the tile's edges, should they be outlines.
-        facing: (n,) int8: 1 where the whole tile faces the viewer, −1 where no point of it does, else 0.
+        aside: how far the eye may be off sideways; if `parallel`, how far the direction may be off.
+        depth: how far the eye may be off along `toward`.
+        spread: (2,), at distance d from the eye a pixel is `spread[0] + spread[1] d` wide.
+        cone: (5,): the axis of the view, sine and cosine of half the angle of the cone that holds it.
+        wanted: (2,), the allowed distance in pixels where a tile may have an outline, and elsewhere.
+        chord: (n,), the allowed distance for each tile.
+        edge: (n,), the allowed distance for those of its edges that are outlines.
+        facing: (n,) int8: 1 for a tile that faces the viewer everywhere, −1 for one that does nowhere, else 0.
     """
     grid, move = places.shape[1], aside + depth
     faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
@@ -189,19 +189,19 @@ def outlines(
 
 @loop
 def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
-    """Fill the rates, numbers of pieces, of tiles and edges: inner (n, 2) along s and t, edges (E,).
+    """Fill the numbers of pieces into which tiles and edges are cut: inner (n, 2) along s and t, edges (E,).
 
     Args:
-        bends: (n, 3), as `shapes` fills them.
-        curves: (E,), the output of `curves`.
-        chord: (n,), allowed distance of a tile's triangles from the surface; infinity where out of view.
-        edge: (n,), allowed distance at the tile's edges, should they be outlines.
-        facing: (n,) int8: 1 where the whole tile faces the viewer, −1 where no point of it does, else 0.
+        bends: (n, 3), as in `shapes`.
+        curves: (E,), the result of `curves`.
+        chord: (n,), how far triangles of a tile may be off the surface; infinity out of view.
+        edge: (n,), how far triangles may be off at those edges of a tile that are outlines.
+        facing: (n,) int8, as in `outlines`.
         sides: (n, k) int32, the edge of each side.
-        least: the least rate of a tile that is cut.
+        least: the least rate within a tile that is cut.
         most: the largest rate.
-        inner: (n, 2) int32.
-        edges: (E,) int32.
+        inner: (n, 2) int32, to be filled.
+        edges: (E,) int32, to be filled.
     """
     fine, finest, width = np.full(len(edges), np.inf), np.full(len(edges), np.inf), sides.shape[1]
     beside, front, back = np.zeros(len(edges), np.int32), np.zeros(len(edges), np.bool_), np.zeros(len(edges), np.bool_)

@@ -1,7 +1,7 @@
-"""Tiles of patches, and their triangles, which meet without cracks at any rates of cutting.
+"""Tiles of patches, and their triangles, which meet without cracks at any rates.
 
 A tile is a quadrilateral or a triangle, with local coordinates (s, t): the unit square, or the triangle (0, 0), (1, 0),
-(0, 1). Tiles that share an edge share its points.
+(0, 1). Its rates are the numbers of pieces into which it is cut. Tiles that share an edge share its points.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.view_cells import View
 
 MOST = 256
-"""The largest number of pieces along a side of a tile."""
+"""The largest rate: the number of pieces into which a side of a tile is cut."""
 MOST_TRIANGLES = 2**27
-"""The largest number of triangles: 8 GiB."""
+"""The largest number of triangles; their arrays take 8 GiB."""
 LEAST = {4: 2, 3: 3}
-"""Number of sides of a tile → least number of pieces along s and t if it is cut, so that points lie within."""
+"""Number of sides → the least rate within a tile that is cut at all, so that vertices lie inside it."""
 AT_ONCE = 2048
 """Tiles whose shapes are computed together."""
 GRID = {4: 3, 3: 5}
-"""Number of sides of a tile → points along each side of the grid on which its shape is measured."""
+"""Number of sides → points along each side of a tile, at which its shape is measured."""
 ENOUGH, FINEST = 500, 4
-"""Fewer than `ENOUGH` patches are split into smaller tiles, at most `FINEST` along a side. So only tiles at outlines
-need to be fine."""
+"""If patches are fewer than `ENOUGH`, each is split into smaller tiles, at most `FINEST` along a side. So only tiles at
+outlines need to be fine."""
 
 Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-"""(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), points
-and derivatives in u, v, uu, uv, vv."""
+"""(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or, for order 2,
+(N, 6, 3), points and derivatives in u, v, uu, uv, vv."""
 
 _CORNERS = {4: np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64), 3: np.array([(0, 0), (1, 0), (0, 1)], float)}
 
 
 class Tiles(NamedTuple):
-    """The tiles of a surface; k is 4, or 3. Host arrays, read-only.
+    """The tiles of a surface, with k sides each, 4 or 3. Host arrays, read-only.
 
     Attributes:
-        patch: (n,) int32, the patch that contains each tile.
-        frames: (n, 3, 2) float64: local (s, t) are the patch's `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
+        patch: (n,) int32, the patch of which each tile is a part.
+        frames: (n, 3, 2) float64: (s, t) has the patch parameters `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
         corners: (n, k) int32, the numbers of the tile's corners, counter-clockwise from (0, 0).
         sides: (n, k) int32, the edge from each corner to the next.
-        flips: (n, k) bool, True for a side whose direction around the tile is opposite to its edge's.
-        corner_tiles: (C, 2) int32, for each corner number a tile with this corner, and its index there.
-        edge_tiles: (E, 2) int32, for each edge a tile beside it, and the index of its side there.
+        flips: (n, k) bool, whether a side, which runs around the tile, runs against its edge.
+        corner_tiles: (C, 2) int32, for each corner a tile that has it, and its index among this tile's corners.
+        edge_tiles: (E, 2) int32, for each edge a tile that has it, and its index among this tile's sides.
     """
 
     patch: np.ndarray
@@ -63,26 +63,26 @@ class Tiles(NamedTuple):
     def of(
         cls, patch: np.ndarray, frames: np.ndarray, corners: np.ndarray, sides: np.ndarray, flips: np.ndarray
     ) -> Tiles:
-        """Tiles from corners (n, k) and sides (n, k) named by any integers, which are renumbered from 0."""
+        """Tiles from tables whose corners and sides are named by any integers, equal for those that tiles share."""
         corners, corner_tiles = _numbered(corners)
         sides, edge_tiles = _numbered(sides)
         patch, frames, flips = patch.astype(np.int32), frames.astype(np.float64), np.array(flips, bool)
         return cls(*(read_only(x) for x in (patch, frames, corners, sides, flips, corner_tiles, edge_tiles)))
 
     def params(self, tiles: np.ndarray, local: np.ndarray) -> np.ndarray:
-        """Parameters (N, 2) at local coordinates (N, 2) of tiles (N,)."""
+        """Parameters (N, 2) of the patch, at local coordinates `local` (N, 2) of tiles (N,)."""
         frames = self.frames[tiles]
         return frames[:, 0] + local[:, :1] * frames[:, 1] + local[:, 1:] * frames[:, 2]
 
 
 class Shapes(NamedTuple):
-    """Shapes of tiles, float64, from which their errors as triangles follow.
+    """Shapes of tiles, float64, from which the distances between their triangles and the surface follow.
 
     Attributes:
-        normals: (n, G, G, 3) of unit length, or zero, at a grid of points.
+        normals: (n, G, G, 3) normals of unit length, or zero, at a grid of G points a side.
         places: (n, G, G, 3), the points of the grid.
         bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t.
-        curves: (E,), the largest second derivative of each edge at right angles to the edge.
+        curves: (E,), the largest second derivatives of edges at right angles to the edge.
     """
 
     normals: np.ndarray
@@ -92,14 +92,14 @@ class Shapes(NamedTuple):
 
 
 def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Names (n, k) replaced by numbers from 0 on; and for each number the first (row, column) that holds it."""
+    """Names (n, k) as numbers from 0 on, and for each number the (row, column) of its first occurrence."""
     _, place, numbers = np.unique(names, return_index=True, return_inverse=True)
     where = np.stack(np.divmod(place, names.shape[1]), axis=1).astype(np.int32)
     return numbers.reshape(names.shape).astype(np.int32), where
 
 
 def split(tiles: Tiles) -> Tiles:
-    """Cut fewer than `ENOUGH` quadrilaterals into smaller tiles, all alike; triangular tiles are returned unchanged."""
+    """Tiles cut into smaller ones, all alike, if they are quadrilaterals and fewer than `ENOUGH`; else unchanged."""
     count, width = tiles.corners.shape
     cuts = int(np.clip(np.sqrt(ENOUGH / count), 1, FINEST))
     if width == 3 or cuts == 1:
@@ -112,7 +112,7 @@ def split(tiles: Tiles) -> Tiles:
 
 
 def _pieces(tiles: Tiles, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners, sides and flips (n cuts², 4) of quadrilaterals cut into cuts² tiles, named by any integers."""
+    """Corners, sides and flips (n cuts², 4) of quadrilaterals cut into cuts² tiles each; see `Tiles.of` for names."""
     count, points, edges, steps = len(tiles.corners), len(tiles.corner_tiles), len(tiles.edge_tiles), np.arange(cuts)
     # Points: the corners, those within edges, those within tiles.
     corner = points + edges * (cuts - 1) + np.arange(count * (cuts + 1) ** 2).reshape(count, cuts + 1, cuts + 1)
@@ -149,7 +149,7 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
 
     Args:
         tiles: the tiles.
-        points: function that evaluates the surface.
+        points: the surface.
         beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
     from rts_surfaces import tile_rates_loops
@@ -189,12 +189,12 @@ def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray)
 
 
 class Allowed(NamedTuple):
-    """Allowed distance of triangles from the surface, in units of space; infinity out of view.
+    """Allowed distances of triangles from the surface, in units of space; infinity out of view.
 
     Attributes:
-        chord: (n,), of each tile.
-        edge: (n,), at the edges of each tile, should these be outlines.
-        facing: (n,) int8: 1 where the whole tile faces the viewer, −1 where no point of it does, else 0.
+        chord: (n,), for each tile.
+        edge: (n,), for the edges of each tile that are outlines.
+        facing: (n,) int8: 1 for a tile that faces the viewer everywhere, −1 for one that does nowhere, else 0.
     """
 
     chord: np.ndarray
@@ -203,7 +203,7 @@ class Allowed(NamedTuple):
 
     @classmethod
     def everywhere(cls, count: int, chord: float) -> Allowed:
-        """The distance `chord` for all of `count` tiles, and their edges, none known to face the viewer."""
+        """The distance `chord` for all of `count` tiles and their edges."""
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 
@@ -211,10 +211,10 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
     """The allowed distances of triangles from the surface in a view.
 
     Args:
-        view: the cell of views.
+        view: the camera's view.
         tile_shapes: the shapes of the tiles.
-        fine: allowed pixels where a tile or an edge may be an outline.
-        coarse: allowed pixels elsewhere.
+        fine: distance in pixels where a tile or an edge may have an outline.
+        coarse: distance in pixels elsewhere.
     """
     from rts_surfaces import tile_rates_loops
 
@@ -228,7 +228,7 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
 
 
 def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, for which triangles keep to the allowed distances."""
+    """Rates of edges (E,) and of tiles (n, 2), int32, at which triangles keep the allowed distances."""
     from rts_surfaces import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
@@ -239,7 +239,7 @@ def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.nd
 
 
 def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32: `rate` everywhere, or `LEAST` within tiles that are cut."""
+    """Rates of edges (E,) and of tiles (n, 2), int32, all equal to `rate`, except where `LEAST` needs more in tiles."""
     edges = np.full(len(tiles.edge_tiles), rate, np.int32)
     least = 1 if rate == 1 else max(rate, LEAST[tiles.corners.shape[1]])
     return edges, np.full((len(tiles.patch), 2), least, np.int32)
@@ -249,11 +249,11 @@ def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray) -> Proxy:
-    """Triangles of tiles, without cracks, counter-clockwise where tiles are.
+    """Triangles of tiles, without cracks, in the winding of the tiles.
 
     Args:
         tiles: the tiles.
-        points: function that evaluates the surface.
+        points: the surface.
         edges: (E,) int32, into how many pieces each edge is cut.
         inner: (n, 2) int32, into how many pieces each tile is cut along s and t; triangular tiles use the first alone.
             Where a tile or an edge of it is cut at all, each number used is at least `LEAST` for its number of sides.
@@ -286,7 +286,10 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
 def _places(
     tiles: Tiles, edges: np.ndarray, edge_first: np.ndarray, inner: np.ndarray, inner_first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Patches (V,) and parameters (V, 2) of vertices: first tiles' corners, then within edges, then within tiles."""
+    """Patches (V,) and parameters (V, 2) of vertices: first those at corners, then within edges, then within tiles.
+
+    `edge_first` (E + 1,) and `inner_first` (n + 1,) are the first vertex within each edge and each tile.
+    """
     from rts_surfaces import tiles_loops
 
     shape = _CORNERS[tiles.corners.shape[1]]
@@ -294,7 +297,7 @@ def _places(
     patch, params = np.empty(total, np.int32), np.empty((total, 2))
     tile, corner = tiles.corner_tiles.T
     patch[: len(tile)], params[: len(tile)] = tiles.patch[tile], tiles.params(tile, shape[corner])
-    # From one end of an edge to the other, in its own direction.
+    # From one end of an edge to the other, in the edge's direction.
     tile, side = tiles.edge_tiles.T
     back = tiles.flips[tile, side][:, None]
     ends = tiles.params(tile, shape[side]), tiles.params(tile, np.roll(shape, -1, axis=0)[side])

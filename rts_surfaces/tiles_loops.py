@@ -15,9 +15,9 @@ def within_edges(owner, starts, ends, edges, edge_first, patch, params):
     """Fill patch (V,) and params (V, 2) of the points within edges.
 
     Args:
-        owner: (E,) int32, the patch that each edge is evaluated on.
-        starts: (E, 2) float64, the patch's parameters where the edge starts.
-        ends: (E, 2) float64, where the edge ends.
+        owner: (E,) int32, the patch on which each edge is evaluated.
+        starts: (E, 2) float64, the patch's parameters at the start of the edge.
+        ends: (E, 2) float64, at its end.
         edges: (E,) int32, into how many pieces each edge is cut.
         edge_first: (E + 1,) int32, the first of the points within each edge.
         patch: (V,) int32.
@@ -39,7 +39,7 @@ def _put(frame, s, t, out):
 
 @loop
 def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within quadrilaterals; t varies fastest."""
+    """Fill patch (V,) and params (V, 2) of the points within tiles; t changes fastest."""
     for n in range(len(inner)):
         v, rs, rt = inner_first[n], inner[n, 0], inner[n, 1]
         for i in range(1, rs):
@@ -51,7 +51,7 @@ def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
 
 @loop
 def within_triangles(owner, frames, inner, inner_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within triangular tiles; s varies fastest."""
+    """Fill patch (V,) and params (V, 2) of the points within triangular tiles; s changes fastest."""
     for n in range(len(inner)):
         v, r = inner_first[n], inner[n, 0]
         for j in range(1, r):
@@ -63,7 +63,7 @@ def within_triangles(owner, frames, inner, inner_first, patch, params):
 
 @compiled
 def _count(rates, sides, edges):
-    """The number of triangles of a tile."""
+    """The number of triangles of a tile with these rates (2,) and sides (k,)."""
     width, rs, rt = len(sides), rates[0], rates[1]
     if rs == 1:
         return width - 2
@@ -84,7 +84,7 @@ def counted(inner, sides, edges):
 
 @loop
 def counts(inner, sides, edges, first):
-    """Fill first (n + 1,): the index of each tile's first triangle, then the number of all triangles."""
+    """Fill first (n + 1,): the index of the first triangle of each tile, and last the number of all triangles."""
     first[0] = 0
     for n in range(len(inner)):
         first[n + 1] = first[n] + _count(inner[n], sides[n], edges)
@@ -102,7 +102,7 @@ def _set(faces, params, t, place, vertex, frame, x, y):
 
 @compiled
 def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
-    """Fill a triangle's corner `place` with point k, from 0 to `cuts`, of a side."""
+    """Set corner `place` of triangle t to point k, from 0 to `cuts`, of a side of tile n."""
     width = corners.shape[1]
     if k == 0 or k == cuts:
         vertex = corners[n, side if k == 0 else (side + 1) % width]
@@ -123,7 +123,7 @@ def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
 
 @compiled
 def _square(faces, params, t, i, j, rs, rt, frame, base):
-    """Fill both triangles of a cell of a tile's grid. Return the index of the next triangle."""
+    """Set both triangles, t and t + 1, of the cell at (i, j) of a tile's inner grid. Returns t + 2."""
     for half in range(2):
         for k in range(3):
             # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
@@ -135,7 +135,7 @@ def _square(faces, params, t, i, j, rs, rt, frame, base):
 
 @compiled
 def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
-    """Fill a triangle's corner `place` with point m, from 1 on, along a side of the ring next to the tile's border."""
+    """Set corner `place` of triangle t to point m, from 1 on, of the ring within a tile, along a side."""
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
     j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
     _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
@@ -150,14 +150,14 @@ def quadrilaterals(
     Args:
         start: first tile.
         stop: one after the last.
-        owner: (n,) int32, patches of tiles.
-        frames: (n, 3, 2) float64.
-        corners: (n, 4) int32.
-        sides: (n, 4) int32.
-        flips: (n, 4) bool.
-        edges: (E,) int32, how often each edge is cut.
+        owner: (n,) int32, the patch of each tile.
+        frames: (n, 3, 2) float64, as in `Tiles`.
+        corners: (n, 4) int32, as in `Tiles`.
+        sides: (n, 4) int32, as in `Tiles`.
+        flips: (n, 4) bool, as in `Tiles`.
+        edges: (E,) int32, into how many pieces each edge is cut.
         edge_first: (E + 1,) int32, the first of the vertices within each edge.
-        inner: (n, 2) int32, how often each tile is cut.
+        inner: (n, 2) int32, into how many pieces each tile is cut along s and t.
         inner_first: (n + 1,) int32, the first of the vertices within each tile.
         first: (n + 1,) int32, the first triangle of each tile.
         out: faces (T, 3) int32, ids (T, 1) int32, params (T, 3, 2) float32.
@@ -201,7 +201,7 @@ def _triangle_point(faces, params, t, place, i, j, r, frame, base):
 
 @compiled
 def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
-    """Fill corner `place` with point m, from 1 on, along a side of the ring next to a triangular tile's border."""
+    """Set corner `place` of triangle t to point m, from 1 on, of the ring within a triangular tile, along a side."""
     i = m if side == 0 else r - 1 - m if side == 1 else 1
     j = 1 if side == 0 else m if side == 1 else r - 1 - m
     _triangle_point(faces, params, t, place, i, j, r, frame, base)

@@ -1,4 +1,4 @@
-"""Cells of views: all views of a cell share triangles, so that images do not depend on earlier renders."""
+"""Cells of views: all views in a cell get the same triangles, so that images do not depend on earlier ones."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import numpy as np
 from rts import Camera
 
 STEP, CELLS = 1.1, 16
-"""Views whose distances and widths of pixels differ by less than this factor, and whose directions are in one cell of a
-cube's sides (`CELLS` from the middle of a side to its edge), have the same triangles."""
+"""Views have the same triangles if their directions are in one cell of a cube's sides (`CELLS` cells from the middle of
+a side to its edge), and distances, widths of pixels and widths of view round to one power of `STEP`."""
 EVEN = 0.5
-"""Views whose smallest scale is below this share of their largest have finer triangles."""
+"""Views whose smallest scale of an axis is below this share of their largest have finer triangles."""
 
 
 class View(NamedTuple):
-    """A cell of views, for which triangles are made: its middle, and the largest deviations from the middle.
+    """A cell of views, for which triangles are made: its middle, and the largest deviations of a view from it.
 
     Attributes:
-        eye: (3,) its position; where rays are parallel, the direction towards the viewer.
+        eye: (3,), local space; where rays are parallel, the unit direction towards the viewer.
         parallel: True if rays are parallel.
-        aside: largest deviation of the eye sideways, local units; if parallel, of the direction.
-        along: largest deviation of the eye towards the surface and away from it.
-        toward: (3,) unit, from the surface to the eye.
-        spread: (2,): at distance d from the eye a pixel is at least `spread[0] + spread[1] d` wide.
-        axis: (3,) the direction in which the camera looks.
-        angle: half the angle of a cone around the axis that contains the image, radians.
+        aside: largest deviation of the eye sideways, local units; where rays are parallel, of the direction.
+        along: largest deviation of the eye towards the surface or away from it, local units.
+        toward: (3,) unit, from the surface's centre to the eye.
+        spread: (2,): at distance d from the eye a pixel is at least `spread[0] + spread[1] d` wide, local units.
+        axis: (3,) unit, the direction in which the camera looks.
+        angle: half the angle of a cone around the axis that holds all views of the cell, radians.
     """
 
     eye: np.ndarray
@@ -41,24 +41,24 @@ class View(NamedTuple):
 
 
 def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple:
-    """The integer coordinates of the cell that contains a camera's view; equal cells have equal triangles.
+    """The cell of views that holds a camera, as whole numbers; `view_of` takes them.
 
     Args:
-        camera: NumPy, in the surface's local space.
-        size: (height, width).
-        center: (3,), the middle of the surface.
+        camera: a camera of NumPy arrays, in the surface's local space.
+        size: (height, width) in pixels.
+        center: (3,), the surface's centre.
     """
     inverse = np.linalg.inv(camera.view)
     spread, axis = camera.spread(size), -inverse[:3, 2]
     scales = np.linalg.svd(camera.view[:3, :3], compute_uv=False)
-    # Where axes are scaled differently, as narrow a pixel, and as wide a cone, as in any direction.
+    # Where axes are scaled differently, pixels count as narrow, and the cone as wide, as in the worst direction.
     evenness = scales[2] / scales[0] if scales[2] < EVEN * scales[0] else 1.0
     if camera.projection[3, 2] == 0:
         return True, _cell(-axis), 0, _power(spread[0] * evenness), _cell(axis), 0
     off = inverse[:3, 3] - center
     # Depth is in the camera's units, distance in the surface's.
     width = spread[1] * float(np.prod(scales)) ** (1 / 3)
-    # The principal point may be beside the image: as wide a cone as reaches its farthest corner.
+    # The principal point may be beside the image: the cone reaches the image's farthest corner.
     shift = float(np.hypot(*(camera.projection[:2, 2])))
     wide = width * math.hypot(*size) / 2 * (1 + shift) / evenness
     distance = float(np.linalg.norm(off))
@@ -66,7 +66,7 @@ def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple
 
 
 def view_of(key: tuple, center: np.ndarray) -> View:
-    """The `View` of a key of `view_key`; `center` (3,) is the middle of the surface."""
+    """The cell of a `view_key`, for a surface with this centre (3,)."""
     parallel, toward, distance, width, axis, wide = key
     direction, half = _direction(toward), 0.75 / CELLS  # Of a cell's diagonal, the tangent at most.
     narrow = STEP ** (width - 0.5)
@@ -83,7 +83,7 @@ def _power(x: float) -> int:
 
 
 def _cell(vector: np.ndarray) -> tuple[int, int, int]:
-    """Integer point, on the surface of a cube of half width `CELLS`, nearest to a direction (3,)."""
+    """The cell of a direction (3,) on the sides of a cube, as whole numbers from −`CELLS` to `CELLS`."""
     largest = float(np.abs(vector).max())
     x, y, z = (round(CELLS * c / largest) for c in vector.tolist()) if largest > 0 else (0, 0, CELLS)
     return x, y, z

@@ -1,4 +1,4 @@
-"""Ray casting of a field's surface: steps that bracket changes of sign, then roots in the brackets."""
+"""Ray casting of a field's surface: steps bracket changes of sign, then roots are found in the brackets."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ SECANT, NEWTON = 5, 2
 """Steps of the methods of Illinois and of Newton in a bracket."""
 
 CROWDED = 0.75
-"""Finished rays are removed when less than this share of the rays goes on."""
+"""Finished rays are removed when the share of the rays that go on is below this."""
 
 FLATTEST = 1e-6
-"""Least squared slope by which points are moved, as a share of the usual one; flatter places move less."""
+"""Least squared slope by which a level is divided to move points, as a share of the usual one; this bounds motion."""
 
 
 class Region(NamedTuple):
@@ -76,19 +76,20 @@ def box(low: np.ndarray, high: np.ndarray) -> Region:
 
 
 def moving(level: Callable[[Array], Array], points: Array, hit: Array) -> Array:
-    """(M, 6) for points (M, 3) of a surface: the points, and how they move for each unit that the level falls there.
+    """Parameters (M, 6): points (M, 3) of a surface, and their motion for each unit by which the level falls.
 
-    The latter is the slope over its square, w = ∇f / |∇f|²: the point x₀ − f(x₀) w is on the surface, to first order.
-    `hit` (M,) bool says which rows are such points.
+    The motion is w = ∇f / |∇f|²: the point x₀ − f(x₀) w is on the surface, to first order. `hit` (M,) bool is true for
+    rows that are points of the surface; others pad.
     """
     engine = engine_of(points)
     return engine.stop_gradient(engine.namespace.concat([points, per_level(gradient(level, points), hit)], axis=-1))
 
 
 def per_level(slope: Array, hit: Array) -> Array:
-    """(M, 3): slopes (M, 3) over their squares; `hit` (M,) bool says which are slopes of the surface.
+    """Slopes (M, 3) divided by their squared lengths; `hit` (M,) bool is true for slopes at points of the surface.
 
-    A few steep places, such as those of a root, do not make the others flat: the usual slope is a geometric mean.
+    Slopes that are flat compared with the usual one are divided by more, see `FLATTEST`. The usual slope is a geometric
+    mean, so that a few steep places, such as those of a square root, do not make the others flat.
     """
     xp = namespace(slope)
     # Squares of small slopes are no numbers of single precision.
@@ -116,12 +117,11 @@ def cast(
     """The nearest points of each ray at which a function changes its sign, within a region; without derivative.
 
     With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the region, so that they
-    lead over the surface. Without one all steps are of one length. Either way what is thinner than a step may be
-    missed.
+    lead over the surface. Without L all steps are of one length. In both cases parts thinner than a step may be missed.
 
     Args:
         level: points (M, 3) → (M,), negative inside, zero counts as outside.
-        describe: points (M, 3), and which of them are of the surface, (M,) bool → (M, P), the parameters of a hit.
+        describe: a function of points (M, 3) and marks (M,) bool of those on the surface; gives parameters (M, P).
         origins: (R, 3).
         directions: (R, 3), of any length but zero.
         layers: K.
@@ -145,7 +145,7 @@ def cast(
         within.across / steps / length,
         xp.zeros_like(length) if lipschitz is None else 1 / (lipschitz * length),
     )
-    most = steps + 1  # No step is shorter.
+    most = steps + 1  # The shortest steps need no more to cross the region.
     free = partial(_without_derivative, level)
     if engine.padded(origins):
         return _cast_all(level, free, describe, rays, enter, layers, most)
@@ -179,7 +179,7 @@ class _Rays(NamedTuple):
 
 
 class _Bracket(NamedTuple):
-    """Arguments between which functions change their sign, and the values there; arrays of one shape."""
+    """Ray parameters `low` and `high` between which the level changes its sign, and the levels there; of one shape."""
 
     low: Array
     high: Array
@@ -190,7 +190,7 @@ class _Bracket(NamedTuple):
 def _cast_some(
     level: Callable, free: Callable, describe: Callable, rays: _Rays, enter: Array, layers: int, most: int
 ) -> RayHits:
-    """Hits of eager arrays: only rays that are not done go on, and roots are sought only where there are any."""
+    """Hits of eager arrays: finished rays are removed, and roots are sought in the brackets found alone."""
     xp, count = engine_of(enter).namespace, enter.shape[0]
     index = xp.arange(count, dtype=xp.int64, device=enter.device)
     going, hits, t, value = rays, xp.zeros_like(index), xp.zeros_like(enter), free(rays.starts)
@@ -228,7 +228,7 @@ def _cast_some(
 def _cast_all(
     level: Callable, free: Callable, describe: Callable, rays: _Rays, enter: Array, layers: int, most: int
 ) -> RayHits:
-    """Hits of arrays whose shapes stay: all rays go on until all are done, and roots are sought in all layers."""
+    """Hits of arrays whose shapes must stay: rays go on until all are finished, and roots are sought in all layers."""
     engine = engine_of(enter)
     xp = engine.namespace
     zero = xp.zeros_like(enter)

@@ -18,10 +18,10 @@ from rts.plugin_api.records import Samples
 from rts_surfaces.parameter_checks import RESERVED
 
 LARGEST = 1e38
-"""Larger values count as no number of single precision."""
+"""The largest absolute value of an isovalue, near the limit of single precision."""
 
 Function = Callable[[Mapping[str, Tree], Array], Array]
-"""A function of θ and points (M, 3)."""
+"""A function of θ and points (M, 3), with one value (M,) or some values (M, C) a point."""
 
 SIDES = {"below": 1.0, "above": -1.0}
 """The sides of the isovalue that may be the inside, and the sign that makes the values there negative."""
@@ -42,7 +42,7 @@ class ScalarField(abc.ABC):
 
     @abc.abstractmethod
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ that lacks such an entry."""
+        """Refuse θ that lacks an entry that is read."""
 
     @abc.abstractmethod
     def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
@@ -62,15 +62,15 @@ class ScalarField(abc.ABC):
 
     @abc.abstractmethod
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The points in the dtype that θ asks for, float32 at least."""
+        """The points in the dtype of the entries of θ that are read, float32 at least."""
 
 
 class Field(ScalarField):
     """A scalar function of space that θ parametrizes; its surface is where it has one value.
 
     Args:
-        f: (θ, points (M, 3)) → (M,), in array code; points and results are in θ's dtype, float32 at least. It may hold
-            for one engine only, such as a network of torch by `torch.func.functional_call`.
+        f: (θ, points (M, 3)) → (M,), in array code; points and results are in θ's dtype, float32 at least. It may work
+            with one engine only, such as a network of torch by `torch.func.functional_call`.
         isovalue: the value on the surface.
         inside: which values are inside, "below" the isovalue or "above" it.
         reads: the names of the entries of θ that `f` reads; None for all.
@@ -107,7 +107,7 @@ class Field(ScalarField):
         """See `ScalarField`.
 
         Raises:
-            InputError: `f` gave another shape, dtype or engine.
+            InputError: `f` fails, or its result has another shape, dtype or engine.
         """
         try:
             value = self.f(theta, points)
@@ -151,7 +151,7 @@ class Field(ScalarField):
 
 
 class Implicit(Surface):
-    """Base class of surfaces of a field: it collects the entries of θ that are read, and makes the G-buffer.
+    """Base class of surfaces of a field: the entries of θ that they read, and their G-buffer.
 
     Args:
         field: the field.
@@ -159,7 +159,7 @@ class Implicit(Surface):
             computed if the shader reads them. They may read any entry of θ.
 
     Raises:
-        InputError: an attribute is no function, or its name is in `RESERVED`.
+        InputError: an attribute has no function, or its name is reserved, such as "normal".
     """
 
     def __init__(self, field: ScalarField, attributes: Mapping[str, Function] | None = None):
@@ -176,11 +176,11 @@ class Implicit(Surface):
         return tuple(theta) if self.attributes else self.field.names(theta)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Raise `InputError` if θ lacks an entry that the field reads."""
+        """Refuse θ that lacks an entry which the field reads."""
         self.field.check(theta)
 
     def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
-        """The G-buffer where rays met the field: x₀ − f(x₀) w, with x₀ and w the first parameters of samples.
+        """The G-buffer where rays met the field, at x₀ − f(x₀) w, with x₀ and w the first six parameters of samples.
 
         Args:
             theta: θ.
@@ -189,7 +189,7 @@ class Implicit(Surface):
         """
         params = self.field.suited(theta, samples.params)
         xp = namespace(params)
-        # Rows of padding would lie at the origin, where many functions have no derivative: they copy the first row.
+        # Rows that only pad would lie at the origin, where many functions have no derivative: they copy the first row.
         used = xp.any(params != 0, axis=1, keepdims=True)
         params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
         points, along = params[:, :3], params[:, 3:6]
@@ -200,7 +200,7 @@ class Implicit(Surface):
         return unit(self.field.slope(theta, position))
 
     def gbuffer(self, theta: Mapping[str, Tree], position: Array) -> GBuffer:
-        """Positions (N, 3) on the surface, with normals of unit length, outwards, and the attributes, when read.
+        """The G-buffer of positions (N, 3) on the surface: with unit normals, outwards, and the attributes, if read.
 
         All are differentiable in θ and in the positions. A normal is zero where the field has no slope.
         """
@@ -212,7 +212,7 @@ class Implicit(Surface):
 
 
 def check_isovalue(isovalue: Any) -> float:
-    """The isovalue; refused beyond single precision, or as a framework's array, whose derivative would be lost."""
+    """The isovalue as a float; refused if it exceeds `LARGEST`, or is an array whose derivative would be lost."""
     value = known_number("isovalue", check_numbers("isovalue", isovalue, ()))
     if exemplar(isovalue) is not None:
         raise InputError(
@@ -225,14 +225,14 @@ def check_isovalue(isovalue: Any) -> float:
 
 
 def known_number(name: str, value: np.ndarray | None) -> float:
-    """A number as returned by `rts.plugin_api.checks.check_numbers`; refused if traced, which is None."""
+    """The float of a checked number, as `check_numbers` returns it; refused if it is traced, which None says."""
     if value is None:
         raise InputError(f"{name} is traced; expected a known number: surfaces do not change with theta")
     return float(value)
 
 
 def check_function(name: str, f: Any) -> None:
-    """Raise `InputError` unless f is a function, or callable object, of θ and points; a class is refused."""
+    """Refuse anything but a function of θ and points; classes are refused, callable objects are not."""
     if not callable(f) or isinstance(f, type):
         raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
     try:
@@ -249,7 +249,7 @@ def check_function(name: str, f: Any) -> None:
 
 
 def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:
-    """Raise `InputError` unless a result for points (M, 3) is (M,), or (M, C), in the points' engine and dtype."""
+    """Refuse a function's result for points (M, 3) that is not (M,), or (M, C), in their engine and dtype."""
     engine, count = engine_of(points), points.shape[0]
     expected = f"({count}, C)" if columns else f"({count},)"
     try:

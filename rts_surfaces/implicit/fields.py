@@ -1,8 +1,8 @@
 """Ready-made fields f(θ, points (M, 3)) → (M,): signed distances, negative inside, and unions of fields.
 
-Each field reads entries of θ by fixed names. If two fields share a name, give each its own dict in θ:
+Each field reads entries of θ by fixed names. If two fields share a name, give each its own dict:
 `union(lambda theta, p: sphere(theta["left"], p), lambda theta, p: sphere(theta["right"], p))`.
-All have finite derivatives everywhere, in θ as in points.
+All have finite derivatives everywhere, both in θ and in points.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rts_surfaces.implicit.field import Function, check_function
 from rts_surfaces.parameter_checks import check_entry
 
 BLOCK = 2048
-"""Number of points whose distances to all spheres are in memory at once."""
+"""The number of points whose distances to all spheres are in memory at once."""
 
 
 def sphere(theta: Mapping[str, Tree], points: Array) -> Array:
@@ -40,8 +40,8 @@ def swept_sphere(theta: Mapping[str, Tree], points: Array) -> Array:
 def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
     """The least distance (M,) of points (M, 3) to n spheres, whose centers lie in the plane y = 0.
 
-    θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. The
-    search for it has no derivative and goes by blocks of `BLOCK` points, or sphere by sphere: memory is O(M).
+    θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. The search
+    for it has no derivatives, and goes by blocks of `BLOCK` points, or sphere by sphere: memory is of the order of M.
     """
     xp, centers = namespace(points), _entry(theta, "centers", ("n", 2))
     radii = _entry(theta, "radii", (centers.shape[0],))
@@ -53,10 +53,10 @@ def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
 
 
 def union(*fields: Function) -> Function:
-    """The minimum of fields: inside is every point that is inside at least one.
+    """The field whose inside is all that is inside any of the fields: their least value.
 
     Raises:
-        InputError: no field is given, or one is no function.
+        InputError: there is no field, or one is no function.
     """
     _check_fields(fields)
 
@@ -69,7 +69,7 @@ def union(*fields: Function) -> Function:
 def smooth_union(sharpness: float, *fields: Function) -> Function:
     """The `union` of n fields with a fillet where they meet: −log(Σ exp(−s fᵢ)) / s for a sharpness s.
 
-    It is at most log(n) / s less than the union, and its slope nowhere exceeds the steepest field's.
+    It is at most log(n) / s less than the union, and its slope nowhere exceeds that of the steepest field.
 
     Args:
         sharpness: s, in units of one over those of the fields; positive.
@@ -127,7 +127,7 @@ def _nearest(points: Array, centers: Array, radii: Array) -> Array:
 
 
 def _entry(theta: Mapping[str, Tree], name: str, shape: tuple[int | str, ...]) -> Array:
-    """An entry of θ, refused where it is missing or of another shape; a letter stands for any length but 0."""
+    """The entry of θ; refused if missing or of another shape, in which a letter is for any length but 0."""
 
     def expected(actual: tuple[int, ...]) -> str | None:
         pairs = zip(actual, shape, strict=False)

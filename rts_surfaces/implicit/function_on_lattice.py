@@ -18,7 +18,7 @@ from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
 CHUNK = 2**15
-"""Lattice points at which a function is evaluated at a time."""
+"""The number of lattice points at which a function is evaluated at a time, about."""
 
 
 class Looked(NamedTuple):
@@ -40,7 +40,7 @@ class Resampled(NamedTuple):
     Attributes:
         shape: (X, Y, Z) of the lattice.
         field: the field.
-        theta: θ → θ for it, or None where θ stays.
+        theta: a function from the old lattice's θ to this one's; None if θ stays.
     """
 
     shape: tuple[int, ...]
@@ -131,14 +131,19 @@ class FunctionOnLattice(Field):
     # ------------------------------------------------------------------------------------------------ samples
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """The spec of the table of lattice points that samples share; empty if the surface wants no table."""
+        """The table "points" of the numbers of lattice points, which samples share; empty without `table`.
+
+        Args:
+            rows: the number of samples.
+            capacity: the largest number of samples, where shapes must be known; else None.
+        """
         if not self.table:
             return {}
         room = 6 * rows if capacity is None else 2 * capacity if self.table is True else int(self.table)
         return {"points": ArraySpec((min(room, self._lattice.count),), np.int32, packed=capacity is None)}
 
     def tabled(self, samples: Samples) -> Samples:
-        """Samples whose ids are rows of a table of lattice points; unchanged if the surface wants no table."""
+        """Samples whose ids are rows of the table "points" instead of lattice points; unchanged without `table`."""
         if not self.table:
             return samples
         from rts_surfaces.implicit.distinct_loops import distinct
@@ -148,14 +153,14 @@ class FunctionOnLattice(Field):
         ids = rows.reshape(-1, 6).astype(np.int32, copy=False)
         row, overflow = samples.row, samples.overflow
         if len(points) > room:
-            # Points are in the order of samples, which is that of layers: the deepest find no room.
+            # Points are in the order of samples, front layers first: the deepest samples find no room.
             gone = (row >= 0) & (ids.max(axis=1) >= room)[row]
             row, overflow = np.where(gone, -1, row), np.asarray(overflow + gone.sum(), np.int32)
             ids = np.minimum(ids, room - 1)
         return samples.replace(ids=ids, row=row, overflow=overflow, tables={"points": points[:room].astype(np.int32)})
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """Levels (M,), differentiable; and for each sample the rows (N, 6) int32 of its six values in them."""
+        """Levels (M,), differentiable; and for each sample the indices (N, 6) int32 of its six values among them."""
         if self.table:
             if "points" not in samples.tables:
                 raise InputError("the samples have no table of lattice points, and the surface has one; sample it anew")
@@ -166,7 +171,7 @@ class FunctionOnLattice(Field):
         return levels, engine_of(levels).constant(rows, levels)
 
     def numbers(self, samples: Samples) -> Array:
-        """The lattice points (N, 6) of samples."""
+        """The numbers (N, 6) of the samples' lattice points."""
         if not self.table:
             return samples.ids
         xp = namespace(samples.ids)

@@ -1,4 +1,4 @@
-"""Values on a lattice interpolated linearly along each axis, and their central differences likewise."""
+"""Interpolation, linear along each axis, of values on a lattice and of their central differences."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Numbers = tuple[float, ...]
 
 
 def interpolated(values: Array, points: Array, lattice: Lattice) -> Array:
-    """(M,): values (X, Y, Z) of a lattice at points (M, 3), differentiable in both; beyond its bounds as on them."""
+    """Values (X, Y, Z) of a lattice at points (M, 3): (M,), differentiable in both; beyond the bounds as on them."""
     lowest, shares = _cells(values.shape, points, lattice.low.tolist(), lattice.step.tolist())
     return _combined(values, *_corners(values.shape, lowest, shares))
 
 
 def differences(values: Array, points: Array, lattice: Lattice) -> Array:
-    """(M, 3): central differences of values (X, Y, Z) along the axes at points (M, 3); see `interpolated`.
+    """Central differences (M, 3) of values (X, Y, Z) along the axes, interpolated at points (M, 3); see `interpolated`.
 
-    At the bounds they are one-sided. Unlike the slope of what is interpolated, they have no jumps.
+    At the bounds differences are one-sided. Unlike the slope of the interpolated values, they have no jumps.
     """
     points = namespace(values).astype(points, values.dtype, copy=False)
     return DIFFERENCES(values, points, low=tuple(lattice.low.tolist()), step=tuple(lattice.step.tolist()))
@@ -31,7 +31,7 @@ def differences(values: Array, points: Array, lattice: Lattice) -> Array:
 def _cells(
     shape: Sequence[int], points: Array, low: Sequence[float], step: Sequence[float]
 ) -> tuple[list[Array], list[Array]]:
-    """The lowest corners of the cells that points lie in, (M,) int32 along each axis; and how far into them, 0 to 1."""
+    """Along each axis, the lowest corners (M,) int32 of the points' cells, and the points' places in them, 0 to 1."""
     xp, engine = namespace(points), engine_of(points)
     lowest, shares = [], []
     for axis in range(3):

@@ -11,7 +11,7 @@ Numbers = tuple[float, ...]
 
 
 def forward(values: np.ndarray, points: np.ndarray, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
-    """Fill `out` (N, 3) with central differences of the values at points (N, 3)."""
+    """Fill the differences (N, 3) at points (N, 3)."""
     parallel(_value, len(points), values, points, low, step, out, work=150 * len(points))
 
 
@@ -25,7 +25,7 @@ def push(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    """Fill `out` (N, 3) with their derivatives along tangents of values (X, Y, Z) and points; None stands for zeros."""
+    """Fill the differences' derivatives (N, 3) along tangents of values (X, Y, Z) and points; None for zeros."""
     out[...] = 0
     if t_values is not None:
         forward(t_values, points, out, low=low, step=step)
@@ -43,7 +43,7 @@ def pull(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    """Pull back the gradient `g` (N, 3) of the differences: add to `g_values`, fill `g_points`; either may be None."""
+    """Pull back the gradient `g` (N, 3): add to that of the values, and fill that of the points, where wanted."""
     if g_values is not None:
         _pull_values(points, g, low, step, g_values)
     if g_points is not None:
@@ -52,9 +52,9 @@ def pull(
 
 @compiled(inline="always")
 def _place(point, shape, low, step, lowest, near, slopes):
-    """Fill the lowest corner of a point's cell, its shares (3, 2) of both ends along each axis, and their slopes (3,).
+    """Fill the lowest corner of a point's cell, the weights (3, 2) of both ends along each axis, and their slopes (3,).
 
-    Returns whether the point is a number.
+    Returns False if the point is NaN.
     """
     for axis in range(3):
         at = (point[axis] - low[axis]) / step[axis]

@@ -1,7 +1,7 @@
 """Isosurfaces of values on a lattice, and of functions: sampled on the triangles of marching cubes (paper §3.1.3).
 
 A sample lies on a triangle whose corners lie on three edges of the lattice. Only the values at the ends of these edges
-are differentiated. Derivatives do not depend on the triangles, whose topology may change.
+are differentiated, independently of the triangles, so that the topology may change.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
 from rts_surfaces.implicit.narrow_band import Band, NarrowBand
 
 NEAR_SINGULAR = 1e-3
-"""An edge is near-singular if its ends' values differ by less than this share of the median over crossed edges."""
+"""An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
 
 BESIDE = 1e-3
-"""Distance before the bounds at which rays begin, if the surface is capped, to meet the caps; a share of the bounds."""
+"""Distance outside the bounds, as a share of their size, at which rays begin if the surface is capped, to meet caps."""
 
 STEPS_PER_CELL = 2
 """Steps of rays across the narrowest side of a cell, where there is no Lipschitz bound."""
@@ -43,7 +43,7 @@ ON_SIDE = 1e-6
 """Largest distance of a cap's points from the bounds' side, as a share of the bounds."""
 
 KEPT = 4
-"""Number of fields whose median differences over crossed edges are remembered."""
+"""The number of fields whose median differences, see `_usual`, are remembered."""
 
 MOTIONS, ENDS, SINGULAR = ("normal", "edge"), ("capped", "open"), ("bound", "drop", "keep")
 
@@ -55,7 +55,7 @@ class Extracted(NamedTuple):
         vertices: (V, 3) float32, on edges of the lattice.
         faces: (T, 3) int32, counter-clockwise seen from outside.
         near_singular: the number of crossed edges that are near-singular.
-        evaluations: the number of points at which the function was evaluated; 0 if θ holds the values.
+        evaluations: the number of points at which the function was evaluated; 0 where values are given.
     """
 
     vertices: np.ndarray
@@ -69,32 +69,34 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     A sample's ids are the numbers of six lattice points, the ends of three edges; point (x, y, z) has the number
     (x Y + y) Z + z. The first three of its parameters are the barycentrics in the triangle between these edges.
-    A sample moves with the field at these six points alone. Values equal to the isovalue are outside.
+    The field at these six points alone moves the sample. Values equal to the isovalue are outside.
 
-    Samplers of triangles see the triangles of marching cubes; the sampler "rays" intersects the field itself, where
-    θ["values"] are interpolated trilinearly.
+    Samplers of triangles see the triangles of marching cubes; the sampler "rays" meets the field itself, for given
+    values interpolated along each axis.
 
     Args:
         bounds: two corners ((x0, y0, z0), (x1, y1, z1)) of the lattice, the lower one first.
-        isovalue: the field's value on the surface.
+        isovalue: the value of the field on the surface.
         f: (θ, points (M, 3)) → (M,), in array code or for one engine; None for θ["values"].
-        shape: (X, Y, Z), lattice points along each axis. Required with `f`; else the shape of θ["values"].
+        shape: (X, Y, Z), lattice points along each axis. Needed with `f`; else None, or the shape of the values.
         motion: how samples move with the field. "normal": along its gradient, by its change there. "edge": their
             triangle's corners slide along the edges of the lattice, as in the paper.
-        inside: "below" or "above" the isovalue.
+        inside: which values are inside: "below" or "above" the isovalue.
         at_bounds: "capped": where the inside reaches the bounds, it is closed there; or "open".
-        near_singular: the rule where an edge's ends differ so little that its corner would move without bound.
-            "bound": derivatives are bounded. "drop": no triangle there, as in the paper. "keep": no change.
-        table: True for a costly `f`, which is then called once for each lattice point, not for each sample. A
-            number is the capacity of the table, in points, where shapes must be known, as in `jax.jit`; else the
-            capacity is twice that of the samples.
-        band: a `NarrowBand`: `f` is evaluated at no more of the lattice than needed. θ must not be traced then.
-        lipschitz: the largest change of `f` over a unit of length, for the sampler "rays"; None if unknown.
+        near_singular: the rule for edges whose ends have nearly equal values, so that a corner on them would move
+            without bound. "bound": derivatives are bounded. "drop": their triangles are dropped, as in the paper.
+            "keep": derivatives stay as they are.
+        table: True for a costly `f`: it is evaluated once for each lattice point, not once for each sample at the
+            point. A number allots room for so many points where shapes must be known, as in `jax.jit`; True allots
+            twice as many as samples.
+        band: a `NarrowBand`, to evaluate `f` near the surface only; θ must not be traced, then. None for the whole
+            lattice.
+        lipschitz: the most that `f` changes over a unit of length, for the sampler "rays"; None if unknown.
         reads: the entries of θ that `f` reads; None for all.
         attributes: name → function (θ, positions (N, 3)) → (N, C), further entries of the G-buffer.
 
     Raises:
-        InputError: an argument of another kind, or outside its range.
+        InputError: an argument is wrong.
     """
 
     refine_moves = False
@@ -159,7 +161,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return Part(surface, {"values": values.astype(np.float32)}, "normals")
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """The surface on coarser lattices, and for a function also on a finer one."""
+        """The surface on coarser lattices, and, if it is of a function, on a finer one."""
         count, rates = self.field.lattice(theta).count, []
         for shape, field, change in self.field.resampled(theta):
             other = copy.copy(self)
@@ -170,14 +172,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ----------------------------------------------------------------------------------- triangles and samples
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """Values at lattice points: those of θ, or levels of the function on the whole lattice or in its band."""
+        """Values at lattice points: θ's, or levels of the function, everywhere or in its band."""
         return self.field.look(theta, self.closed).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
         """The triangles of marching cubes, dropped ones included, and their cost.
 
         Args:
-            theta: θ, with concrete values, not traced ones.
+            theta: θ, not traced.
 
         Raises:
             InputError: the field is NaN or infinite somewhere.
@@ -206,7 +208,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         raise InputError(f"{self.field.name} is {value} at lattice point [{at}]; expected finite numbers")
 
     def why_no_triangles(self, inputs: Mapping[str, np.ndarray]) -> str:
-        """The side of the isovalue on which the whole field lies; one text for all values: a loop warns only once."""
+        """The side of the isovalue on which the whole field lies. The text holds no values, so that loops warn once."""
         values, (isovalue, sign) = inputs["values"], self.field.level_of_values
         if "corners" in inputs:
             return f"has no surface: its band found no place where the field crosses the isovalue {self.isovalue:g}"
@@ -214,7 +216,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return f"has no surface: the field is {side} of the isovalue {self.isovalue:g} all over its bounds"
 
     def proxy(self, inputs: Mapping[str, np.ndarray], camera: Any, size: tuple[int, int]) -> Proxy:
-        """The triangles of marching cubes, each with the ends of its edges, its cell, and where it is capped."""
+        """The triangles of marching cubes; the ids of each are the six ends of its edges, its cell, and its caps."""
         from rts_surfaces.implicit import lattice_samples_loops
 
         triangles = self._triangles(inputs)
@@ -234,7 +236,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
-        """Samples with their parameters: weights of the six values, place and motion; and merged lattice points."""
+        """Samples with their parameters, see `lattice_samples_loops.fill`, and with lattice points as ids."""
         from rts_surfaces.implicit import lattice_samples_loops
 
         lattice = self.field.lattice(inputs)
@@ -254,12 +256,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
-        """The median difference of the ends of crossed edges, kept from when the triangles were made."""
+        """The median difference of the field between the ends of crossed edges; `proxy` keeps it for `refine`."""
         difference = self._usual.get(fingerprint(inputs["values"]))
         return _usual(self._triangles(inputs)) if difference is None else difference
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
-        """The lattice points that samples share."""
+        """The tables of the field."""
         return self.field.table_specs(rows, capacity)
 
     # ------------------------------------------------------------------------------------ evaluation and rays
@@ -284,7 +286,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         )
 
     def _capped(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The level; beyond the bounds at least their distance times `lipschitz`, so that rays meet the caps."""
+        """The level (M,), or if larger, the distance beyond the bounds, negative inside, times `lipschitz` or 1."""
         xp, level = namespace(points), self.field.level(theta, points)
         for axis, (low, high) in enumerate(np.stack(self.bounds, axis=1).tolist()):
             beyond = xp.maximum(low - points[:, axis], points[:, axis] - high)
@@ -292,7 +294,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return level
 
     def _caps(self, points: Array) -> Array:
-        """(M, 3): for points in a capped side of the bounds, 1 or −1 on the axis across that side; else 0."""
+        """Marks (M, 3) of points in caps: 1 in the upper, −1 in the lower side of the bounds across an axis; else 0."""
         xp, (low, high) = namespace(points), self.bounds
         columns = []
         for axis in range(3):
@@ -304,9 +306,9 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return xp.stack(columns, axis=-1)
 
     def _moving(self, theta: Mapping[str, Tree], points: Array, hit: Array) -> Array:
-        """(M, 7): points, how they move for each unit of level, and their level; in a cap only within its side.
+        """Parameters (M, 7): points; their motion for a unit of level, within its side in a cap; their level in caps.
 
-        `hit` (M,) bool says which points are those of hits.
+        `hit` (M,) bool is true for points that are hits of rays.
         """
         engine = engine_of(points)
         xp, level = engine.namespace, partial(self.field.level, theta)
@@ -317,7 +319,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         )
 
     def unbounded(self) -> Isosurface | None:
-        """See `rts.Surface`: with near-singular edges as they are."""
+        """See `rts.Surface`: the surface with `near_singular` "keep"; None if it bounds no derivatives."""
         if self.near_singular != "bound":
             return None
         surface = copy.copy(self)
@@ -351,6 +353,6 @@ def _singular(triangles: Triangles) -> np.ndarray:
 
 
 def _usual(triangles: Triangles) -> float:
-    """The median difference of the ends of edges that are crossed."""
+    """The median difference of the field between the ends of crossed edges; 0 without any."""
     crossed = triangles.differences[triangles.differences > 0]
     return float(np.median(crossed)) if len(crossed) else 0.0

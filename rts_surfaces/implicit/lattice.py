@@ -11,7 +11,7 @@ from rts.plugin_api.arrays import Array
 from rts.plugin_api.checks import check_numbers, is_count, quoted
 
 MOST_POINTS = 2**31 - 1
-"""Points are numbered by int32."""
+"""The largest number of points, which int32 must number."""
 
 
 class Lattice:
@@ -37,7 +37,7 @@ class Lattice:
 
     @classmethod
     def of(cls, shape: tuple[int, ...], low: tuple[float, ...], step: tuple[float, ...]) -> Lattice:
-        """The lattice of a shape, a first point and a step, as `fixed` gives them."""
+        """The lattice with these attributes, which `fixed` returns."""
         self = cls.__new__(cls)
         self.shape, self.low, self.step = shape, np.array(low), np.array(step)
         return self
@@ -49,7 +49,7 @@ class Lattice:
 
     @property
     def fixed(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
-        """Shape, first point and step, as numbers of Python."""
+        """Shape, first point and step, as Python's numbers."""
         return self.shape, tuple(self.low.tolist()), tuple(self.step.tolist())
 
     @property
@@ -59,11 +59,11 @@ class Lattice:
         return x * y * z
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
-        """The places (M, 3) float64 of points by number (M,)."""
+        """The coordinates (M, 3) float64 of the points with these numbers (M,)."""
         return self.low + self.step * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
 
     def places(self, numbers: Array, dtype: Any) -> Array:
-        """The places (M, 3) of points by number (M,) int32, in array code."""
+        """The coordinates (M, 3), in `dtype`, of the points with these numbers (M,) int32, in array code."""
         xp = namespace(numbers)
         _, y, z = self.shape
         steps = numbers // (y * z), numbers // z % y, numbers % z

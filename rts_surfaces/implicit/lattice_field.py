@@ -20,7 +20,7 @@ class LatticeField(ScalarField):
     """θ["values"] (X, Y, Z) at the points of a lattice, as a field.
 
     Args:
-        bounds: the corners of the lattice.
+        bounds: two corners ((x0, y0, z0), (x1, y1, z1)) of the lattice, the lower one first.
         isovalue: where the level is zero.
         sign: 1 if values below the isovalue are inside, −1 if values above it are.
         shape: (X, Y, Z) that the values must have, or None for any.
@@ -56,7 +56,7 @@ class LatticeField(ScalarField):
         return Lattice(self.bounds, shape_of(theta["values"]))
 
     def resampled(self, theta: Mapping[str, Tree]) -> Iterator[Resampled]:
-        """Every fourth value along each axis, and every second, if these include the lattice's ends."""
+        """Lattices of every fourth value along each axis, and of every second, if these include the lattice's ends."""
         for stride in (4, 2):
             shape = tuple((n - 1) // stride + 1 for n in shape_of(theta["values"]))
             if min(shape) >= 2 and all((n - 1) % stride == 0 for n in shape_of(theta["values"])):
@@ -64,7 +64,7 @@ class LatticeField(ScalarField):
                 yield Resampled(shape, field, partial(_every, stride))
 
     def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """The values, as `Looked`; no function is evaluated."""
+        """θ["values"], since nothing needs to be evaluated."""
         return Looked({"values": theta["values"]}, 0)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
@@ -76,12 +76,12 @@ class LatticeField(ScalarField):
         return samples
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """All values (M,), and for each sample the indices (N, 6) of its six values."""
+        """All values (M,), and for each sample the indices (N, 6) of its six values among them."""
         values = self.suited(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 
     def numbers(self, samples: Samples) -> Array:
-        """The lattice points (N, 6) of samples."""
+        """The numbers (N, 6) of the samples' lattice points."""
         return samples.ids
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
@@ -104,5 +104,5 @@ class LatticeField(ScalarField):
 
 
 def _every(stride: int, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-    """θ with every `stride`-th value along each axis."""
+    """θ with every value of number `stride` along each axis."""
     return {**theta, "values": theta["values"][::stride, ::stride, ::stride]}

@@ -7,7 +7,7 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 
 LARGEST = 1e38
-"""Larger values count as no number of single precision: fields that are flat to the last digit move nothing."""
+"""Larger motions, beyond single precision, become zero: where fields are flat to the last digit nothing moves."""
 
 
 @compiled(inline="always")
@@ -50,20 +50,20 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
     Args:
         start: the first sample.
         stop: the sample after the last.
-        values: (M,), of all lattice points by number, or of those of a band by row.
+        values: (M,), of all lattice points, indexed by number, or of a band's points, indexed by row.
         isovalue: see `marching_cubes.of_lattice`.
         sign: see `marching_cubes.of_lattice`.
         band: numbers (M,) of the band's points, and rows (C, 8) of the corners of its cells; None without one.
         shape: (X, Y, Z).
         low: (3,), the first point.
-        step: (3,).
-        ids: (N, 8) int32: the ends of three edges, the cell, and the axes along which it is capped.
-        near: (N, 2), barycentrics.
+        step: (3,), the distance of neighbours along each axis.
+        ids: (N, 8) int32: the six ends of three edges, the cell, and its caps, see `marching_cubes.Triangles`.
+        near: (N, 2), the first two barycentrics.
         points: (N, 6) int32, to be filled with the numbers of lattice points.
         params: (N, 4), of which the barycentrics (3) are filled; or (N, 16), filled with the barycentrics, the weights
-            of the six values (6), the place (3), how it moves for each unit of level (3), and the sum of the values
-            less the isovalue by these weights.
-        least: by how much the level is taken to change at least over a unit of length.
+            of the six values (6), the position (3), its motion for each unit of level (3), and the weighted sum of the
+            six values less the isovalue.
+        least: lower bound for the slope, by whose square motions are divided.
     """
     a, b, at, slope = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(start, stop):
@@ -103,7 +103,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
 
 @loop
 def hand_on(start, stop, faces, ends, cells, caps, ids):
-    """Fill the ids (T, 8) that triangles hand on to samples: the ends of three edges, the cell, and its caps."""
+    """Fill the ids (T, 8) that samples take from triangles: the ends of three edges, the cell, and its caps."""
     for t in range(start, stop):
         for k in range(3):
             for i in range(2):

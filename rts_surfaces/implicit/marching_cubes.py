@@ -1,7 +1,7 @@
 """Marching cubes: the edges of a cell on which its triangles' corners lie, by the signs at the cell's corners.
 
-The table of the 256 cases is read off PyMCubes once, from 256 single cells. Values at lattice points only decide where
-on an edge a corner lies.
+The table of the 256 cases is read off PyMCubes once, from 256 single cells. The sizes of the values at lattice points
+decide only the place of a corner on its edge.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class Triangles(NamedTuple):
     Attributes:
         vertices: (V, 3) float32.
         faces: (T, 3) int32, counter-clockwise seen from outside.
-        ends: (V, 2) int32, the lattice points at the ends of the edge that a vertex lies on: by number, or by row of a
-            band. Twice the same point where the surface is capped there.
-        cells: (T,) int32, the cell that a triangle lies in: the number of its lowest corner, or its row of a band.
-        caps: (T,) int8, bit i is set where a triangle lies in the bounds' side across axis i.
-        differences: (V,) float32, by how much the field differs between the ends of an edge; 0 where capped.
+        ends: (V, 2) int32, the lattice points at the ends of each vertex's edge: their numbers, or their rows in a
+            band. Twice the same point if the vertex is on a cap.
+        cells: (T,) int32, the cell of each triangle: the number of its lowest corner, or its row in a band.
+        caps: (T,) int8; bit i is set if the triangle lies in the bounds' side across axis i.
+        differences: (V,) float32, the field's absolute difference between the ends of each vertex's edge; 0 on caps.
     """
 
     vertices: np.ndarray

@@ -1,8 +1,8 @@
 """Marching cubes, compiled: cells whose corners differ in sign, the vertices on their edges, their triangles.
 
-Cells are met layer by layer along x. Each owns the three edges that begin at its lowest corner, so that layers can be
-made side by side: the first loop counts, the second writes. So that every edge has an owner, there is one more cell
-along each axis than fit between the points; where the surface is closed there is one before the first point, too.
+Cells are processed layer by layer along x. Each cell owns the three edges that begin at its lowest corner, so that
+threads can work on different layers: the first loop counts, the second writes. So that every edge has an owner, there
+is one more cell along each axis than fit between the points; for a closed surface one lies before the first point, too.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rts.plugin_api.loops import compiled, loop
 
 @compiled(inline="always")
 def _signs(values, isovalue, sign, closed, x, out):
-    """Fill `out` with 1 for each point of plane x that is inside, with the cells' border around it."""
+    """Fill `out` with 1 for each point of plane x that is inside, else 0, and with the border of cells around it."""
     shape_x, shape_y, shape_z = values.shape
     outside = x < 0 or x >= shape_x
     if closed and outside:
@@ -38,7 +38,7 @@ def _signs(values, isovalue, sign, closed, x, out):
 
 @compiled(inline="always")
 def _codes(low, high, y, count, out):
-    """Fill `out` with the cases of a row of cells between two planes of signs."""
+    """Fill `out` with the cases, see `marching_cubes.cases`, of row y of cells between two planes of `_signs`."""
     a, b, c, d = low[y], high[y], low[y + 1], high[y + 1]
     for z in range(count):
         below = a[z] | b[z] << 1 | c[z] << 2 | d[z] << 3
@@ -48,7 +48,7 @@ def _codes(low, high, y, count, out):
 
 @compiled
 def _mixed(codes, count, found):
-    """Fill `found` with the cells of a row that are mixed, looked for by eights; returns how many there are."""
+    """Fill `found` with the cells of a row whose corners differ in sign; returns their number. Eight a test."""
     words, full, many = codes.view(np.uint64), np.uint64(0xFFFFFFFFFFFFFFFF), 0
     for w in range(len(words)):
         if words[w] == 0 or words[w] == full:
@@ -61,7 +61,7 @@ def _mixed(codes, count, found):
 
 @compiled
 def _crossed(code):
-    """A bit for each axis along which the edge that a cell owns is crossed."""
+    """Bits of the axes along which the edge that a cell owns is crossed, from the cell's case `code`."""
     own = code & 1
     return (own != code >> 1 & 1) | np.int64(own != code >> 2 & 1) << 1 | np.int64(own != code >> 4 & 1) << 2
 
@@ -111,15 +111,15 @@ def vertices(
         sign: see `of_lattice`.
         closed: see `of_lattice`.
         origin: (3,), the place of the first point.
-        step: (3,).
-        offsets: (layers, 3), how many cells, vertices and triangles lie in layers before.
+        step: (3,), the distance of neighbours along each axis.
+        offsets: (layers, 3), the numbers of mixed cells, vertices and triangles in the layers before.
         cells: (C,) to be filled: y * (number of cells along z) + z within its layer.
-        codes_of: (C,) to be filled: the case of each.
+        codes_of: (C,) to be filled: the case of each of `cells`.
         first_of: (layers, cells along y, cells along z), filled at mixed cells: eight times the first vertex that it
             owns, plus a bit for each axis along which its own edge is crossed.
-        ends: (V, 2) to be filled.
-        places: (V, 3) to be filled.
-        apart: (V,) to be filled.
+        ends: (V, 2) to be filled, see `Triangles`.
+        places: (V, 3) to be filled with `Triangles.vertices`.
+        apart: (V,) to be filled with `Triangles.differences`.
     """
     shape = values.shape
     border = 2 if closed else 1
@@ -146,7 +146,7 @@ def vertices(
 
 @compiled
 def _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart):
-    """Fill in the vertices on the edges that a cell owns, from this number on; the number of the next."""
+    """Fill in the vertices on the edges that a cell owns, from number `vertex` on. Returns the next free number."""
     shape = values.shape
     ax, ay, az = max(own[0], 0), max(own[1], 0), max(own[2], 0)
     for axis in range(3):
@@ -174,7 +174,7 @@ def _bit_count(x):
 def faces(
     start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
 ):
-    """Fill the triangles `out` (T, 3) of layers, with the cells and caps they belong to; see `Triangles`."""
+    """Fill the triangles `out` (T, 3) of layers, and the cell and the caps of each; see `Triangles`."""
     cells_z = first_of.shape[2]
     shift = 1 if closed else 0
     for x in range(start, stop):
@@ -203,17 +203,17 @@ def faces(
 
 @loop
 def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys, pairs):
-    """Fill the edges that corners of triangles lie on, for mixed cells in any order.
+    """Fill the edges on which corners of triangles lie, for mixed cells in any order.
 
     Args:
         corners: (C, 8) int32, rows of points.
-        virtual: (C,) uint8, a bit for each corner that is not the point itself, but one beyond it.
+        virtual: (C,) uint8, a bit for each corner that lies beyond the lattice, next to the point in `corners`.
         codes: (C,) uint8, the case of each cell.
         triangles_of: (256,).
         edges_of: (256, 5, 3).
         edges: (12, 2).
-        keys: (3 T,) to be filled: a number that each edge has in all cells that share it.
-        pairs: (3 T, 2) to be filled: the rows of its ends; twice the same row where one of them is virtual.
+        keys: (3 T,) to be filled: a number for each edge, the same in all cells that share the edge.
+        pairs: (3 T, 2) to be filled: the rows of the edge's ends; twice the same row if one end is virtual.
     """
     n = 0
     for c in range(len(codes)):

@@ -1,6 +1,6 @@
 """Operations that move an isosurface's samples with the field: along its gradient, or along the lattice's edges.
 
-Both take values (M,), params (N, P) in their dtype, and rows (N, 6) int32: the six values of each sample.
+Both take values (M,), params (N, P) in the values' dtype, and rows (N, 6) int32: indices of each sample's six values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
 """Shape, first point and step of a lattice."""
 
 _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
-"""Parameters of a sample: the weights of the six values, its place, and its motion for a unit of level."""
+"""Columns of a sample's parameters: the weights of the six values, its position, and its motion for a unit of level."""
 
 
 def _by_level(values: Array, params: Array, rows: Array, *, isovalue: float, sign: float) -> Array:
@@ -62,8 +62,9 @@ ALONG_NORMAL = Operation.of_loops(
     packed=(1, 2),
     packed_result=True,
 )
-"""(N, 3): where samples are, less their vector times the change of the level `sign * (value - isovalue)`, by weights
-of six values. A sample's params (16) are barycentrics, these weights, place, vector, and the sum at sampling."""
+"""Positions (N, 3) of samples: the position at sampling, less the motion for a unit of level, times the change of the
+level `sign * (value - isovalue)`. The value is a weighted sum of six. A sample's params (16) are barycentrics (3), the
+weights (6), the position (3), the motion (3), and the weighted sum of the values less the isovalue at sampling."""
 
 
 # ------------------------------------------------------------------------------------------------ along edges
@@ -83,7 +84,7 @@ def _by_crossings(
 
 
 def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """The place (N,) along an edge where the level is zero; its derivative as if the ends differed by `least`."""
+    """The place (N,) along an edge, 0 to 1, where the level is zero; derivatives are as if ends differed by `least`."""
     engine = engine_of(f_a)
     xp, apart = engine.namespace, f_b - f_a
     same = apart == 0
@@ -114,6 +115,6 @@ ALONG_EDGES = Operation.of_loops(
     packed=(1, 2, 3),
     packed_result=True,
 )
-"""(N, 3): the points of triangles whose corners lie where three edges of a lattice cross the isovalue. Its last operand
-are the numbers (N, 6) of the lattice points at their ends. A sample's params (4) are barycentrics, and by how much the
-ends of an edge are taken to differ at least, in derivatives."""
+"""Positions (N, 3) of samples in triangles whose corners lie where three edges of a lattice cross the isovalue. The
+last operand are the numbers (N, 6) of the lattice points at the edges' ends. A sample's params (4) are barycentrics
+(3), and the least difference of an edge's ends that derivatives assume."""

@@ -19,7 +19,7 @@ def along(
 def push_along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, moved: np.ndarray, out: np.ndarray, **given: float
 ) -> None:
-    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
     sign = values.dtype.type(given["sign"])
     parallel(_push, len(rows), moved, params, rows, sign, out, work=30 * len(rows))
 
@@ -27,7 +27,7 @@ def push_along(
 def pull_along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, g: np.ndarray, result: np.ndarray, **given: float
 ) -> None:
-    """Add to the gradient (M,) of the values, of that (N, 3) of the places."""
+    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
     _pull(g, params, rows, values.dtype.type(given["sign"]), result)
 
 
@@ -39,21 +39,21 @@ def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tu
 
 
 def push_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
-    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
     *given, moved, out = rest
     count, level = len(out), values.dtype.type(isovalue)
     parallel(_push_crossings, count, values, moved, *given, level, *lattice, out, work=60 * count)
 
 
 def pull_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
-    """Add to the gradient (M,) of the values, of that (N, 3) of the places."""
+    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
     *given, g, result = rest
     _pull_crossings(values, g, *given, values.dtype.type(isovalue), *lattice, result)
 
 
 @loop
 def _move(start, stop, values, params, rows, isovalue, sign, out):
-    """Fill the places (N, 3) of samples `start` to `stop`."""
+    """Fill the positions (N, 3) of samples `start` to `stop`."""
     for n in range(start, stop):
         level = -params[n, 15]
         for i in range(6):
@@ -64,7 +64,7 @@ def _move(start, stop, values, params, rows, isovalue, sign, out):
 
 @loop
 def _push(start, stop, tangents, params, rows, sign, out):
-    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
     for n in range(start, stop):
         level = tangents.dtype.type(0)
         for i in range(6):
@@ -75,7 +75,7 @@ def _push(start, stop, tangents, params, rows, sign, out):
 
 @loop
 def _pull(g, params, rows, sign, results):
-    """Add the gradients (M,) of the values, of those (N, 3) of the places."""
+    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
     for n in range(len(rows)):
         along = g[n, 0] * params[n, 12] + g[n, 1] * params[n, 13] + g[n, 2] * params[n, 14]
         if along != 0:
@@ -85,7 +85,7 @@ def _pull(g, params, rows, sign, results):
 
 @compiled(inline="always")
 def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
-    """The axis and length of edge k, and the place along it where the isovalue is crossed.
+    """The axis and length of edge k of sample n, and the place along the edge where the isovalue is crossed.
 
     Then the number that the derivative divides by; zero for an edge whose ends are one point.
     """
@@ -106,7 +106,7 @@ def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
 
 @loop
 def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
-    """Fill the places (N, 3) of samples `start` to `stop` whose corners slide along edges."""
+    """Fill the positions (N, 3) of samples `start` to `stop` whose corners slide along edges."""
     for n in range(start, stop):
         x = y = z = 0.0
         for k in range(3):
@@ -120,7 +120,7 @@ def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, ste
 
 @loop
 def _push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
-    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
     for n in range(start, stop):
         out[n] = 0
         for k in range(3):
@@ -132,7 +132,7 @@ def _push_crossings(start, stop, values, tangents, params, rows, numbers, isoval
 
 @loop
 def _pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
-    """Add the gradients (M,) of the values, of those (N, 3) of the places."""
+    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
     for n in range(len(rows)):
         if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
             continue

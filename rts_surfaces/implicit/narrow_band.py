@@ -1,4 +1,4 @@
-"""The narrow band of an implicit surface: the cells of a lattice that it passes through, at few evaluations."""
+"""The narrow band of an implicit surface: the cells of a lattice through which it passes, at few evaluations."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from rts_surfaces.implicit import narrow_band_loops as loops
 from rts_surfaces.implicit.lattice import Lattice
 
 Level = Callable[[np.ndarray], np.ndarray]
-"""A function of places (M, 3) float64 to levels (M,) float32 or float64: negative inside the surface, else not."""
+"""A function of points in space (M, 3) float64 to levels (M,) float32 or float64, negative inside the surface."""
 
 WORK = 5
-"""Nanoseconds for the evaluation at a place."""
+"""Nanoseconds to compute one point in space; decides how many threads share a loop."""
 ROUNDING = 4
 """Rounding error of a level, in units of the last digit of its scale: the Lipschitz bound times coordinates."""
 
@@ -61,7 +61,7 @@ class NarrowBand:
         lipschitz: the fastest change of the level, per unit of length; None if unknown.
         coarse: cells along each side of the first blocks, a power of two; None for 16 with a Lipschitz bound and 8
             without one.
-        margin: width, in coarse cells, of this margin. With a Lipschitz bound it does not count.
+        margin: width, in coarse cells, of this margin. It has no effect with a Lipschitz bound.
         chunk: the largest number of points at which the level is evaluated together.
 
     Raises:
@@ -149,7 +149,7 @@ class _Evaluate:
         return numbers, self._levels(loops.centres, numbers, blocks, side, self.shape, self.low, self.step)
 
     def slack(self, values: np.ndarray, lipschitz: float) -> float:
-        """The largest rounding error of levels."""
+        """The largest rounding error of levels (M,), from their dtype and the lattice's coordinates."""
         far = max(max(abs(x), abs(x + s * (n - 1))) for x, s, n in zip(self.low, self.step, self.shape, strict=True))
         return ROUNDING * float(np.finfo(values.dtype).eps) * lipschitz * far
 
@@ -171,11 +171,11 @@ class _Evaluate:
 
 
 class _Grid:
-    """Corners of blocks with one side, and the levels at known corners.
+    """Corners of blocks whose sides all have one length, and the levels at corners evaluated so far.
 
     Attributes:
-        numbers: (M,) int64, their numbers in the lattice.
-        values: (M,) the levels there.
+        numbers: (M,) int64, the numbers in the lattice of corners evaluated so far.
+        values: (M,), the levels at these corners.
     """
 
     def __init__(self, evaluate: _Evaluate, side: int):
@@ -202,7 +202,7 @@ class _Grid:
         self._keep(first, values)
 
     def corners(self, blocks: np.ndarray) -> np.ndarray:
-        """The rows (B, 8) of the corners of blocks; unknown levels are evaluated."""
+        """The rows (B, 8) of the corners of blocks in `numbers` and `values`; missing levels are evaluated."""
         first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
         rows, self.bricks, self._used, self._numbers, self._count = loops.numbered(
             blocks, self.side, self._evaluate.shape, self.counts, *state
@@ -271,7 +271,7 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
 
 
 def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the blocks whose corners differ in sign, and add blocks into which the surface continues."""
+    """The blocks whose corners differ in sign, and blocks into which the surface continues: (C, 3), and rows (C, 8)."""
     directory, bricks = _bricks(grid.counts, np.uint8)
     bricks, used = loops.marked(blocks, grid.counts, directory, bricks, 0)
     rows = grid.corners(blocks)

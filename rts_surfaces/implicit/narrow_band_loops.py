@@ -1,11 +1,11 @@
 """Blocks and points of narrow bands, compiled.
 
 Blocks of `side` cells an axis lie at multiples of the side; the last ones are cropped at the lattice's end. A block is
-named by its place among blocks, (x, y, z) int32. Their corners, too, form a grid: a corner (x, y, z) is the lattice's
-point (min(x side, X − 1), …). Corner i of a block has the offsets (i & 1, i >> 1 & 1, i >> 2 & 1).
+named by its index (x, y, z) int32 in the grid of blocks. Corners of blocks form a grid, too: a corner (x, y, z) is the
+lattice's point (min(x side, X − 1), …). Corner i of a block has the offsets (i & 1, i >> 1 & 1, i >> 2 & 1).
 
-What is known at corners is found through bricks of 4 × 4 × 4 of them: `directory` has the brick at each place, or −1,
-and `bricks` (B, 64) int32 the row of each corner, or −1. It imports numba.
+Rows of corners, in tables of levels, are looked up in bricks of 4 × 4 × 4 corners: `directory` has the brick at each
+place, or −1, and `bricks` (B, 64) int32 the row of each corner, or −1. It imports numba.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def centre_numbers(blocks, side, shape):
 
 @loop
 def near(blocks, values, side, shape, step, lipschitz, slack, closed):
-    """Choose the blocks which the surface may pass through, as far as the levels at their centres tell.
+    """Choose the blocks through which the surface may pass, judging by the levels at their centres.
 
     Args:
         blocks: (B, 3) int32.
@@ -114,7 +114,7 @@ def near(blocks, values, side, shape, step, lipschitz, slack, closed):
 
 @loop
 def widened(blocks, margin, counts):
-    """Add all blocks that are so many blocks away, or fewer, along each axis: (K, 3), in the order of the grid."""
+    """The blocks, and all blocks at most `margin` blocks away along each axis: (K, 3), in the order of the grid."""
     marked = np.zeros(counts, np.bool_)
     for b in range(len(blocks)):
         x, y, z = blocks[b]
@@ -144,7 +144,7 @@ def _grown(array, count):
 
 @compiled
 def _brick(x, y, z, counts):
-    """The place of a corner's brick, and the corner's place in it. There is one corner more than blocks."""
+    """The index of a corner's brick in the directory, and of the corner in its brick; `counts` are those of blocks."""
     place = ((x >> SHIFT) * ((counts[1] >> SHIFT) + 1) + (y >> SHIFT)) * ((counts[2] >> SHIFT) + 1) + (z >> SHIFT)
     return place, (((x & MASK) << SHIFT | y & MASK) << SHIFT) | z & MASK
 
@@ -193,7 +193,7 @@ def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, coun
 
 @loop
 def given_rows(known, side, shape, counts, directory, bricks, used, numbers, count):
-    """Give rows to points of the lattice (M,) by number, all different and without rows; else like `numbered`."""
+    """Give rows to lattice points `known` (M,), by number, all different and without rows; see `numbered`."""
     for m in range(len(known)):
         number = known[m]
         xy = number // shape[2]
@@ -238,7 +238,7 @@ OPPOSITE = 0b111
 
 @compiled
 def _inside(rows, b, values):
-    """The corners of block b that are inside, as bits."""
+    """The corners of block b whose levels are negative, inside, as bits."""
     inside = 0
     for i in range(8):
         inside |= (values[rows[b, i]] < 0) << i
@@ -259,7 +259,7 @@ def _border(blocks, b, counts):
 
 @loop
 def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step, lipschitz, slack, closed):
-    """Halve blocks of two cells a side; choose the cells whose corners may differ in sign, as far as levels tell.
+    """Halve blocks of two cells a side into cells, and choose those whose corners may differ in sign.
 
     Each cell of a block that is not cropped has the block's centre and one of its corners as opposite corners.
 

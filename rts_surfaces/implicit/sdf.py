@@ -1,4 +1,4 @@
-"""Surfaces of fields that rays are cast at: signed distances, and any other function of space."""
+"""Surfaces of fields, found by casting rays: of signed distances, and of any other function of space."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from rts_surfaces.implicit.fields import swept_sphere
 class Sdf(Implicit, RaySurface):
     """The surface of a field within a ball, found by rays: of a signed distance, or of any other function of space.
 
-    A sample is the point where a ray meets the surface, and it moves along the surface's normal as θ changes: with f
-    the field and w = ∇f / |∇f|², at the point x₀ where it was found, it is x₀ − f(θ, x₀) w. Along the ray it would
-    never leave its pixel, and outlines would have no derivative.
+    A sample is the point x₀ where a ray meets the surface, and it moves along the surface's normal as θ changes: its
+    position is x₀ − f(θ, x₀) w, with f the field and w = ∇f / |∇f|² at x₀. If it moved along the ray, it would never
+    leave its pixel, and outlines would have no derivative.
 
-    The ball cuts off what is outside of it, and there should be as little of it around the surface as can be.
+    The ball cuts off parts of the surface outside of it; it should enclose the surface tightly.
 
     Args:
-        f: (θ, points (M, 3)) → (M,), in array code; see `Field`. A ready-made one is in `rts_surfaces.implicit.fields`.
-        radius: of the ball, in the units of the points.
-        center: (3,), of the ball.
+        f: (θ, points (M, 3)) → (M,), in array code; see `Field`. `rts_surfaces.implicit.fields` has ready-made ones.
+        radius: the radius of the ball, in the units of the points.
+        center: (3,), the centre of the ball.
         isovalue: the value of `f` on the surface.
         inside: which values are inside, "below" the isovalue or "above" it.
         lipschitz: a number that the slope of `f` nowhere exceeds, 1 for distances. If it is too small, rays miss parts
-            of the surface. None if there is none: rays then take steps of one length, and cost more.
+            of the surface. None if unknown: rays then take steps of one length, and cost more.
         reads: the names of the entries of θ that `f` reads; None for all.
         attributes: name → g(θ, positions (N, 3)) → (N, C), further entries of the G-buffer; see `Implicit`.
         steps: the number of shortest steps across the ball: parts thinner than one step may be missed. None

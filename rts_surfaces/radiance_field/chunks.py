@@ -1,4 +1,4 @@
-"""Functions of many rows, called on some at a time so that memory stays bounded; and their progress bar."""
+"""Functions of many rows, called on some rows at a time so that memory stays bounded; and a progress bar."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ CHUNK = 8192
 
 
 def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
-    """The result of `f(*arrays)`, computed from `rows` rows at a time, and once more for its gradient.
+    """The result of `f(*arrays)`, computed from at most `rows` rows at a time, and once more for its gradient.
 
     Args:
-        f: arrays (M, ·) → (M, ·), each row from its own row alone.
+        f: arrays (M, ·) → (M, ·); each row of the result depends on the same row of the arrays alone.
         rows: the largest number of rows at a time.
         *arrays: (N, ·) each, of one engine.
 
     Returns:
-        (N, ·). Between value and gradient only results are kept, where the engine can (`Engine.checkpoint`).
+        (N, ·). From value to gradient only results stay in memory, if the engine supports that (`Engine.checkpoint`).
     """
     count = arrays[0].shape[0]
     if count <= rows:
@@ -35,7 +35,7 @@ def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
 
 
 def fast_engine() -> Engine:
-    """The engine for networks whose arrays are NumPy's: torch, which uses all cores, where it is installed."""
+    """The engine for networks whose arrays are NumPy's: torch, which uses all cores, if installed; else NumPy."""
     try:
         import torch
     except ImportError:
@@ -45,12 +45,12 @@ def fast_engine() -> Engine:
 
 @contextlib.contextmanager
 def progress_bar(wanted: bool | None, what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error, and the function that moves it on by a number.
+    """A progress bar on standard error; the context's value is a function that advances the bar by a number.
 
     Args:
-        wanted: True to show it; None to do so in a terminal.
+        wanted: True to show the bar; None to show it in a terminal only.
         what: the work's name, for the bar.
-        total: the number that makes it full.
+        total: the number at which the bar is full.
     """
     if wanted is False or (wanted is None and not sys.stderr.isatty()):
         yield lambda count: None

@@ -1,4 +1,4 @@
-"""Radiance fields in files: weights of two networks, read and written, never unpickled."""
+"""Radiance fields, the weights of two networks each, read from files and written to files, never unpickled."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class RadianceField:
 
     Attributes:
         weights: {"coarse": network, "fine": network}, nested dicts and lists of arrays of any engine (float32 NumPy as
-            loaded): see `rts_surfaces.radiance_field.network.check_network`. As θ["weights"] of a part, one network.
+            loaded): see `rts_surfaces.radiance_field.network.check_network`. θ["weights"] of a part is one of the two.
 
     Raises:
         InputError: a network is missing, or its weights do not fit together.
@@ -75,10 +75,11 @@ class RadianceField:
         """Densities on a lattice, (X, Y, Z) float32; see `rts_surfaces.radiance_field.lattice`.
 
         Args:
-            bounds: ((x0, y0, z0), (x1, y1, z1)) in the field's space, both points of the lattice.
+            bounds: ((x0, y0, z0), (x1, y1, z1)) in the field's space, the first and the last point of the lattice.
             shape: (X, Y, Z), at least 2 each.
             network: "fine" or "coarse".
-            keep: True to keep them in the user's cache and to find them there; a folder for that; False for neither.
+            keep: True to keep densities in the user's cache and to look for them there; a folder in place of the cache;
+                False for neither.
             progress: True to show a progress bar; None to do so in a terminal.
 
         Raises:
@@ -98,8 +99,8 @@ def load_radiance_field(path: Any) -> RadianceField:
     (out, in), coarse.layer1.bias (out,), coarse.layers_xyz.0.weight, …, coarse.fc_alpha.weight, coarse.fc_feat.weight,
     coarse.layers_dir.0.weight, coarse.fc_rgb.weight, and so on for fine. Nothing is unpickled.
 
-    As a surface light field, it is a part with the shader "radiance" and one network of it as θ["weights"], on a
-    surface such as where `lattice`, the density, is 50.
+    To draw the field as a surface light field, take a part with the shader "radiance" and one of its networks as
+    θ["weights"]. Its surface may be the isosurface of the density, `lattice`, at the value 50.
 
     Returns:
         An object with `weights`, {"coarse": network, "fine": network} of float32 NumPy arrays; `architecture(network)`;
@@ -148,7 +149,7 @@ def load_radiance_field(path: Any) -> RadianceField:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz, as float32."""
+    """The arrays of an .npz by name, as float32; an error is raised if one is not of finite floating numbers."""
     arrays = {}
     try:
         # NumPy leaves files open that are damaged, if it opens them.

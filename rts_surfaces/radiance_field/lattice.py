@@ -20,7 +20,7 @@ from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, progress_bar
 from rts_surfaces.radiance_field.network import density, placed
 
 VERSION = b"rts density lattice 1"
-"""Changes when lattices that are kept no longer hold."""
+"""Part of the names of kept files: to be changed when densities would be computed differently."""
 
 
 def lattice(
@@ -40,8 +40,8 @@ def lattice(
             lattice.
         shape: (X, Y, Z), at least 2 each.
         network: "fine" or "coarse".
-        keep: where to keep the lattice, and to look for it: True for the user's cache, a folder, or False for nowhere.
-            It goes by weights, bounds and shape. What is damaged there is computed anew.
+        keep: where to keep the densities, and to look for them: True for the user's cache, a folder, or False for
+            nowhere. Weights, bounds and shape make the file's name. A damaged file is computed anew.
         progress: True to show a progress bar; None to do so in a terminal.
 
     Returns:
@@ -79,7 +79,7 @@ def _computed(weights: Any, points: Lattice, progress: bool | None) -> np.ndarra
 
 
 def _key(weights: Any, points: Lattice) -> str:
-    """A name that changes with weights and points."""
+    """A hash of the weights, the lattice and `VERSION`, for the name of a kept file."""
     digest = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
     for place, array in placed(weights):
         digest.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
@@ -87,7 +87,7 @@ def _key(weights: Any, points: Lattice) -> str:
 
 
 def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
-    """The lattice in a file; None if the file is missing or damaged (zip files hold checksums)."""
+    """The densities (X, Y, Z) in a file; None if the file is missing or damaged (zip files hold checksums)."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             values = file["density"]
@@ -97,7 +97,7 @@ def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
 
 
 def _keep(path: Path, values: np.ndarray) -> None:
-    """Write a lattice, in one step: readers find it whole or not at all. Where nothing can be written, nothing is."""
+    """Write densities, in one step: readers find them whole or not at all. If writing fails, no file is left."""
     draft = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

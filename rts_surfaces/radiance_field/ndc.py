@@ -1,7 +1,7 @@
 """Normalised device coordinates of forward-facing scenes, in which their radiance fields are trained.
 
-A camera at the origin that looks along −z sees the world beyond its near plane; NDC bring that into the cube [−1, 1]³,
-infinity to z = 1 (Mildenhall et al. 2020, appendix C). Straight lines stay straight.
+A camera at the origin that looks along −z sees the world beyond its near plane. NDC map the visible space into the cube
+[−1, 1]³, infinity to z = 1 (Mildenhall et al. 2020, appendix C). Straight lines stay straight.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rts.plugin_api.arrays import Array, constants, exemplar, from_numbers, shap
 from rts.plugin_api.checks import check_positive, is_count, quoted
 
 NEAREST, FARTHEST = 1e-6, 1e6
-"""Depths, over that of the near plane, to which points behind the camera and at infinity are brought."""
+"""Depths, in multiples of the near plane's, at which points behind the camera and points at infinity are placed."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Ndc:
 
     @classmethod
     def of_images(cls, size: tuple[int, int], focal: float, near: float = 1.0) -> Ndc:
-        """NDC of images of a size (height, width) and a focal length in their pixels.
+        """NDC of images of a size (height, width) in pixels, with a focal length in pixels.
 
         Raises:
-            InputError: no positive numbers.
+            InputError: an argument is not positive.
         """
         height, width = checked_size(size)
         check_positive("focal", focal)
@@ -48,7 +48,7 @@ class Ndc:
         return cls((2 * float(focal) / width, 2 * float(focal) / height), float(near))
 
     def from_world(self, points: Array) -> Array:
-        """NDC (N, 3) of world points (N, 3); those behind the camera as if they were just before it."""
+        """NDC (N, 3) of world points (N, 3); points behind the camera count as just before it."""
         points = _checked("points", points)
         xp = namespace(points)
         depth = _at_least(-points[:, 2], NEAREST * self.near)
@@ -56,7 +56,7 @@ class Ndc:
         return xp.stack([x, y, 1 - 2 * self.near / depth], axis=1)
 
     def to_world(self, points: Array) -> Array:
-        """World points (N, 3) of NDC (N, 3); those at infinity and beyond at a depth of a million near planes."""
+        """World points (N, 3) of NDC (N, 3); those at infinity and beyond get the depth of a million near planes."""
         points = _checked("points", points)
         xp = namespace(points)
         depth = 2 * self.near / _at_least(1 - points[:, 2], 2 / FARTHEST)
@@ -88,7 +88,7 @@ class Ndc:
 
 
 def checked_size(size: Any) -> tuple[int, int]:
-    """The size (height, width) of an image; anything but two positive integers is refused."""
+    """The size (height, width) of an image as integers; an error is raised if it is not two positive integers."""
     sides = tuple(size) if isinstance(size, (tuple, list, np.ndarray)) else ()
     if len(sides) != 2 or not all(map(is_count, sides)):
         raise InputError(f"size is {quoted(size)}; expected (height, width), two positive integers")
@@ -96,7 +96,7 @@ def checked_size(size: Any) -> tuple[int, int]:
 
 
 def _checked(name: str, points: Any) -> Array:
-    """Rows of three numbers, refused where they are something else."""
+    """The array (N, 3) of points; an error is raised if it has another shape."""
     points = from_numbers(points, name)
     if len(shape_of(points)) != 2 or points.shape[1] != 3:
         raise InputError(f"{name} has shape {shape_of(points)}; expected (N, 3)")

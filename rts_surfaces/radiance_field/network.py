@@ -1,14 +1,14 @@
-"""The network of a radiance field as functions of its weights, in NumPy, torch and jax by the one code.
+"""The network of a radiance field as functions of its weights; one code for NumPy, torch and jax.
 
     x = encoded(position), d = encoded(direction)
-    h = layer1 x (no ReLU), then h = ReLU(layers_xyz h) for each of these
+    h = layer1 x (no ReLU), then h = ReLU(layer h) for each layer of layers_xyz
     density = ReLU(fc_alpha h)
-    g = ReLU(fc_feat h), then g = ReLU(layers_dir [g, d])
+    g = ReLU(fc_feat h), then g = ReLU(layers_dir.0 [g, d]), then g = ReLU(layer g) for each later one of layers_dir
     rgb = sigmoid(fc_rgb g)
 
 as in Mildenhall et al. 2020 (NeRF), in the smaller form of krrish94/nerf-pytorch. A layer is {"weight": (out, in),
-"bias": (out,)}, and maps x to weight x + bias. Shapes of weights tell everything else: how many layers there are, how
-wide, and how many frequencies encode positions and directions.
+"bias": (out,)}, and maps x to weight x + bias. The weights tell the number and widths of layers, and how many
+frequencies encode positions and directions.
 
 Weights that are NumPy arrays are constants beside points of any engine. Results have the dtype of the points.
 """
@@ -32,8 +32,8 @@ class Architecture(NamedTuple):
     Attributes:
         position_levels: frequencies that encode positions: 2⁰ to 2^(levels − 1).
         direction_levels: frequencies that encode directions.
-        width: units of the layers that density is computed from.
-        layers: the number of these layers, the first included.
+        width: units of the layers from which density is computed, layer1 and layers_xyz.
+        layers: the number of these layers.
         parameters: the number of weights.
     """
 
@@ -45,7 +45,7 @@ class Architecture(NamedTuple):
 
 
 def check_network(weights: Any, name: str = "the network") -> Architecture:
-    """The architecture of a network, refused where layers are missing, or their shapes do not fit together.
+    """The architecture of a network; an error is raised if layers are missing, or their shapes do not fit together.
 
     Args:
         weights: {"layer1": layer, "layers_xyz": [layer, …], "fc_alpha", "fc_feat", "layers_dir": [layer, …],
@@ -53,7 +53,7 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
         name: the network's name in errors.
 
     Raises:
-        InputError: it is none; the message names the layer.
+        InputError: the weights are of no such network; the message names the layer.
     """
     if not isinstance(weights, Mapping):
         raise InputError(f"{name} is {quoted(weights)}; expected a dict of layers {', '.join(SINGLE + REPEATED)}")
@@ -122,7 +122,7 @@ def encoding(vectors: Array, levels: int) -> Array:
 
 
 def density(weights: Mapping[str, Tree], points: Array) -> Array:
-    """Volume density σ at points: the share of its light that a ray loses per unit of length in the field's space.
+    """Volume density σ at points: the share of light that a ray loses per unit of length in the field's space.
 
     Args:
         weights: a network, see `check_network`.

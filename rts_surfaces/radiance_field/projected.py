@@ -1,7 +1,8 @@
-"""Surfaces in NDC, mapped to the world: so a camera draws a forward-facing radiance field.
+"""Surfaces in NDC (see `ndc`), mapped to the world: so a camera draws a forward-facing radiance field.
 
 The map between NDC and the world keeps planes and straight lines, so triangles stay triangles; but it does not keep the
-middle of a side. A corner at depth d_k has barycentric λ_k in the world. In NDC it is λ_k d_k, over the sum of these.
+middle of a side. If λ_k are barycentrics of a point in the world, and d_k the depths of the triangle's corners, its
+barycentrics in NDC are λ_k d_k, divided by their sum.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from rts.plugin_api.records import ArraySpec, Proxy, Rays, Samples
 from rts_surfaces.radiance_field.ndc import Ndc
 
 DEEPEST = 1e4
-"""Depth, over the near plane's, beyond which triangles are left out: rounding moves them too far in the world."""
+"""Depth, in multiples of the near plane's, beyond which triangles are left out: rounding would move them too far."""
 
 
 class Projected(TriangleSurface):
-    """A surface of NDC in the world: its triangles, its points and its normals, differentiable in θ.
+    """A surface in NDC, mapped to the world: its triangles, its points and its normals, differentiable in θ.
 
-    Its G-buffer has position and normal, if that surface has them, and further entries as they are.
+    The G-buffer has position and normal, if the surface in NDC has them, in the world; further entries are unchanged.
 
     Args:
         surface: a surface in NDC, such as an isosurface. Its triangles must not depend on the camera. Before `refine`
@@ -33,7 +34,7 @@ class Projected(TriangleSurface):
         ndc: the map between the world and NDC.
 
     Raises:
-        InputError: another surface.
+        InputError: the surface is not of this kind, or `ndc` is no `Ndc`.
     """
 
     refine_moves = False
@@ -81,7 +82,7 @@ class Projected(TriangleSurface):
         return self.surface.proxy_inputs(theta)
 
     def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
-        """The surface's triangles, seen from the world; they carry the depths of their corners, as bits of floats."""
+        """The surface's triangles in the world; the last three ids of each are depths of corners, as bits of floats."""
         inner = self.surface.proxy(inputs, camera, size)
         vertices = np.asarray(inner.vertices, np.float64)
         world = self.ndc.to_world(vertices)
@@ -94,7 +95,7 @@ class Projected(TriangleSurface):
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """One piece, as of any surface that refines samples without moving them: an isosurface."""
+        """One piece: an isosurface winds all its triangles by which side is inside."""
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:

@@ -21,13 +21,13 @@ from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
 class RadianceShader(Shader):
     """The colour that a network θ["weights"] gives a sample, seen along its ray (Miller et al. 1998, NeRF).
 
-    Colours are as the network gives them, in the encoding of the images that it was trained on: sRGB, as a rule. For
-    linear ones, decode the image.
+    Colours are in the encoding of the images on which the network was trained: sRGB, as a rule. For linear colours,
+    decode the rendered image.
 
     Attributes:
-        ndc: the map from the world to the network's space, or None where that is the world.
-        chunk: samples at a time. In torch and jax only their colours are kept for the gradient, which computes the rest
-            anew, so that memory stays bounded.
+        ndc: the map from the world to the network's space; None if the network's space is the world.
+        chunk: number of samples evaluated at a time. In torch and jax only their colours are kept for the gradient,
+            which computes the rest anew, so that memory stays bounded.
     """
 
     ndc: Ndc | None = None

@@ -16,7 +16,7 @@ from rts_surfaces.radiance_field.ndc import Ndc, checked_size
 from rts_surfaces.radiance_field.network import density_and_radiance
 
 RAYS = 512
-"""Rays at a time."""
+"""Number of rays rendered at a time."""
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LAST = 1e10
 """Length of the last interval of a ray, which has no end."""
@@ -48,22 +48,22 @@ def volume_render(
     ndc: Ndc | None = None,
     progress: bool | None = None,
 ) -> VolumeImage:
-    """The image of a radiance field by quadrature along rays, as NeRF's test mode: without noise; no derivatives.
+    """The image of a radiance field by quadrature along rays, without noise and derivatives, as in NeRF's test mode.
 
-    The coarse network is evaluated at N_c equal steps of depth; N_f more samples are placed where it has weight, by
-    the inverse of their distribution; the fine network is evaluated at all of them (Mildenhall et al. 2020, §4 and 5).
-    It is what surface light fields are compared with. By torch where that is installed, else by NumPy.
+    The coarse network is evaluated at N_c equal steps of depth. Its samples' weights are a distribution along the ray,
+    by whose inverse N_f more samples are placed. The fine network is evaluated at all samples (Mildenhall et al. 2020,
+    §4 and 5). Surface light fields are compared with this image. Computed by torch if installed, else by NumPy.
 
     Args:
-        field: what `load_radiance_field` gives; its weights may be arrays of any engine.
-        camera: a perspective camera; rays pass through the centres of its pixels (for NeRF's own, cameras of
+        field: the result of `load_radiance_field`; its weights may be arrays of any engine.
+        camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras of
             `load_views` with `pixel_center`).
-        size: (height, width).
+        size: (height, width) in pixels.
         near: depth at which rays begin; default 2, as in NeRF's Blender scenes; with `ndc`, always its near plane.
-        far: depth at which they end; default 6; with `ndc`, always infinity.
-        samples: (N_c, N_f).
-        background: what is behind: "white", "black" or a colour (3,); None for transparency.
-        ndc: the map from the world to the field's space, or None where that is the world.
+        far: depth at which rays end; default 6; with `ndc`, always infinity.
+        samples: (N_c, N_f), at least 3 and 1.
+        background: the colour behind the field: "white", "black" or (3,); None for transparency.
+        ndc: the map from the world to the field's space; None if the field's space is the world.
         progress: whether to show a progress bar; None to do so in a terminal.
 
     Returns:
@@ -71,7 +71,7 @@ def volume_render(
         the images that the field was trained on; `coarse` and `fine`, the evaluations of each network.
 
     Raises:
-        InputError: an argument is none of these, or the camera is orthographic.
+        InputError: an argument is wrong, or the camera is orthographic.
     """
     height, width = checked_size(size)
     near, far = _planes(near, far, ndc)
@@ -116,7 +116,7 @@ def volume_render(
 
 
 def _planes(near: float | None, far: float | None, ndc: Ndc | None) -> tuple[float, float]:
-    """The parameters of rays at which they begin and end."""
+    """The ray parameters t at which rays begin and end: depths, or 0 and 1 with `ndc`."""
     if ndc is not None and not isinstance(ndc, Ndc):
         raise InputError(f"ndc is {quoted(ndc)}; expected an Ndc, or None")
     if ndc is not None and not near is far is None:
@@ -143,7 +143,7 @@ def _color(background: Any) -> np.ndarray:
 
 
 def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
-    """A function of origins, directions, unit directions (R, 3) and depths (R, S): colours and density (R, S, 4)."""
+    """A function (origins, directions, unit directions (R, 3) each, depths (R, S)) → colours and density (R, S, 4)."""
     engine = fast_engine()
     weights = constants(field.on_host()[name], engine, None)
     xp = engine.namespace
@@ -162,7 +162,7 @@ def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
 
 
 def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied RGBA (R, 4), and the weight of each sample (R, S)."""
+    """Premultiplied RGBA (R, 4) of rays, and the weight (R, S) of each sample in it, from radiance (R, S, 4)."""
     lengths = np.concatenate([np.diff(t, axis=1), np.full_like(t[:, :1], LAST)], axis=1)
     lengths = lengths * np.linalg.norm(directions, axis=1, keepdims=True)
     passed = np.exp(-radiance[..., 3] * lengths)
@@ -173,7 +173,7 @@ def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> 
 
 
 def _placed(t: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
-    """Depths (R, count) at equal steps of the distribution that the weights (R, S) of samples at t (R, S) make."""
+    """Depths (R, count) at equal steps of the cumulative distribution of the weights (R, S) of samples at t (R, S)."""
     edges = (t[:, 1:] + t[:, :-1]) / 2
     share = weights[:, 1:-1] + np.float32(1e-5)
     total = np.cumsum(share / share.sum(axis=1, keepdims=True), axis=1)

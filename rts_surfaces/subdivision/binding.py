@@ -1,6 +1,6 @@
 """OpenSubdiv's limit surfaces with NumPy in and out: cages, weights of their control points, points, rays.
 
-All loops run without the interpreter lock, on all cores. What is made of a cage is only read afterwards.
+All loops run without the interpreter lock, on all cores. OpenSubdiv's objects are only read once they are made.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.cage import Cage
 
 SMOOTH, SHARP = 10, 10
-"""Levels to which Bfr isolates extraordinary vertices and creases: as many as it has. It isolates nothing further than
-the second says. Its defaults, 2 and 6, are off by up to 5e-3 of the extent; 8 and 8 by 1e-4, at spot's ears and at
-semi-sharp creases of sharpness 7; 10 and 10 by 2e-5 there, at the same cost, and by nothing farther than 2⁻¹⁰ of a face
-from such vertices."""
+"""Levels to which Bfr, OpenSubdiv's evaluator, isolates extraordinary vertices and creases: the largest possible. The
+second limits the first. Bfr's defaults, 2 and 6, are off by up to 5e-3 of the extent; 8 and 8 by 1e-4, at spot's ears
+and at semi-sharp creases of sharpness 7; 10 and 10 by 2e-5 there, at the same cost. Farther than 2⁻¹⁰ of a face from
+such vertices, 10 and 10 are exact."""
 MOST_NUMBERS = 2**28
-"""Numbers that the table of control points may have: a gigabyte."""
+"""The most numbers in the table of control points: a gigabyte."""
 
 SCHEMES = {"catmark": 1, "loop": 2}
 BOUNDARIES = {"none": 0, "edge_only": 1, "edge_and_corner": 2}
 UV_RULES = {"none": 0, "corners_only": 1, "corners_plus1": 2, "corners_plus2": 3, "boundaries": 4, "all": 5}
-"""Values of OpenSubdiv's options, by names as in USD."""
+"""Values of OpenSubdiv's options, by their names in USD."""
 
 NONE, QUAD, TRIANGLE, SUBFACES = -1, 0, 1, 2
-"""Kinds of faces: without a limit surface; with parameters in the unit square; in the triangle (0, 0), (1, 0), (0, 1);
-in sub-faces, one a corner, each a square of half the size."""
+"""Kinds of faces: without a limit surface; with parameters in the unit square; with parameters in the triangle (0, 0),
+(1, 0), (0, 1); with sub-faces, one a corner, each with parameters in its own square of side 1/2."""
 VERTEX, UV = 0, 1
 """Kinds of data that are subdivided: of vertices, or face-varying."""
 
@@ -44,7 +44,7 @@ class Rules(NamedTuple):
         chaikin: True to smooth the sharpness of a crease along it by Chaikin's rule.
         uv: a key of `UV_RULES`: the places where face-varying data is interpolated linearly.
         smooth: the level to which extraordinary vertices are isolated.
-        sharp: the level to which creases are.
+        sharp: the level to which creases are isolated; it limits `smooth`, too.
     """
 
     boundary: str = "edge_and_corner"
@@ -70,19 +70,19 @@ class _Description(ctypes.Structure):
 
 
 class Limit:
-    """The limit surface of a cage, whatever its control points. Freed when garbage-collected.
+    """The limit surface of a cage, for any control points. Its C++ memory is freed when it is garbage-collected.
 
     Args:
         cage: a cage that has been checked.
-        rules: how it is subdivided.
+        rules: the rules of subdivision; None for the default ones.
         uv: (H,) int32, the row of face-varying data of each corner of each face, or None.
 
     Attributes:
-        table: (F, W) int32, the vertices that each face depends on, filled up with one of them; read-only.
-        uv_table: (F, W') int32, the rows of face-varying data that it depends on; None without such data.
-        kinds: (F,) int32.
-        used: the vertices that faces refer to, in order; read-only.
-        corners: (H, 2) float64, parameters of the corners of each face; of sub-faces where they begin.
+        table: (F, W) int32, the vertices on which each face depends, padded with one of them; read-only.
+        uv_table: (F, W') int32, the rows of face-varying data on which each face depends; None without such data.
+        kinds: (F,) int32, `NONE`, `QUAD`, `TRIANGLE` or `SUBFACES`.
+        used: int32, the vertices that faces refer to, in order; read-only.
+        corners: (H, 2) float64, parameters at the corners of each face; for sub-faces their least parameters.
 
     Raises:
         InputError: OpenSubdiv refuses the cage, or its faces depend on too many vertices.
@@ -167,7 +167,7 @@ class Limit:
             channel: `VERTEX` or `UV`.
 
         Raises:
-            InputError: there is no such face, or parameters lie far outside of theirs.
+            InputError: there is no such face, or parameters lie far outside of their face.
         """
         out = np.empty((len(faces), self._width(channel)), dtype)
         self._stencils(faces, params, channel, out, None, None)
@@ -178,8 +178,8 @@ class Limit:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Weights (N, W) for the derivatives along u and along v; see `stencils`.
 
-        Where they are parallel whatever the control points, as at the corner of a sheet with a smooth boundary, they
-        are those of a point beside it.
+        At points whose derivatives are parallel for any control points, as at the corner of a sheet with a smooth
+        boundary, the weights are those of a point beside.
         """
         along_u, along_v = np.empty((2, len(faces), self._width(VERTEX)), dtype)
         self._stencils(faces, params, VERTEX, None, along_u, along_v)
@@ -202,7 +202,7 @@ class Limit:
         parallel(some, len(faces), work=500 * len(faces))
 
     def _samples(self, faces: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Faces and parameters as the library takes them."""
+        """Checked faces (N,) int32 and parameters (N, 2) float64, contiguous, as the C++ library takes them."""
         faces, params = np.ascontiguousarray(faces, np.int32), np.ascontiguousarray(params, np.float64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(self.kinds):
             raise InputError(f"samples lie on faces {faces.min()} to {faces.max()} of {len(self.kinds)}; sample anew")
@@ -218,7 +218,7 @@ class Limit:
 
 
 class Points:
-    """The limit surface of a cage whose vertices are known. Freed when garbage-collected.
+    """The limit surface of a cage for given vertices. Its C++ memory is freed when it is garbage-collected.
 
     Args:
         limit: the limit surface.
@@ -226,7 +226,7 @@ class Points:
     """
 
     def __init__(self, limit: Limit, vertices: np.ndarray):
-        self.limit = limit  # It must live as long.
+        self.limit = limit  # The limit must live as long as these points.
         if np.ndim(vertices) != 2 or np.shape(vertices)[1] != 3 or len(vertices) <= limit.used[-1]:
             raise InputError(
                 f"vertices have shape {np.shape(vertices)}; expected (V, 3), V at least {limit.used[-1] + 1}"
@@ -251,11 +251,12 @@ class Points:
         Args:
             faces: (N,) integers.
             params: (N, 2) float.
-            derivatives: 0, 1 or 2, up to which order. In OpenSubdiv 3.5.0 all second derivatives have the wrong sign in
-                those triangles of Loop's subdivision that are turned round, such as the middle one of four.
+            derivatives: the highest order of derivatives, 0, 1 or 2. In OpenSubdiv 3.5.0 all second derivatives have
+                the wrong sign in those triangles of Loop's subdivision that are turned round, such as the middle one of
+                four.
 
         Raises:
-            InputError: there is no such face, or parameters lie far outside of theirs.
+            InputError: there is no such face, or parameters lie far outside of their face.
         """
         faces, params = self.limit._samples(faces, params)
         out = np.empty((len(faces), (1, 3, 6)[derivatives], 3))
@@ -279,8 +280,8 @@ class Points:
         """Hits of rays with the surface, by Newton's method from samples nearby.
 
         Args:
-            faces: (N,) integers, where to start.
-            params: (N, 2) float.
+            faces: (N,) integers, the faces of the samples.
+            params: (N, 2) float, the parameters of the samples.
             origins: (N, 3) float.
             directions: (N, 3) float; the point at depth z is `origin + z direction`.
             spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
@@ -306,7 +307,7 @@ class Points:
 
 
 def _leave(library: ctypes.CDLL, left: list[int], points: int) -> None:
-    """Keep the memory of one `Points`."""
+    """Keep the memory of one `Points` for the next; free it if some is kept already."""
     if left:
         library.rts_points_free(points)
     else:
@@ -316,5 +317,5 @@ def _leave(library: ctypes.CDLL, left: list[int], points: int) -> None:
 def _free(library: ctypes.CDLL, cage: int, left: list[int]) -> None:
     for points in left:
         library.rts_points_free(points)
-    left[:] = [0]  # Of points that are freed later, in a cycle, nothing is kept.
+    left[:] = [0]  # So that `_leave` frees points that are collected later, in a cycle, and keeps none.
     library.rts_cage_free(cage)

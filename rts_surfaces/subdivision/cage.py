@@ -21,8 +21,8 @@ INFINITE = 10
 """The least sharpness of a crease or corner that OpenSubdiv treats as infinitely sharp."""
 
 MOST, MOST_AROUND = 256, 2000
-"""Limits: on corners of a face and faces at a vertex; and on corners of the faces that touch a face. With ten times as
-many, OpenSubdiv takes minutes, or ends the process."""
+"""Limits: the most corners of a face and faces at a vertex; and the most corners of all faces that touch a face. With
+ten times as many, OpenSubdiv takes minutes, or ends the process."""
 
 
 class Cage(NamedTuple):
@@ -33,11 +33,11 @@ class Cage(NamedTuple):
         sizes: (F,) int32, the number of corners of each face.
         first: (F + 1,) int32, the first half edge of each face.
         indices: (H,) int32, the vertices at the corners of all faces.
-        twins: (H,) int32, the half edge that runs the other way, or −1 at a boundary.
-        creases: (C, 2) int32, the ends of sharp edges.
-        crease_sharpness: (C,) float32.
+        twins: (H,) int32, the half edge of the neighbouring face on the same edge, or −1 at a boundary.
+        creases: (C, 2) int32, the vertices of sharp edges.
+        crease_sharpness: (C,) float32, from 0 to `INFINITE`.
         corners: (D,) int32, sharp vertices.
-        corner_sharpness: (D,) float32.
+        corner_sharpness: (D,) float32, from 0 to `INFINITE`.
         holes: (E,) int32, faces that shape the surface but are not part of it.
     """
 
@@ -53,7 +53,7 @@ class Cage(NamedTuple):
     holes: np.ndarray
 
     def next(self) -> np.ndarray:
-        """The half edge (H,) int64 that follows each in its face."""
+        """The half edge (H,) int64 that follows each half edge in its face."""
         after = np.arange(1, len(self.indices) + 1)
         after[self.first[1:] - 1] = self.first[:-1]
         return after
@@ -64,7 +64,7 @@ class Cage(NamedTuple):
 
 
 def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), holes: Any = ()) -> Cage:
-    """The cage of these faces.
+    """The cage of these faces, after all checks.
 
     Args:
         faces: lists of vertex numbers, counter-clockwise seen from outside; or an array (F, n).
@@ -104,10 +104,10 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), 
 
 
 def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Lengths (F,) and numbers (H,) of lists of indices, both int32.
+    """Lengths (F,) of lists of indices, and their indices (H,), one list after the other; both int32.
 
     Raises:
-        InputError: no lists of integers from 0 on, or no lists at all.
+        InputError: the lists are empty, too short, or hold something other than integers from 0 on.
     """
     wrong = InputError(f"{name} is {quoted(lists)}; expected lists of integers, one for each face, or an array (F, n)")
     if isinstance(lists, (list, tuple)):
@@ -172,14 +172,14 @@ def _key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
 
 
 def _sorted_edges(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
-    """Half edges (H,) in the order of their edges, and the sorted keys (H,) of these."""
+    """Half edges (H,) sorted by the key of their edges, see `_key`, and the sorted keys (H,)."""
     keys = _key(*_ends(cage), int(cage.indices.max()) + 1)
     order = np.argsort(keys, kind="stable")
     return order, keys[order]
 
 
 def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """The half edge in the other direction, or −1; a cage that is not a manifold is refused."""
+    """`Cage.twins` (H,), from the result of `_sorted_edges`; an error is raised if the cage is no oriented manifold."""
     same = keys[1:] == keys[:-1]
     thrice = np.flatnonzero(same[1:] & same[:-1])
     (a, b), owner = _ends(cage), cage.faces()
@@ -202,7 +202,7 @@ def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
 
 
 def _check_pairs(cage: Cage) -> None:
-    """Refuse two faces that share two edges: around a vertex between them, or elsewhere."""
+    """Refuse cages with two faces that share two edges: around a vertex between the faces, or elsewhere."""
     owner, inner = cage.faces(), cage.twins >= 0
     pairs = owner * len(cage.sizes) + np.where(inner, owner[cage.twins], 0)
     pairs, count = np.unique(pairs[inner], return_counts=True)
@@ -224,10 +224,10 @@ def _check_pairs(cage: Cage) -> None:
 
 
 def _check_fans(cage: Cage) -> None:
-    """Refuse vertices whose faces are not all connected through edges."""
+    """Refuse cages with a vertex whose faces are not all connected through edges at this vertex."""
     count = len(cage.indices)
     h = np.flatnonzero(cage.twins >= 0)
-    # Go around a vertex: from the half edge that leaves it to the one that leaves it in the next face.
+    # Go around a vertex: from the half edge that leaves the vertex in a face to the one that does in the next face.
     beside = cage.next()[cage.twins[h]]
     graph = coo_array((np.ones(len(h), bool), (h, beside)), shape=(count, count))
     _, fan = connected_components(graph, directed=False)
@@ -242,7 +242,7 @@ def _check_fans(cage: Cage) -> None:
 
 
 def _check_sizes(cage: Cage) -> None:
-    """Refuse faces and vertices with too many neighbours for OpenSubdiv."""
+    """Refuse faces and vertices above the limits `MOST` and `MOST_AROUND`."""
     valence = np.bincount(cage.indices)
     if cage.sizes.max() > MOST:
         f = int(cage.sizes.argmax())
@@ -261,7 +261,7 @@ def _check_sizes(cage: Cage) -> None:
 
 
 def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, columns − 1) int64 and sharpness (n,) float32 of rows."""
+    """Indices (n, len(columns) − 1) int64 and sharpness (n,) float32 of rows, whose last column is the sharpness."""
     expected = f"rows ({', '.join(columns)})"
     if shape_of(rows)[:1] == (0,) or (isinstance(rows, (list, tuple)) and not rows):
         return np.zeros((0, len(columns) - 1), np.int64), np.zeros(0, np.float32)
@@ -300,7 +300,7 @@ def _checked_holes(holes: Any, faces: int) -> np.ndarray:
 
 
 def _check_tags(cage: Cage, keys: np.ndarray, edges: np.ndarray, corners: np.ndarray) -> None:
-    """Refuse sharpness of edges and vertices that do not exist."""
+    """Refuse sharp edges (n, 2) and sharp vertices (m,) that the cage lacks; `keys` are the cage's sorted edge keys."""
     count = int(cage.indices.max()) + 1
     wanted = _key(edges[:, 0], edges[:, 1], count)
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

@@ -1,7 +1,7 @@
 """Faces of a cage as tiles.
 
-Where any face is subdivided into sub-faces, whose parameters have gaps, all faces are: so each side of a tile is one
-edge, and tiles that share it share its points.
+If any face has sub-faces, whose parameters have gaps, all faces are cut into quarters, one a corner. So each side of a
+tile is one edge, and tiles that share an edge share its points.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def tiles_of(limit: Limit) -> Tiles:
 
 
 def _quarters(limit: Limit) -> np.ndarray:
-    """Frames (H, 3, 2) of the quarter of a face at each of its corners."""
+    """`Tiles.frames` (H, 3, 2) of the quarters of faces, one at each corner of each face."""
     cage = limit.cage
     frames = np.zeros((len(cage.indices), 3, 2))
     frames[:, 0] = limit.corners

@@ -1,7 +1,7 @@
 """The C++ part of subdivision surfaces: compiled on first use, and kept in the user's cache.
 
-So the package stays pure Python, and the library always fits the installed OpenSubdiv. Its key in the cache consists of
-the sources, the version of the headers and the compiler.
+So the package stays pure Python, and the compiled library always fits the installed OpenSubdiv. Its name in the cache
+is a hash of the sources, the version of the headers and the compiler.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PREFIXES = ("/usr", "/usr/local", "/opt/homebrew", "/usr/local/opt/opensubdiv")
 COMPILERS = ("c++", "g++", "clang++")
 FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared")
 OLDEST = (3, 5)
-"""The first version with Bfr."""
+"""The first version of OpenSubdiv with Bfr, its module that evaluates limit surfaces."""
 
 HELP = (
     "install OpenSubdiv and a C++ compiler: Debian's packages libosd-dev and g++, or opensubdiv of conda-forge or "
@@ -129,7 +129,7 @@ def _opened(tools: Tools) -> ctypes.CDLL:
 
 
 def _compiled(tools: Tools, folder: Path) -> Path:
-    """The library for these tools: kept in a folder, or compiled now."""
+    """The path of the library for these tools: as kept in a folder, or compiled now."""
     name = f"opensubdiv-{_key(tools)}.so"
     kept = folder / name
     if kept.is_file():

@@ -1,6 +1,6 @@
 """Cages from OBJ files: polygons, uv, and the tags of OpenSubdiv's files, which are statements "t".
 
-`t name i/f/s …` has so many integers, floats and words. Vertices and faces in them count from 0, those of "f" from 1.
+`t name i/f/s …` is followed by i integers, f floats and s words. Tags count vertices and faces from 0, "f" from 1.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _TAGS = ("crease", "corner", "hole", "interpolateboundary", "facevaryinginterpol
 
 
 class CageFile(NamedTuple):
-    """A cage as its file has it.
+    """The content of a cage's file.
 
     Attributes:
-        faces: lists of vertices.
+        faces: for each face the list of its vertices.
         options: keywords of `Subdivision`.
         theta: "vertices" (V, 3) and, if the file has them, "uv", "colors", "texture" and "color", float32, linear.
-        shader: a shader for it.
+        shader: a shader suited to θ.
     """
 
     faces: list[list[int]]
@@ -41,10 +41,10 @@ def read_cage(path: Path) -> CageFile:
     """The cage of an OBJ file.
 
     Raises:
-        InputError: it is no OBJ file, or damaged.
+        InputError: the file is no OBJ file, or damaged.
 
     Warns:
-        FileWarning: a statement is not followed.
+        FileWarning: a statement, or the choice among several materials, is ignored.
     """
     if path.suffix.lower() != ".obj":
         raise InputError(f"{path} is no OBJ file; cages of subdivision surfaces are read from .obj")
@@ -78,7 +78,7 @@ def _lists(indices: np.ndarray, sizes: np.ndarray) -> list[list[int]]:
 
 
 def _material(mesh: Any, theta: dict[str, Any]) -> bool:
-    """Add colour and texture of the material to θ; True if all is opaque."""
+    """Add colour and texture of the material to θ. Returns True if neither can be transparent."""
     color = mesh.color
     opaque = color is None or len(color) < 4 or color[3] >= 1
     if mesh.texture is not None and "uv" in theta:
@@ -90,7 +90,7 @@ def _material(mesh: Any, theta: dict[str, Any]) -> bool:
 
 
 def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
-    """Keywords of `Subdivision` that tags stand for."""
+    """Keywords of `Subdivision` from tags, which are (line of the file, text)."""
     options: dict[str, Any] = {"creases": [], "corners": [], "holes": []}
     for number, text in tags:
         name, whole, real, words = _split(path, number, text)

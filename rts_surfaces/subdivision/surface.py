@@ -1,7 +1,7 @@
 """Subdivision surfaces: the limit of Catmull–Clark or Loop subdivision of a cage, by OpenSubdiv.
 
-A sample is a face of the cage and Bfr's (u, v) in it. Points are sums of control points with weights that depend on the
-sample alone: linear in θ, and exactly differentiable.
+A sample is a face of the cage and (u, v) in this face, as OpenSubdiv's module Bfr defines them. Points are sums of
+control points with weights that depend on the sample alone: linear in θ, and exactly differentiable.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from rts_surfaces.subdivision.face_tiles import tiles_of
 library.find()  # Without OpenSubdiv there is no such plugin.
 
 BESIDE = 1 / 16
-"""Distance from the border of a tile from which on its bend is measured. At extraordinary vertices second derivatives
-have no bound, and at creases they are large. Both cover so little of a tile that triangles stay near the surface."""
+"""Distance from the border of a tile, as a share of its size, from which on its bend is measured. At extraordinary
+vertices second derivatives have no bound, and at creases they are large. Both cover so little of a tile that triangles
+stay near the surface."""
 LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
 VERTEX_ATTRIBUTES = ("colors", "uv")
@@ -61,8 +62,8 @@ class Subdivision(Parametric):
     """The limit surface of a cage.
 
     θ["vertices"] (V, 3) are the control points. Attributes of control points are further entries of θ, each (A, C):
-    "colors" (1, 3 or 4 wide) and "uv" (2 wide) are known, others are declared by `indices`; they are subdivided as
-    positions are. In the G-buffer "colors" becomes "color". Normals are those of the limit surface.
+    "colors" (1, 3 or 4 wide) and "uv" (2 wide) are known, others are declared by `indices`. All attributes are
+    subdivided as positions are. In the G-buffer "colors" becomes "color". Normals are those of the limit surface.
 
     Points are those of the limit but for rounding, except within 2⁻¹⁰ of a face from an extraordinary vertex, where
     OpenSubdiv's patches end: there they are off by less than 1e-4 of the cage's extent.
@@ -70,21 +71,21 @@ class Subdivision(Parametric):
     Args:
         faces: lists of integers into θ["vertices"], counter-clockwise seen from outside; or an array (F, n).
         scheme: "catmark" (Catmull–Clark, any polygons) or "loop" (triangles).
-        creases: rows (a, b, sharpness): edges by their vertices. Sharpness s is sharp for s steps of subdivision; 10 is
-            for ever.
+        creases: rows (a, b, sharpness): edges by their vertices. An edge of sharpness s stays sharp for s steps of
+            subdivision; from 10 on, for ever.
         corners: rows (vertex, sharpness).
         holes: numbers of faces that shape the surface, and are no part of it.
         boundary: the rule for edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
             face are corners), "edge_only" (no corners), "none" (faces at the boundary have no surface).
         chaikin: True if the sharpness of creases is smoothed along them.
-        indices: attribute name → None for one row a vertex, which is how others than the known ones are declared; and
-            for "uv" lists of integers into θ["uv"], as `faces` are: a face-varying map with seams.
+        indices: attribute name → None for one row a vertex, which declares an attribute of another name. For "uv" it
+            may be lists of integers into θ["uv"], shaped as `faces`: a face-varying map with seams.
         uv_rule: where a face-varying uv is linear rather than smooth: "none", "corners_only", "corners_plus1",
             "corners_plus2", "boundaries" or "all", as in OpenSubdiv and USD.
         tolerance: the largest distance of triangles from the surface near outlines, pixels.
 
     Raises:
-        InputError: the cage has no limit surface that can be computed, or an option is none of these.
+        InputError: the cage has no limit surface that can be computed, or an option is wrong.
         PluginError: OpenSubdiv does not work.
     """
 
@@ -135,7 +136,7 @@ class Subdivision(Parametric):
         return tuple(dict.fromkeys((*VERTEX_ATTRIBUTES, *(indices or {})))), uv
 
     def _prepare(self) -> None:
-        """Make the objects that copies do not keep."""
+        """Make OpenSubdiv's objects, which copies must make anew."""
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
             raise InputError(
@@ -145,7 +146,7 @@ class Subdivision(Parametric):
         self._points: tuple[tuple, Points] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy: the library's objects stay in this process."""
+        """The state of a copy, without OpenSubdiv's objects, which no other process can use."""
         return {name: value for name, value in vars(self).items() if name not in ("limit", "_points")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -169,10 +170,10 @@ class Subdivision(Parametric):
         """One part: the cage in an OBJ file, with uv, and OpenSubdiv's statements "t" for creases, corners and holes.
 
         Raises:
-            InputError: the file is no OBJ, is damaged, or its cage is not sound.
+            InputError: the file is no OBJ, is damaged, or its cage has no limit surface.
 
         Warns:
-            FileWarning: a statement is not followed.
+            FileWarning: a statement is ignored.
         """
         from rts_surfaces.subdivision.obj_cages import read_cage
 
@@ -202,7 +203,7 @@ class Subdivision(Parametric):
         return theta["vertices"]
 
     def geometry(self, points: np.ndarray) -> Geometry:
-        """See `Parametric`; made once while the vertices stay."""
+        """See `Parametric`; the result is kept until the vertices change."""
         key, kept = fingerprint(points), self._points
         if kept is None or kept[0] != key:
             kept = self._points = key, self.limit.points(points)
@@ -210,7 +211,7 @@ class Subdivision(Parametric):
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
         """See `Parametric`."""
-        # Where faces are cut into quarters, each has half of a side.
+        # A quarter of a face has half of each side, and half of the pieces.
         quarters = len(self.whole.patch) != np.count_nonzero(self.limit.kinds >= 0)
         return super().uniform(-(-rate // 2) if quarters else rate)
 
@@ -246,7 +247,7 @@ class Subdivision(Parametric):
         return gbuffer
 
     def _weights(self, like: Array, faces: Array, params: Array, channel: int, derivatives: bool) -> tuple[Array, ...]:
-        """Weights (N, W) of control points; for derivatives also weights along u and along v."""
+        """Weights (N, W) of control points for points of the surface; for `derivatives` two arrays, along u and v."""
         engine = engine_of(like, params)
         dtype = np.float64 if engine.namespace.finfo(like.dtype).bits == 64 else np.float32
         table = self.limit.table if channel == VERTEX else self.limit.uv_table
