@@ -285,7 +285,7 @@ def _drawn(
 ) -> tuple[Fragments, np.ndarray]:
     """The fragments (K, height, width) of the picture, and a bool mask of the covered cells.
 
-    Views are drawn on all cores, if the sampler is `concurrent`.
+    Views are drawn on all cores if the sampler `draws_at_once`.
     """
     shape, faces, places = (layers, *picture.size), len(built.proxy.faces), picture.places()
     # One array for all fields: fewer pages are allotted in each call.
