@@ -208,6 +208,15 @@ def test_where_only_the_pose_is_differentiable_the_mesh_is_evaluated_on_the_host
     assert rts.sample(part_of(full), camera_at(full["eye"]), SIZE).samples[0].gbuffer is None
 
 
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_real_arrays_are_admitted_and_complex_ones_refused(target):
+    real = arrays(target, np.ones(2), np.float32)
+    engine = rts.engine_of(real)
+    assert engine.admitted(real, "radii") is real
+    with pytest.raises(rts.InputError, match="^radii has dtype .*complex64; expected real numbers"):
+        engine.admitted(arrays(target, np.ones(2), np.complex64), "radii")
+
+
 def test_torch_and_jax_in_one_scene_are_refused_by_name():
     pytest.importorskip("torch")
     pytest.importorskip("jax")
