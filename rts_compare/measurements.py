@@ -283,7 +283,7 @@ class Measurements:
         """All combinations of these options, without layers "auto" where "auto" fails.
 
         Args:
-            group: the name of a group of modes, whose parameters choose the rates.
+            group: the name of a group of modes; the rates depend on the parameters that these change.
             splatters: names.
             layers: numbers, or "auto".
             samples: as `Setting.supersample`.
@@ -384,7 +384,7 @@ class Measurements:
         )
 
     def call(self, group: str, setting: Setting) -> Callable[[], Any]:
-        """A function that renders the scene and the gradient of a loss by the parameters that a group changes."""
+        """A function that computes an image of the scene and a loss's gradient by the parameters of a group's modes."""
         engine = next(e for e in self.engines if e.name == setting.engine)
         at, size = self.at_rates(group)[setting.rate].at, self.scene.size
         live, rebuilt = self._live(group, engine)

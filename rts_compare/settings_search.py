@@ -28,7 +28,8 @@ SLOWER = 3.0
 ENOUGH = 3
 """The fewest timed turns of the chosen setting."""
 NEARLY = 1.2
-"""A setting is skipped if the error with the most layers and finest surface exceeds this many times the tolerance."""
+"""A setting is skipped if even the most layers and finest surface, with its samples, err by more than this many
+times the tolerance."""
 FAR = 1.5
 """A setting is skipped if errors with fewer samples predict more than this many times the tolerance for it."""
 
@@ -173,7 +174,7 @@ class Search:
         return True
 
     def _needless(self, setting: Setting, accurate: Sequence[Setting]) -> bool:
-        """True if an accurate setting costs far less, or, with the same splatter and sampler, no more in any respect."""
+        """True if an accurate setting costs far less, or no more in any respect with the same splatter and sampler."""
         mine = self._work(setting)
         if any(self._cost(setting) > MORE_WORK * self._cost(s) for s in accurate):
             return True
@@ -282,7 +283,7 @@ class Search:
     def _reasons(
         self, chosen: Setting, cells: Sequence[Setting], splatters: Sequence[str]
     ) -> tuple[list[str], Setting | None]:
-        """Lines on each choice: the cheaper one's error, the dearer one's time; and a faster accurate setting or None."""
+        """Lines on each choice: the cheaper one's error, the dearer one's time; and a faster accurate setting."""
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),
