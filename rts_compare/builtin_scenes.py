@@ -1,6 +1,6 @@
 """Scenes by name, for comparisons of settings: some made by formulas, some of files of the test data.
 
-All are seen by one camera, at 256 × 256 pixels, and what moves in them moves in the ways of `moving`.
+All have the same camera and 256 × 256 pixels; their parts move in the modes of `moving`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from rts_compare.scene_shapes import normalised, rotation_xy, turned
 
 SIZE = (256, 256)
 VARIABLE, FOLDER = "RTS_DATA", Path("../shared/data")
-"""The variable that names the folder of the test data, and where that is without."""
+"""The environment variable that names the folder of the test data, and the folder if it is not set."""
 EXACT = 0.02
-"""The largest distance of exact surfaces' triangles from the surface at outlines, pixels: a fifth of the usual one."""
+"""The largest distance between exact surfaces and their triangles at outlines, pixels; a fifth of the usual one."""
 
 
 class Builtin(NamedTuple):
@@ -53,7 +53,7 @@ def builtin(name: str) -> Scene:
     """A built-in scene.
 
     Args:
-        name: one of `names()`; letters may be large, and spaces may be hyphens or underscores.
+        name: one of `names()`; case and accents do not matter; spaces may be hyphens or underscores.
 
     Raises:
         InputError: there is no such scene, or a file of the test data that it needs is missing.
@@ -73,7 +73,7 @@ def _scene(name: str, parts: Part | Sequence[Part], **options: Any) -> Scene:
 
 
 def data_file(scene: str, file: str) -> Path:
-    """A file of the test data."""
+    """The path of a file of the test data; an InputError that names `scene` if it is missing."""
     path = Path(os.environ.get(VARIABLE) or FOLDER) / file
     if not path.is_file():
         formulas = ", ".join(name for name, found in BUILTIN.items() if not found.data)
@@ -92,7 +92,7 @@ def _with_exact(part: Part) -> tuple[Part, Part]:
 
 
 def _upright(points: np.ndarray, ax: float, ay: float) -> np.ndarray:
-    """Points (V, 3) float64 of an object that stands along z: scaled to a usual size, stood along y, and turned."""
+    """Points (V, 3) float64 of an object upright along z: normalised, made upright along y, and turned."""
     return normalised(np.asarray(points, np.float64)[:, [0, 2, 1]] * [1, 1, -1]) @ rotation_xy(ax, ay).T
 
 
@@ -100,7 +100,7 @@ def _upright(points: np.ndarray, ax: float, ay: float) -> np.ndarray:
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and faces (T, 3)."""
+    """Vertices (V, 3) float64 and faces (T, 3) of a file with one mesh."""
     (part,) = load(path)
     vertices, faces = part.surface.tessellate(part.theta, 1)
     return vertices.astype(np.float64), faces
@@ -113,7 +113,7 @@ def _bunny_and_square(scene: str) -> list[Part]:
 
 
 def bunny_over_black() -> Scene:
-    """The bunny before nothing: case A of the table of derivatives."""
+    """The bunny moves over black: case A of the table of derivatives."""
     name = "bunny over black"
     return _scene(name, _bunny_and_square(name)[0])
 
@@ -145,7 +145,7 @@ def nefertiti() -> Scene:
 
 
 def thin_wires() -> Scene:
-    """Wires of one pixel, and of half a pixel."""
+    """Wires one pixel wide, or half a pixel."""
     return _scene("thin wires", scene_shapes.wires(SIZE[0], [1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 1.0]))
 
 
@@ -156,24 +156,24 @@ def stack_of_cards() -> Scene:
 
 
 def card_behind_glass() -> Scene:
-    """A card behind a glass ball and a pane."""
+    """A card that moves behind a glass ball and a glass pane."""
     return _scene("card behind glass", scene_shapes.behind_glass(), moves=[1])
 
 
 def crossing_spheres() -> Scene:
-    """Two spheres."""
+    """Two spheres that pass through one another; the nearer moves."""
     return _scene("crossing spheres", scene_shapes.crossing_spheres(), moves=[1])
 
 
 def turned_box() -> Scene:
-    """A box before a card."""
+    """A box that moves before a card."""
     return _scene("turned box", scene_shapes.turned_box(), moves=[0])
 
 
 # ----------------------------------------------------------------------------------------------- smooth surfaces
 
 VASE_RADII = np.array([0.0, 0.22, 0.4, 0.34, 0.55, 0.68, 0.6, 0.3, 0.2, 0.26, 0.42])
-"""The vase's profile, from its foot up."""
+"""Radii of the vase at `VASE_HEIGHTS`, from its foot up."""
 VASE_HEIGHTS = np.array([-0.9, -0.9, -0.88, -0.74, -0.5, -0.15, 0.22, 0.5, 0.68, 0.82, 0.9])
 AROUND = 16
 """Control points around the vase."""
@@ -190,7 +190,7 @@ def vase() -> Scene:
 
 
 def _standing(part: Part, entry: str, color: Sequence[float]) -> Part:
-    """The part with its control points placed by `_upright`, shaded, in one colour."""
+    """The part in one colour, shaded, with the points in `entry` of θ placed by `_upright`."""
     theta = {entry: _upright(part.theta[entry], 0.35, 0.5), "color": np.array(color)}
     return part.replace(theta=theta, shader="lambert")
 
@@ -234,14 +234,14 @@ def _torus_by_ray() -> Part:
 
 
 def torus_by_lattice() -> Scene:
-    """A torus of values on a lattice with steps of 0.05; its exact counterpart is the field that rays meet."""
+    """A torus of values on a lattice with steps of 0.05; its truth is made of the exact field, by rays."""
     bounds = (-1.0, -0.4, -1.0), (1.0, 0.4, 1.0)
     surface = plugin("rts.surfaces", "isosurface")(bounds, f=torus, shape=(41, 17, 41), lipschitz=1.0, reads=("radii",))
     return _scene("torus by lattice", _torus(surface), exact=_torus_by_ray())
 
 
 def torus_by_ray() -> Scene:
-    """The torus that rays are cast at."""
+    """The torus as a signed distance that rays are cast at."""
     return _scene("torus by ray", _torus_by_ray())
 
 

@@ -1,7 +1,7 @@
 """Looks and names of a comparison's rows in charts.
 
-Colours are those of Okabe and Ito, which those who are colour blind tell apart, and others chosen to be far from these
-for them too. Symbols have the names that plotly.js gives them.
+Colours are the palette of Okabe and Ito, which colour-blind readers can tell apart, and four others that they can tell
+from it. Symbols have the names that plotly.js gives them.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ OTHER_SYMBOLS = ("pentagon", "star", "cross", "triangle-left", "triangle-right")
 PEER_SYMBOL = "x"
 ENGINE_FILLS = {"torch": "", "jax": "-open"}
 OTHER_FILLS = ("-open-dot", "-dot")
-"""Endings of a symbol's name: full, hollow, hollow with a dot, full with a dot."""
+"""Endings of a symbol's name: "" full, "-open" hollow, "-open-dot" hollow with a dot, "-dot" full with a dot."""
 
 
 def assigned(names: Iterable[str], fixed: Mapping[str, str], others: Sequence[str]) -> dict[str, str]:
     """The look (a colour or symbol) of each name: its fixed look if it has one, else the next of `others`.
 
     Args:
-        names: any; some may occur often.
+        names: any names; they may repeat.
         fixed: name → look.
         others: looks, used again and again where there are more names.
 
@@ -58,13 +58,13 @@ def assigned(names: Iterable[str], fixed: Mapping[str, str], others: Sequence[st
 
 @dataclass(frozen=True)
 class Looks:
-    """Name → look, for all names in some comparisons.
+    """The looks of all splatters, samplers, engines and other renderers in some comparisons.
 
     Attributes:
         splatters: name → colour.
         samplers: name → symbol.
-        engines: name → what is added to the symbol.
-        peers: name → colour.
+        engines: name → ending of the symbol's name.
+        peers: name of another renderer → colour.
     """
 
     splatters: dict[str, str]
@@ -74,7 +74,7 @@ class Looks:
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Looks:
-        """The looks of rows."""
+        """The looks of all names in rows."""
         rows = list(rows)
         ours = [row["settings"] for row in rows if "peer" not in row]
         return cls(
@@ -99,7 +99,7 @@ def time_label(milliseconds: float) -> str:
 
 
 def side_length(supersample: int | str) -> float:
-    """The side of a row's symbol, in pixels of a screen, by the samples along the side of a pixel."""
+    """The side of a row's symbol, screen pixels; it grows with the samples along a pixel's side, up to 6."""
     return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
 
 

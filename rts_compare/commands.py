@@ -1,4 +1,4 @@
-"""The commands `rts compare` and `rts tune`. What they need is imported when they run: `rts --help` lists them."""
+"""The commands `rts compare` and `rts tune`. Their modules are imported as they run, so that `rts --help` is quick."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def tune(
 
 @contextlib.contextmanager
 def _interrupted(what: str) -> Iterator[None]:
-    """Say what is left after Ctrl-C."""
+    """On Ctrl-C in the block, print `what`, which says what is kept, and exit with status 130."""
     try:
         yield
     except KeyboardInterrupt:
@@ -130,7 +130,7 @@ def _print_scenes() -> None:
 
 
 def summary(comparison: Comparison) -> Table:
-    """For each mode the fastest setting within some errors."""
+    """A table of the fastest setting of each mode within each error of `LEVELS`."""
     from rts_compare.chart_style import label, time_label
     from rts_compare.pareto_front import LEVELS
 

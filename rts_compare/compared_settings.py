@@ -1,4 +1,4 @@
-"""Settings that are compared: what there is to choose from, and which are worth a look."""
+"""Settings that are compared, the plugins that they may name, and the choice of settings worth timing."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rts.plugin_api.checks import quoted
 from rts_compare.pareto_front import LEVELS
 
 FIRST = "torch"
-"""The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
+"""The engine that measures errors where it is installed: all engines give the same ones, and it compiles nothing."""
 
 
 SHARE = 1.5
-"""Fine samples for each sample of the plain image and each along a pixel's side, about, where they are at outlines."""
+"""Mean number of samples a pixel of an `rts.Adaptive`, about, as a multiple of its `samples`."""
 
 ALIKE = 1.1
-"""A setting that costs more has to have an error smaller than by this factor, or smaller than one of `LEVELS`."""
+"""A dearer setting is worth timing if its error is smaller by more than this factor, or within one more of `LEVELS`."""
 
 
 class Setting(NamedTuple):
@@ -29,10 +29,10 @@ class Setting(NamedTuple):
     Attributes:
         splatter: its name.
         layers: K, or "auto".
-        supersample: samples along each side of a pixel; or, where outlines are, such as "adaptive:4" (`rts.Adaptive`).
-        rate: how finely surfaces are sampled, such as "tolerance=0.4" (`Surface.rates`); "" for their own fineness.
+        supersample: samples along each side of a pixel; or `as_text` of an `rts.Adaptive`, such as "adaptive:4".
+        rate: how finely surfaces are sampled, such as "tolerance=0.4" (`Surface.rates`); "" for surfaces as given.
         sampler: its name; "" in settings whose errors alone are measured.
-        engine: its name; "" in such settings, too.
+        engine: its name; "" in settings whose errors alone are measured.
     """
 
     splatter: str
@@ -80,11 +80,15 @@ def in_python(supersample: int | str) -> str:
 
 
 def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
-    """The plugins of a group that load, each class once and without "auto"; and for others the reason why not.
+    """Names of plugins of a group that load, each class once; and a line on each that does not, with the reason.
 
     Args:
         group: such as "rts.splatters".
-        chosen: names; None for all.
+        chosen: names; None for all but "auto".
+
+    Raises:
+        InputError: `chosen` is no list of names.
+        PluginError: a chosen plugin cannot be loaded.
     """
     found: dict[str, Any] = {}
     left_out = []
@@ -106,7 +110,7 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
 
 
 def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
-    """The engines with derivatives, first the one that measures errors; and for others the reason why not."""
+    """Engines with derivatives, first the one that measures errors; and a line on each other, with the reason."""
     names, left_out = usable("rts.engines", chosen)
     loaded = [engine_named(name) for name in names]
     found = [engine for engine in loaded if engine.differentiates]
@@ -126,11 +130,11 @@ def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str
 
 
 def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tuple[float, ...]]) -> list[Setting]:
-    """The settings worth timing: no cheaper setting has a smaller error, nor an equally cheap one listed before.
+    """The settings worth timing: no setting chosen before costs as little in all respects and is as accurate.
 
     Args:
         errors: setting → error.
-        work: setting → its costs, several numbers, each the less the better.
+        work: setting → its costs, several numbers; the settings are looked at from the least on.
     """
     found: list[Setting] = []
     for setting in sorted(errors, key=lambda s: (work(s), errors[s])):

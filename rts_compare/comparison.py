@@ -70,7 +70,7 @@ class Comparison:
         return best_within([r for r in self.rows if r["mode"] == mode and "peer" not in r], error)
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write NAME.json, and NAME.png and NAME.html where the packages of the extra `plots` are installed."""
+        """Write NAME.json and, with the extra `plots` installed, NAME.png and NAME.html; return the files written."""
         from rts_compare.html_page import write_page
         from rts_compare.png_chart import draw
 
@@ -84,7 +84,7 @@ class Comparison:
             try:
                 write(file)
                 written.append(file)
-            except PluginError:  # What is missing is seen from what is not there.
+            except PluginError:  # The package is missing: the file is not in the result.
                 continue
         return written
 
@@ -107,10 +107,10 @@ class Plan(NamedTuple):
 
     Attributes:
         splatters: names.
-        samplers: names of samplers that suit the scene, the usual one first; each with the one whose errors it shares:
-            "" for the usual one.
-        engines: the first measures errors.
-        layers: K or "auto".
+        samplers: sampler that suits the scene, the usual one first → the sampler whose errors it shares, as
+            `Measurements.kinds`.
+        engines: engines with derivatives; the first measures errors.
+        layers: numbers K, or "auto".
         supersample: as `Setting.supersample`.
         rates: whether the rates that surfaces offer are tried.
         most: the most settings to measure; None for all.
@@ -151,36 +151,36 @@ def compare(
     """Measure the error of derivatives, and the time of a render and gradient, of all settings on one scene.
 
     The error of a setting is that of the derivative image along each of some directions (modes), against differences of
-    area-sampled renders. Settings that no cheaper one betters are timed, in turns: a render and the gradient of a loss
-    in what moves. Every registered sampler and splatter takes part, and DEODR and Mitsuba where the extra `bench` is
-    installed.
+    area-sampled renders. Settings are timed, in turns, unless a cheaper one is as accurate: a render, and the gradient
+    of a loss by the parameters that move. Every registered sampler and splatter takes part, and DEODR and Mitsuba where
+    the extra `bench` is installed.
 
     Args:
         scene: the name of a built-in scene, the path of a model or of a Python file ("file.py:function"), or a
-            function: parameters → (parts, camera), or () → (parts, camera) in NumPy, whose parts then move in five
-            ways.
-        parameters: of the function: where derivatives are taken; an array, or nested dicts and lists.
-        directions: mode → direction of the parameters; None for one for each number of small arrays, and one at random
-            for each larger array.
+            function: parameters → (parts, camera), or () → (parts, camera) in NumPy, whose parts then move in the
+            modes of `moving_scenes.moving`.
+        parameters: of the function: where derivatives are taken; an array, or nested dicts and lists of arrays.
+        directions: mode → direction of the parameters; None for one mode for each number of small arrays, and one
+            random direction for each larger array.
         size: (height, width); None for the scene's own.
-        modes: some of the modes; None for all.
+        modes: names of modes; None for all.
         samplers: names; None for all that suit the scene.
         splatters: names; None for all.
         engines: names; None for all. Errors are measured with the first.
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
         supersample: samples along each side of a pixel, or `rts.Adaptive`; None for 1, 2, 4 and `rts.Adaptive(4)`.
         peers: whether other renderers take part.
-        quick: one mode, engine and sampler unless others are named, at most 40 settings, no peers.
-        surface: the kind of surface that reads a model.
-        output: a folder for the results, and for what a run that is interrupted goes on from; None to write nothing.
-        truths: the folder of truths; None for the folder of caches.
-        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
-        fresh: whether to forget what earlier runs have measured.
+        quick: one mode, engine and sampler, and 1 and 2 layers, unless named; at most 40 settings; no other renderers.
+        surface: the name of the surface that reads a model, such as "mesh" or "bezier".
+        output: a folder for the results and measurements, from which an interrupted run goes on; None to write nothing.
+        truths: the folder of true derivatives; None for the folder of caches.
+        truth_samples: samples of true derivatives along each side of a pixel; fewer are faster and less exact.
+        fresh: whether to delete the measurements of earlier runs.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
         InputError: there is no such scene, or an argument is wrong; before anything is measured.
-        PluginError: a plugin that was asked for cannot be loaded.
+        PluginError: a named plugin cannot be loaded, or no engine with derivatives is installed.
     """
     found = scene_of(scene, parameters, directions, size, surface=surface)
     folder = None if output is None else output_folder(output)
@@ -222,7 +222,7 @@ def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()
 
 
 def _samples(given: Any) -> list[int | str]:
-    """Values of `Setting.supersample` for a user's argument."""
+    """Values of `Setting.supersample` for the argument `supersample` of `compare`."""
     wanted = list(SUPERSAMPLE) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
     if not wanted or not all(is_count(finest(s)) for s in wanted):
         raise InputError(f"supersample is {quoted(given)}; expected integers of at least 1 or rts.Adaptive")
@@ -236,7 +236,7 @@ def _unthinned() -> list[str]:
 
 
 def _earlier(folder: Path | None, scene: Scene, fresh: bool) -> KeptMeasurements:
-    """Measurements that earlier runs have kept of scenes of this name."""
+    """The store of measurements that earlier runs made of scenes of this name; without folder or if fresh, empty."""
     if folder is None:
         return KeptMeasurements()
     path = folder / f".{file_name(scene.name)}.jsonl"
@@ -307,11 +307,11 @@ def _cells(measured: Measurements, plan: Plan, group: str) -> list[Setting]:
 def _timed(
     measured: Measurements, plan: Plan, group: str, errors: Mapping[str, Mapping[Setting, dict]], phase: Phase
 ) -> dict[Setting, dict[str, float]]:
-    """Times of settings.
+    """Setting → its time, as `InterleavedTiming.run` returns it.
 
-    For each splatter, and each sampler with errors of its own, the front of errors is timed first, with one sampler and
-    the first engine. Settings on the front of errors and times are then timed with all samplers that share these
-    errors, and with all other engines.
+    For each splatter and each set of samplers with equal errors, settings that are `worth_timing` are timed first, with
+    one sampler of the set and the first engine. Settings on the Pareto front are then timed with the other samplers of
+    the set, and with all other engines.
     """
     engine = plan.engines[0].name
     usual = {kind: next(name for name, k in plan.samplers.items() if k == kind) for kind in plan.samplers.values()}
@@ -369,7 +369,7 @@ def _peer_scores(measured: Measurements, mode: str, peer: Peer) -> dict[str, flo
 def _peer_times(
     measured: Measurements, mode: str, peers: Sequence[Peer], phase: Phase
 ) -> dict[tuple, dict[str, float]]:
-    """Times of peers in a mode; taken anew if a mode changes other vertices or colours."""
+    """Times of other renderers' gradients in a mode, by `_peer_key`; each mode has times of its own."""
     if not peers:
         return {}
     calls: Calls = {_peer_key(p): lambda p=p: p.gradient(mode) for p in peers}
@@ -383,7 +383,7 @@ def _rows(
     samplers: Mapping[str, str],
     times: Mapping[Setting, dict[str, float]],
 ) -> list[dict]:
-    """A row for each setting that was timed, and one without time for each that was not."""
+    """Rows of a mode: one for each timed setting, and one with "ms" None for each setting without a time."""
     timed: dict[Setting, list[Setting]] = {}
     for setting in times:
         timed.setdefault(setting._replace(sampler=samplers[setting.sampler], engine=""), []).append(setting)

@@ -1,4 +1,4 @@
-"""Scores of derivative images: how near they are to the truth."""
+"""Scores of derivative images against the true derivative."""
 
 from __future__ import annotations
 
@@ -30,25 +30,26 @@ def loss_weights(height: int, width: int, count: int = LOSSES) -> np.ndarray:
 
 
 def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Score a derivative image (H, W, 3) beside the true one.
+    """Score a derivative image (H, W, 3) against the true one.
 
     Returns:
-        error: relative L2 of the two through the low-pass; what charts show.
-        gain: ⟨x, truth⟩ / ⟨truth, truth⟩, through the low-pass: 1 where the derivative is neither too long nor too
-            short.
-        loss_error: over the random losses, RMS of the error of dL/dt relative to the RMS of dL/dt.
+        error: relative L2 through the low-pass (Gaussian, standard deviation 2 pixels); the error in charts.
+        gain: ⟨x, truth⟩ / ⟨truth, truth⟩, through the low-pass: 1 where the derivative is neither too
+            large nor too small as a whole.
+        loss_error: over the random losses L, RMS of the error of dL/dt relative to the RMS of dL/dt; t is the
+            parameter of the derivative.
     """
     low = _compared(low_pass(x), low_pass(true))
     return {"error": low["relative_l2"], "gain": low["gain"], "loss_error": _loss_error(x, true)}
 
 
 def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Score a derivative image (H, W, 3) beside the true one, in more ways.
+    """Score a derivative image (H, W, 3) against the true one, by more numbers than `scores`.
 
     Returns:
         relative_l2, cosine, gain: of the images as they are.
         low_relative_l2, low_cosine, low_gain: the same through the low-pass.
-        spurious: share of the derivative's energy farther than 3 pixels from where the truth is not zero.
+        spurious: share of the derivative's energy farther than 3 pixels from all pixels where the truth is not zero.
         loss_error: as of `scores`.
     """
     from scipy.ndimage import binary_dilation

@@ -11,7 +11,7 @@ from typing import Any
 
 
 def environment(packages: Iterable[str]) -> dict[str, Any]:
-    """Date, machine and versions; None for a package that is not installed."""
+    """The date, the machine, and the version of each package; None for a package that is not installed."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     machine = f"{count} cores, {platform.machine()}, {platform.system()}, Python {platform.python_version()}"
     return {

@@ -32,10 +32,10 @@ from rts_compare.pareto_front import LEVELS, Row, best_within
 def write_page(comparisons: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write comparisons as one HTML file: a chart to hover over and click on, with menus for scene and mode.
 
-    `path#scene=…&mode=…` is a link to one of the views.
+    `path#scene=…&mode=…` is a link to one scene and mode.
 
     Args:
-        comparisons: as `compare` gives them, or as they were written; one a scene.
+        comparisons: `Comparison.data` of each, also as read from its JSON file; one a scene.
         path: of the HTML.
 
     Raises:
@@ -49,7 +49,7 @@ def write_page(comparisons: Sequence[Mapping[str, Any]], path: Path) -> None:
     if not comparisons:
         raise InputError("there is no comparison to write a page of; expected at least one")
     template = (files("rts_compare") / "page.html").read_text(encoding="utf-8")
-    # In JSON "<" only occurs in strings: written otherwise, no name can end the script.
+    # In JSON "<" only occurs in strings: escaped, no name can end the HTML script.
     data = json.dumps(_data(comparisons), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     inserted = {"plotly": get_plotlyjs(), "data": data}
     with writing(path):
@@ -77,7 +77,7 @@ def _data(comparisons: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _settings(row: Row) -> dict[str, Any]:
-    """The settings of a row, and how they are shown."""
+    """The settings of a row as texts, with the size of its symbol."""
     given = row["settings"]
     shown = {"text": arguments(row), "label": label(row), "size": side_length(given.get("supersample", 1))}
     if "peer" in row:
@@ -92,7 +92,7 @@ def _settings(row: Row) -> dict[str, Any]:
 
 
 def _scene(comparison: Mapping[str, Any], settings: Mapping[str, int]) -> dict[str, Any]:
-    """One comparison: its modes, each with columns of rows."""
+    """The page's data of one comparison: texts on the scene, and its modes as `_mode` returns them."""
     scene = comparison["scene"]
     return {
         "name": scene["name"],
@@ -113,7 +113,7 @@ def _key(row: Row) -> str:
 
 
 def _mode(truth_error: float, rows: Sequence[Row], settings: Mapping[str, int]) -> dict[str, Any]:
-    """The rows of a mode by columns, and the fastest within some errors, of ours and of the peers."""
+    """The rows of a mode as columns, and indices of rows: the front, the fastest within each of `LEVELS`, the best."""
     rows = [row for row in rows if drawn(row)]
     index = {id(row): i for i, row in enumerate(rows)}
     ours, peers = [row for row in rows if "peer" not in row], [row for row in rows if "peer" in row]
@@ -135,5 +135,5 @@ def _mode(truth_error: float, rows: Sequence[Row], settings: Mapping[str, int]) 
 
 
 def _short(value: float) -> float | None:
-    """A number of few digits; None where it is none, which JSON cannot say."""
+    """The number in five digits; None for infinity and NaN, which JSON lacks."""
     return float(f"{value:.5g}") if math.isfinite(value) else None

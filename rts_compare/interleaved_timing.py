@@ -14,17 +14,17 @@ from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.skip_reasons import limited, one_line
 
 ROUNDS, CONSECUTIVE = 3, 2
-"""Turns that each function has, and calls timed in a turn."""
+"""Turns that each function has by default, and calls timed in a turn."""
 SLOW = 1.5
-"""Seconds of timed calls after which a function has had its turns, two at least."""
+"""Seconds of timed calls, at least two, after which a function has no further turn."""
 LONGEST = 120.0
-"""Seconds after which a function that is to be timed is left out."""
+"""Seconds that a turn may take, with making and compiling the function; a slower function is left out."""
 
 WARM = 0.5
-"""Seconds that a first call may always take, since it also loads and compiles."""
+"""Seconds that a first call, which also loads and compiles, may take without being `hopeless`."""
 
 Calls = Mapping[tuple, Callable[[], Callable[[], Any]]]
-"""The key of a time → a function that makes the function to be timed."""
+"""The name of a function to be timed → a function without arguments that makes it."""
 
 
 class InterleavedTiming:
@@ -32,11 +32,11 @@ class InterleavedTiming:
 
     Args:
         kept: the store of times.
-        calls: the functions.
-        key: function from a key of `calls` to the key in the store.
+        calls: the functions, see `Calls`.
+        key: name in `calls` → the rest of the key in the store.
 
     Attributes:
-        failed: key → the reason why the function could not be timed, one line.
+        failed: name in `calls` → the reason why the function could not be timed, one line.
     """
 
     def __init__(self, kept: KeptMeasurements, calls: Calls, key: Callable[[tuple], tuple]):
@@ -57,12 +57,12 @@ class InterleavedTiming:
 
         Args:
             rounds: turns of each function, kept turns of earlier runs included.
-            done: called for each turn.
+            done: called for each turn, also a skipped one.
             late: returns True to skip all further turns; ignored until one function has a time.
             hopeless: a function that takes more than this many times the fastest one's time is called only once.
 
         Returns:
-            Milliseconds under each name that could be timed: "median", quartiles "low" and "high", number of "calls".
+            Name in `calls` that could be timed → "median", quartiles "low" and "high" (ms); number of "calls".
         """
         self._hopeless = hopeless
         order, shuffle = list(self.calls), random.Random(0).shuffle
@@ -88,7 +88,7 @@ class InterleavedTiming:
         times.extend(kept)
 
     def timed(self, name: tuple) -> list[float]:
-        """Seconds of a few consecutive calls, after one that is not timed where calls are quick."""
+        """Seconds of consecutive calls after one to warm up; of one call if it is slow, or if the first is hopeless."""
         with limited(LONGEST):
             if name not in self._made:
                 self._made[name] = self.calls[name]()
@@ -101,7 +101,7 @@ class InterleavedTiming:
         return found
 
     def _most(self) -> float:
-        """Seconds; a function whose first call takes longer is not called again."""
+        """The most seconds of a first call; a function whose first call takes longer is not called again."""
         known = [float(np.median(times)) for times in self._times.values() if times]
         return max(WARM, self._hopeless * min(known)) if known else math.inf
 

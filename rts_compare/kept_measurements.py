@@ -1,4 +1,4 @@
-"""Measurements kept line by line, so that an interrupted run goes on where it was."""
+"""Measurements kept in a file, one a line, so that an interrupted run goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ class KeptMeasurements:
     """A table of measurements, each written to a file as soon as it is made.
 
     Args:
-        path: the file, JSON lines; None to keep the table in memory alone. A last line that was cut off is left out,
-            and written anew.
+        path: the file, JSON lines; None to keep the table in memory alone. An incomplete last line is
+            removed from the file.
 
     Attributes:
-        since: the date of the oldest measurement that was asked for, ISO 8601.
+        since: the date of the oldest measurement that `get` has returned, ISO 8601; today without any.
+
+    Raises:
+        InputError: the file cannot be read or written, or a line of it is no measurement.
     """
 
     def __init__(self, path: Path | None = None):
@@ -41,13 +44,13 @@ class KeptMeasurements:
                 raise InputError(f"line {number} of {path} is no measurement; remove the file to start anew") from error
 
     def get(self, *key: Any) -> Any:
-        """The value that was put under a key, or None."""
+        """The value kept under a key; None if there is none."""
         value, date = self._kept.get(_text(key), (None, self.since))
         self.since = min(self.since, date)
         return value
 
     def put(self, value: Any, *key: Any) -> Any:
-        """Keep a value, which JSON can hold, under a key; returns it."""
+        """Keep a value of types that JSON has under a key; return the value."""
         text, date = _text(key), datetime.date.today().isoformat()
         self._kept[text] = value, date
         if self.path is not None:

@@ -1,4 +1,4 @@
-"""Keys of measurements: hashes of the scene and the code that a kept measurement was made of."""
+"""Keys of measurements: hashes of the scene and the code that a kept measurement depends on."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rts.plugin_api.arrays import leaves
 from rts.plugin_api.checks import fingerprint
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
-"""The library's own."""
+"""Packages of the library whose code is part of the keys."""
 WITHOUT_EFFECT = ("rts/cli", "rts/diagnostics", "rts/testing", "__pycache__")
 """Folders whose files change no measurement."""
 MOST_LAYERS = 8
@@ -24,12 +24,12 @@ MOST_LAYERS = 8
 
 
 def layers_of(parts: list[Part], camera: Camera) -> int:
-    """The number of layers that a hard image needs: one, or all where something is translucent."""
+    """The number of layers that a hard image needs: 1, or `MOST_LAYERS` if a shader is not opaque."""
     return 1 if all(part.shader.opaque for part in check_scene(parts, camera)[0]) else MOST_LAYERS
 
 
 def state_key(parts: list[Part], camera: Camera, size: tuple[int, int]) -> str:
-    """A hash of arrays of θ, transforms and camera, and of what is seen: depths, and colours."""
+    """A hash of θ, transforms, camera, size and kinds of surfaces, and of the depths and colours of a hard image."""
     arrays = [*leaves([p.theta for p in parts]), *leaves([p.transform for p in parts]), *leaves(camera.for_size(size))]
     layers = layers_of(parts, camera)
     image = render(parts, camera, size, splatter="none", layers=layers)
@@ -53,7 +53,7 @@ def library_key() -> str:
 
 
 def plugin_key(group: str, name: str) -> str:
-    """A hash of the file that a plugin is in, where it is no file of the library; "" otherwise."""
+    """A hash of the source file of a plugin that is not the library's; "" for the library's, or without a file."""
     if not name:
         return ""
     loaded = plugin(group, name)

@@ -25,14 +25,14 @@ from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
 from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
 
 PATIENCE = 8.0
-"""Seconds after which a sampler that has not finished is left out."""
+"""Seconds that a sampler may take for its first image; a slower one is left out."""
 PROBE, SLOWEST = 8, 3.0
-"""Side of the first image that samplers are tried on, pixels; and the most seconds for an image of the scene's size."""
+"""Side of that first image, pixels; and the usual limit for an image of the scene's size, seconds."""
 ALIKE = 0.002
-"""Samplers whose derivatives differ by less than this, relative L2, share their errors."""
+"""A sampler whose derivatives differ from the usual one's by at most this, relative L2, shares its errors."""
 
 TOGETHER = "all"
-"""The group of all modes, where they are differentiated at once."""
+"""The name of the group of all modes, where all are differentiated at once."""
 
 Done = Callable[[], None]
 
@@ -44,11 +44,11 @@ class Measurements:
         scene: the scene.
         kept: the store of measurements.
         engines: engines with derivatives; errors are measured with the first.
-        truths: the folder of truths; None for that of caches.
-        samples: of the truth, along each side of a pixel, unless `refine_truths` takes others.
+        truths: the folder of true derivatives; None for the folder of caches.
+        samples: samples of the truth along each side of a pixel, until `refine_truths` takes another number.
         together: whether the parameters of all modes are differentiated at once.
-        count_at: samples along each side of a pixel with which layers are counted, once for all settings of a splatter;
-            None to count them with those of each setting.
+        count_at: the `supersample` with which layers are counted, once for each splatter and sampler; None to count
+            them for each setting with its own.
         slowest: the most seconds that a sampler may take for an image of the scene's size.
 
     Attributes:
@@ -86,7 +86,7 @@ class Measurements:
         return "surfaces rest" if is_constant(read) else "surfaces change"
 
     def group(self, mode: str) -> str:
-        """The modes that are timed together: those that leave surfaces alone, and those that change them."""
+        """The name of the group that a mode is timed in: `TOGETHER`, or by whether the mode changes surfaces."""
         return self._groups[mode]
 
     def modes(self, group: str) -> list[str]:
@@ -94,7 +94,7 @@ class Measurements:
         return [mode for mode in self.scene.directions if self.group(mode) == group]
 
     def pixel(self, mode: str) -> float:
-        """The step along a mode that moves the fastest point by a pixel.
+        """The step along a mode that moves the fastest point by a pixel or, if none moves, changes a colour by 0.05.
 
         Raises:
             InputError: the mode changes nothing.
@@ -115,7 +115,7 @@ class Measurements:
         return self._pixels[mode]
 
     def leave_out_what_rests(self) -> None:
-        """Drop the modes that change nothing.
+        """Drop the modes along which no point and no colour of the image changes.
 
         Raises:
             InputError: no mode is left.
@@ -126,7 +126,7 @@ class Measurements:
         """Make the truths, and drop the modes in which the image does not change.
 
         Args:
-            done: see `truth`.
+            done: called 4 `samples`² times for each mode.
 
         Raises:
             InputError: no mode is left.
@@ -139,11 +139,11 @@ class Measurements:
         self._keep(changes)
 
     def rough(self, error: float) -> list[str]:
-        """The modes whose truth has an error of its own that is larger."""
+        """The modes whose truth has an estimated error larger than `error`."""
         return [mode for mode in self.scene.directions if self.truth(mode).error > error]
 
     def refine_truths(self, modes: Sequence[str], samples: int, done: Done) -> None:
-        """Make the truths of some modes anew, of `samples`² a pixel."""
+        """Make the truths of some modes anew, of `samples`² points a pixel."""
         for mode in modes:
             self._truth_samples[mode] = samples
             self._truths.pop(mode, None)
@@ -151,7 +151,7 @@ class Measurements:
             self.truth(mode, done)
 
     def _keep(self, check: Callable[[str], Any]) -> None:
-        """Keep the modes that a check does not refuse."""
+        """Keep the modes for which `check` raises no InputError; if none is left, raise the first of these errors."""
         kept, why = [], []
         for mode in self.scene.directions:
             try:
@@ -175,7 +175,7 @@ class Measurements:
         return self.engine.constant(np.asarray(value, np.float32), like)
 
     def truth(self, mode: str, done: Done = lambda: None) -> Truth:
-        """The true change of the image along a mode; see `truth`."""
+        """The true derivative of the image along a mode; see `true_derivatives.truth`."""
         if mode not in self._truths:
             samples = self._truth_samples.get(mode, self.samples)
             options: dict[str, Any] = dict(samples=samples, engine=self._still, folder=self.folder, done=done)
@@ -184,11 +184,11 @@ class Measurements:
 
     @property
     def _still(self) -> Engine | None:
-        """The engine of scenes without derivatives; None for NumPy, if the scene takes it."""
+        """The engine that computes the scene without derivatives; None for NumPy, if the scene is `separate`."""
         return None if self.scene.separate else self.engine
 
     def state(self, mode: str) -> tuple[str, ...]:
-        """The key of a mode's measurements: the scene where it begins and ends, its truth, and the library."""
+        """The key of a mode's measurements: hashes of the scene at the ends of the truth's step, truth and library."""
         if mode not in self._states:
             step = STEP * self.pixel(mode)
             moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]
@@ -199,7 +199,7 @@ class Measurements:
         return self._states[mode]
 
     def at_rates(self, group: str) -> dict[str, SceneAtRate]:
-        """The scene at the rates that its surfaces offer; "" as it is given."""
+        """Name of a rate that surfaces offer → the scene at this rate; "" → the scene as it is given."""
         if group not in self._at_rates:
             self._at_rates[group] = scenes_at_rates(self.scene.at, parts_of(self.scene.at(self.start(group))))
         return self._at_rates[group]
@@ -207,7 +207,7 @@ class Measurements:
     # -------------------------------------------------------------------------------------------------- samplers
 
     def samplers(self, names: Iterable[str]) -> list[str]:
-        """Samplers that can sample all parts, "auto"'s choice first; "auto" itself if it chooses several."""
+        """Samplers that can sample all parts: the choices of "auto", then "auto" if it makes several, then others."""
         found = self.scene.at(self.start(self.group(next(iter(self.scene.directions)))))
         parts = parts_of(found)
         auto = {choice.sampler for choice in explain(parts, found[1])}
@@ -226,7 +226,7 @@ class Measurements:
         return sorted(suited, key=lambda name: (name not in auto, name != "auto"))
 
     def kinds(self, samplers: Sequence[str]) -> dict[str, str]:
-        """Each sampler, with the one whose errors it shares: "" for the usual one, or itself if it differs."""
+        """Sampler → the sampler whose errors it shares: "" for the usual (first) one, or itself if they differ."""
         group = self.group(next(iter(self.scene.directions)))
         found = {}
         for name in samplers:
@@ -238,7 +238,7 @@ class Measurements:
         return found
 
     def _agrees(self, name: str, usual: str, group: str) -> bool:
-        """True if a sampler gives the same derivatives as the usual one."""
+        """True if a sampler's derivatives along a group's modes agree with the usual one's, up to `ALIKE`."""
         for mode in self.modes(group):
             setting = Setting("auto", 2, 1)
             try:
@@ -250,7 +250,7 @@ class Measurements:
         return True
 
     def _tried(self, name: str, parts: list[Part], camera: Camera) -> dict[str, Any]:
-        """Try a sampler on the scene: {"suits": …, "why": why not}."""
+        """Try a sampler on the scene. Returns {"suits": True or False, "why": the reason if False}."""
         side = PROBE
         try:
             for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
@@ -280,14 +280,14 @@ class Measurements:
         kinds: Iterable[str] = ("",),
         rates: bool = True,
     ) -> list[Setting]:
-        """Possible settings that may differ in their error.
+        """All combinations of these options, without layers "auto" where "auto" fails.
 
         Args:
-            group: of modes.
+            group: the name of a group of modes; the rates depend on the parameters that these change.
             splatters: names.
             layers: numbers, or "auto".
             samples: as `Setting.supersample`.
-            kinds: samplers with errors of their own, and "" for all others.
+            kinds: samplers whose errors differ from the usual one's, and "" for all others.
             rates: whether settings include the rates that surfaces offer.
         """
         all_of = (
@@ -301,7 +301,7 @@ class Measurements:
         return [setting for setting in all_of if self.counting(group, setting) is not None]
 
     def counting(self, group: str, setting: Setting) -> int | None:
-        """The number of layers that count in a setting: at most those of "auto". None if "auto" fails."""
+        """The number of layers that a setting uses, at most that of "auto"; None if it has "auto", and that fails."""
         counted = setting._replace(layers="auto", engine="")
         if self.count_at is not None:
             counted = counted._replace(supersample=self.count_at, rate="")
@@ -311,7 +311,7 @@ class Measurements:
         return most if setting.layers == "auto" else min(int(setting.layers), most)
 
     def _layers(self, group: str, setting: Setting) -> int | None:
-        """The number of layers that "auto" takes; None if it fails."""
+        """The number of layers that a setting with layers "auto" takes; None if it fails."""
         key = "layers", group, *setting, *self._identity(self.modes(group)[0], setting)
         if key in self._failed:
             return None
@@ -328,11 +328,11 @@ class Measurements:
         return kept
 
     def scores(self, mode: str, setting: Setting) -> dict[str, float] | None:
-        """Errors of the derivative along a mode; see `rts_compare.derivative_scores`. None if it fails.
+        """Scores of a setting's derivative along a mode, see `derivative_scores.scores`; None if it fails.
 
         Args:
             mode: of the scene.
-            setting: its `sampler` has errors of its own, or is "".
+            setting: its `sampler` is a value of the method `kinds`.
         """
         count = self.counting(self.group(mode), setting)
         if count is None:
@@ -351,7 +351,7 @@ class Measurements:
         return kept
 
     def _identity(self, mode: str, setting: Setting) -> tuple[str, ...]:
-        """The key of a setting's measurement beside the setting."""
+        """The rest of a measurement's key, beside its setting: hashes of its plugins, and the mode's state."""
         plugins = ("rts.splatters", setting.splatter), ("rts.samplers", setting.sampler)
         return *(plugin_key(*p) for p in plugins), *self.state(mode)
 
@@ -362,7 +362,7 @@ class Measurements:
         return scores(derivative, self.truth(mode).derivative)
 
     def _derivative(self, mode: str, setting: Setting) -> np.ndarray:
-        """The derivative image (H, W, 3) along a mode, for a motion of one pixel."""
+        """The derivative image (H, W, 3) along a mode, per pixel of motion."""
         at, pixel = self.at_rates(self.group(mode))[setting.rate].at, self.pixel(mode)
 
         def image(t: Array) -> Array:
@@ -375,7 +375,7 @@ class Measurements:
     # ----------------------------------------------------------------------------------------------------- times
 
     def work(self, group: str, setting: Setting) -> tuple[float, ...]:
-        """The cost of a setting in respects known beforehand: layers, samples, rate."""
+        """Costs of a setting, known before it is timed: layers, samples along a pixel's side, work of its rate."""
         layers = self.counting(group, setting) or 0
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),
@@ -384,7 +384,7 @@ class Measurements:
         )
 
     def call(self, group: str, setting: Setting) -> Callable[[], Any]:
-        """A function that renders the scene and takes the gradient of a loss in the parameters of a group's modes."""
+        """A function that computes an image of the scene and a loss's gradient by the parameters of a group's modes."""
         engine = next(e for e in self.engines if e.name == setting.engine)
         at, size = self.at_rates(group)[setting.rate].at, self.scene.size
         live, rebuilt = self._live(group, engine)
@@ -398,12 +398,12 @@ class Measurements:
         return lambda: _quietly(lambda: engine.block(gradient(live)))
 
     def start(self, group: str) -> Tree:
-        """The parameters; those that a group's modes change are arrays of the first engine."""
+        """The parameters before any motion; those that a group's modes change are arrays of the first engine."""
         live, rebuilt = self._live(group, self.engine)
         return rebuilt(live)
 
     def _live(self, group: str, engine: Engine) -> tuple[list[Array], Callable[[list[Array]], Tree]]:
-        """The parameters that a group's modes change, and the tree of all parameters with others in their place."""
+        """The parameters that a group's modes change, and a function: values for these → all parameters."""
         scene = self.scene
         changing = [
             not scene.separate or any(np.any(np.asarray(d)) for d in of_modes)
@@ -419,11 +419,11 @@ class Measurements:
         return live, rebuilt
 
     def timing(self, group: str, calls: Calls) -> InterleavedTiming:
-        """Timing of functions, such as those of `call`, with the store of their times.
+        """The timer of functions, such as those of `call`, with the store of their times.
 
         Args:
-            group: of modes, whose parameters they differentiate.
-            calls: key of the times, a `Setting` or the name of a peer → see `InterleavedTiming`.
+            group: the name of the group of modes whose parameters the functions differentiate by.
+            calls: `Setting`, or a tuple that names another renderer → function that makes the function to be timed.
         """
         modes = self.modes(group)
         states = [state for mode in modes for state in self.state(mode)]
@@ -436,7 +436,7 @@ class Measurements:
 
 
 def _quietly(f: Callable[[], Any]) -> Any:
-    """The result of a call without warnings of the library, which the first look at the scene has shown."""
+    """The result of `f()`, with warnings of the library silenced."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RtsWarning)
         return f()

@@ -1,4 +1,4 @@
-"""Scenes that settings are compared on: parts and a camera as a function of parameters, and directions of these."""
+"""Scenes that settings are compared on: parts and a camera as a function of parameters, with directions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rts.plugin_api.checks import quoted
 SceneFunction = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 
 MODES = ("translation", "rotation", "shape", "color", "camera")
-"""The ways that `moving` moves parts."""
+"""The modes of `moving`: names of changes of parts or camera."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Scene:
         name: of the scene.
         at: parameters → (parts, camera).
         parameters: nested dicts and lists of arrays: where the derivatives are looked at.
-        directions: mode → the direction of the parameters, of their structure, along which the image is differentiated.
+        directions: mode → a tree like `parameters`, the direction along which the image is differentiated.
         size: (height, width) of images.
         note: what moves, and what is hard about it.
-        exact: as `at`, with surfaces that are exact, where those of `at` are approximations; None for `at`.
+        exact: as `at`, with exact surfaces where `at` has approximations; the truth is made of it. None for `at`.
         separate: whether `at` also takes NumPy arrays for parameters that a mode does not change.
     """
 
@@ -55,8 +55,8 @@ class Scene:
 
         Args:
             mode: a key of `directions`.
-            by: how far; a number, or a scalar of the engine.
-            engine: that of the parameters that move, and of all where the scene is not `separate`; None for NumPy.
+            by: the factor of the direction; a number, or a scalar of the engine.
+            engine: the engine of the parameters that move or, unless the scene is `separate`, of all; None for NumPy.
         """
         direction = iter(leaves(self.directions[mode]))
 
@@ -112,8 +112,8 @@ def moving(
         moves: the indices of the parts that translations, rotations and shapes move; None for all.
         modes: names from `MODES`. Modes that change nothing are left out.
         note: what is hard about the scene.
-        exact: the same parts as exact surfaces, with the same transforms. Modes that change entries of θ which these
-            lack, or have in another shape, are left out.
+        exact: the same parts as exact surfaces, with the same transforms. Modes that change entries of θ which exact
+            parts lack, or have in another shape, are left out.
 
     Raises:
         InputError: not as many exact parts as parts, an unknown mode, or an index out of range.
@@ -157,8 +157,8 @@ class _Ways(NamedTuple):
     Attributes:
         camera: at rest.
         moved: the indices of the parts that generators move.
-        generators: mode → (4, 4), the derivative of the transform that moves them.
-        changes: mode → for each part the directions of entries of θ; those that θ lacks begin at ones.
+        generators: mode → (4, 4), the derivative of the transform, world space, that moves these parts.
+        changes: mode → for each part: entry of θ → its direction; entries that θ lacks begin at ones.
     """
 
     camera: Camera
@@ -167,12 +167,12 @@ class _Ways(NamedTuple):
     changes: Mapping[str, Sequence[Mapping[str, np.ndarray]]]
 
     def at(self, parts: Sequence[Part], parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
-        """Parts and the camera, for the parameters of some modes."""
+        """Parts and the camera, moved by parameters: mode → number; modes that are not in it rest."""
         live = {k: t for k, t in parameters.items() if not (is_constant(t) and np.all(np.asarray(t) == 0))}
         camera = self.camera
         if "camera" in live:
             ahead = np.zeros((4, 4))
-            ahead[2, 3] = 1.0  # In the camera's space what is seen comes nearer.
+            ahead[2, 3] = 1.0  # In camera space, all parts come nearer.
             camera = camera.replace(view=_plus(np.asarray(camera.view, np.float64), live["camera"], ahead))
         return [self._part(index, part, live) for index, part in enumerate(parts)], camera
 
@@ -188,7 +188,7 @@ class _Ways(NamedTuple):
         return part.replace(theta=theta, transform=transform)
 
     def changes_something(self, mode: str, parts: Sequence[Part], exact: Sequence[Part]) -> bool:
-        """True if a mode has an effect, and the same one on parts and on exact ones."""
+        """True if a mode changes anything, and entries of θ of the same shapes in `parts` and `exact`."""
         if mode == "camera":  # Without perspective, moving ahead changes nothing.
             return bool(np.any(np.asarray(self.camera.projection)[3, :3]))
         if mode not in self.changes:
@@ -202,7 +202,7 @@ class _Ways(NamedTuple):
 
 
 def _plus(start: Any, by: Any, direction: np.ndarray) -> Any:
-    """Start + by · direction, in the engine of either."""
+    """`start + by * direction`, in the engine of `start` or `by`."""
     engine, like = engine_of(start, by), exemplar(start, by)
     start, by, direction = constants((start, by, direction), engine, like)
     return start + by * direction
@@ -215,7 +215,7 @@ def _translation(along: np.ndarray) -> np.ndarray:
 
 
 def _rotation(about: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """The derivative of a rotation about an axis through a point."""
+    """The derivative (4, 4), by the angle, of a rotation about an axis through a point."""
     x, y, z = about
     generator = np.zeros((4, 4))
     generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
@@ -243,7 +243,7 @@ def _middle(parts: Sequence[Part]) -> np.ndarray:
 
 
 def _points(part: Part) -> np.ndarray:
-    """Points (M, 3) of a surface, local space; without triangles, the middle that it states, or 0."""
+    """Points (M, 3) of a surface, local space; without triangles, its attribute `center`, or 0."""
     surface = part.surface
     if isinstance(surface, TriangleSurface):
         with contextlib.suppress(InputError):  # Triangles may depend on the view.
@@ -259,14 +259,14 @@ UNEVEN = np.array([2.0, 3.0, 2.5])
 """Phase of a swelling's wave from an object's middle to its end along each axis, radians."""
 
 NO_SHAPE = ("normals", "colors", "uv", "color", "texture", "light", "specular", "shininess", "depth_range")
-"""Attributes of surfaces, and entries that shaders read."""
+"""Entries of θ that do not shape a surface: attributes of its vertices, and entries that shaders read."""
 
 TINT = np.array([1.0, -0.5, 0.25, 0.0])
 """Relative changes of red, green, blue and alpha."""
 
 
 def _swelling(part: Part) -> dict[str, np.ndarray]:
-    """Directions in which the entries of θ that shape the surface change, by entry."""
+    """Entry of θ that shapes the surface → the direction in which it changes."""
     reads = part.surface.reads(part.theta)
     # Beside its vertices a mesh may have attributes of any name.
     names = ("vertices",) if "vertices" in reads else [name for name in reads if name not in NO_SHAPE]
@@ -293,7 +293,7 @@ def _away(points: np.ndarray) -> np.ndarray:
 
 
 def _coloring(part: Part, camera: Camera) -> dict[str, np.ndarray]:
-    """The direction in which the base colour of a part changes, by its entry of θ."""
+    """Entry of θ with the base colour → the direction in which it changes; {} if none can change."""
     theta, reads = part.theta, part.surface.reads(part.theta)
     [checked], _ = check_scene(part, camera)
     if checked.reads is not None and not {"color", "uv"} & set(checked.reads):
@@ -308,10 +308,10 @@ def _coloring(part: Part, camera: Camera) -> dict[str, np.ndarray]:
 
 
 def check_directions(scene: Scene) -> None:
-    """Refuse directions of another structure than the parameters.
+    """Refuse directions that do not suit the parameters.
 
     Raises:
-        InputError: they have other leaves, or leaves of other shapes.
+        InputError: a direction has other leaves than the parameters, leaves of other shapes, or zeros alone.
     """
     wanted = [tuple(np.shape(p)) for p in leaves(scene.parameters)]
     for mode, direction in scene.directions.items():

@@ -1,7 +1,7 @@
 """Rows of a comparison that are worth their time: the Pareto front, and the fastest row within an error.
 
 A row is plain data: `mode`, `settings`, `error`, and `ms`, the quartiles of its time, or None where only the error was
-measured. Rows without time, or with an error that is no number, take no part.
+measured. Rows without time, or whose error is not finite, are never chosen.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LEVELS = (0.1, 0.03, 0.01)
 
 
 def timed(row: Row) -> bool:
-    """True where both the time and the error of a row are known."""
+    """True if a row has a time, and both its median and the error are finite."""
     return row["ms"] is not None and math.isfinite(row["ms"]["median"]) and math.isfinite(row["error"])
 
 

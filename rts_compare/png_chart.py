@@ -41,15 +41,15 @@ MARKERS = {
     "cross": "P",
     "x": "X",
 }
-"""Symbol → what matplotlib calls it."""
+"""Name of a symbol in `chart_style` → matplotlib's marker."""
 INK, PALE = "#1f2937", "#6b7280"
 COLUMNS = 3
 PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
-"""In inches; the last is that of a line of the list under a panel."""
+"""Inches; `LINE_HEIGHT` is the height of a text line in the list under a panel."""
 CHARACTER_WIDTH = 0.075
-"""Inches of a character of the line below all panels."""
+"""Width of a character in the text below all panels, inches."""
 LONGEST = 70
-"""Characters of a line under a panel."""
+"""The most characters of a text line in the list under a panel."""
 
 
 def draw(comparison: Mapping[str, Any], path: Path) -> None:
@@ -58,7 +58,7 @@ def draw(comparison: Mapping[str, Any], path: Path) -> None:
     The rows on the Pareto front are numbered, and listed under their panel. Rows without time are not drawn.
 
     Args:
-        comparison: as `compare` gives it, or as it was written.
+        comparison: `Comparison.data`, also as read from its JSON file.
         path: of the PNG.
 
     Raises:
@@ -97,7 +97,7 @@ def draw(comparison: Mapping[str, Any], path: Path) -> None:
 
 
 def _texts(figure: Figure, comparison: Mapping[str, Any]) -> None:
-    """Write what was compared above the panels, and where below them."""
+    """Write the scene's name, size and note above the panels, and the environment below them."""
     scene = comparison["scene"]
     title = f"{scene['name']}, {' × '.join(map(str, scene['size']))}"
     note = f"\n{scene['note']}" if scene.get("note") else ""
@@ -107,18 +107,18 @@ def _texts(figure: Figure, comparison: Mapping[str, Any]) -> None:
 
 
 def _front(rows: Sequence[Row]) -> list[Row]:
-    """The rows on the front, the fastest first."""
+    """The rows on the Pareto front, the fastest first."""
     return sorted((row for row in rows if row.get("front")), key=lambda row: (milliseconds(row), -row["error"]))
 
 
 def _panel(axes: Axes, rows: Sequence[Row], truth_error: float, looks: Looks) -> None:
-    """The points and lines of a mode."""
+    """Draw the points and lines of a mode."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.axhline(truth_error, color=PALE, linestyle="--", linewidth=1, zorder=1)
     axes.plot(*_places(_front(rows)), drawstyle="steps-post", color=INK, linewidth=1.1, zorder=5)
     for (color, symbol, samples, on), same in _alike([row for row in rows if "peer" not in row], looks).items():
-        behind = 0.01 * side_length(samples)  # Small ones are before large ones.
+        behind = 0.01 * side_length(samples)  # Small symbols are drawn over large ones.
         for mark in _marks(symbol, color, samples):
             axes.plot(*_places(same), **mark, alpha=1.0 if on else 0.45, zorder=6 if on else 4 - behind)
     for peer, color in looks.peers.items():
@@ -133,7 +133,7 @@ def _panel(axes: Axes, rows: Sequence[Row], truth_error: float, looks: Looks) ->
 
 
 def _ticks(axes: Axes) -> None:
-    """Limits with room for numbers on the left and below, and ticks at 1, 2, 5, 10."""
+    """Set limits with room for numbers on the left and below, and ticks at 1, 2, 5, 10."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
@@ -148,7 +148,7 @@ def _ticks(axes: Axes) -> None:
 
 
 def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int | str, bool], list[Row]]:
-    """Rows by colour, symbol, samples along a pixel's side, and whether they are on the front."""
+    """(Colour, symbol, `Setting.supersample`, True on the Pareto front) → the rows that look so."""
     found: dict[tuple[str, str, int | str, bool], list[Row]] = {}
     for row in rows:
         settings = row["settings"]
@@ -163,7 +163,7 @@ def _places(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
 
 
 def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str, Any]]:
-    """The lines of matplotlib that together are a symbol: itself, the dot in it, and the bar of adaptive samples."""
+    """Keyword arguments of matplotlib's lines that draw a symbol: its shape, its dot, the bar of adaptive samples."""
     shape, hollow, dot = symbol.removesuffix("-dot").removesuffix("-open"), "-open" in symbol, symbol.endswith("-dot")
     size = 0.72 * side_length(supersample)  # Points of 1/72 inch.
     mark = {"marker": MARKERS[shape], "markersize": size, "linestyle": "none", "markeredgewidth": 0.9}
@@ -177,7 +177,7 @@ def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str
 
 
 def _order(supersample: int | str) -> tuple[bool, int, str]:
-    """Where samples a pixel stand in the legend."""
+    """The sorting key of a `Setting.supersample` in the legend: numbers first, then adaptive ones, by fineness."""
     return isinstance(supersample, str), finest(samples_of(supersample)), str(supersample)
 
 
@@ -187,7 +187,7 @@ NUMBER_SIZE = (12, 9)
 
 
 def _number(figure: Figure, axes: Axes, rows: Sequence[Row]) -> None:
-    """Numbers of the rows on the front: below and to the left, where no row is, each as near as there is room."""
+    """Number the rows on the Pareto front, below and left of their points, as near as numbers do not overlap."""
     from matplotlib.patheffects import withStroke
 
     taken = np.empty((0, 2))
@@ -212,7 +212,7 @@ def _number(figure: Figure, axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _list(axes: Axes, rows: Sequence[Row]) -> None:
-    """List what the numbers of a panel stand for."""
+    """List time, error and settings of each numbered row of a panel."""
     lines = [f"    {'ms':>8}  {'error':>7}"] if rows else ["    no row was timed"]
     for number, row in enumerate(rows, 1):
         text = f"{number:>3} {milliseconds(row):>8.4g}  {100 * row['error']:>5.3g} %  {label(row)}"
@@ -230,7 +230,7 @@ def _list(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _legend(figure: Figure, rows: Sequence[Row], looks: Looks) -> None:
-    """Explain all looks beside the panels."""
+    """Draw the legend of colours, symbols, sizes and lines beside the panels."""
     from matplotlib.legend_handler import HandlerTuple
     from matplotlib.lines import Line2D
 

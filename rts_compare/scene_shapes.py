@@ -13,7 +13,7 @@ from rts.diagnostics.example_shapes import QUAD, box, icosphere, unlit
 FOV, DISTANCE = 40.0, 3.2
 """The camera's vertical field of view, degrees, and its distance from the origin."""
 CARD_DEPTH = 4.3
-"""Camera depth of what lies behind the object in the middle."""
+"""Camera depth of cards behind the object in the middle."""
 SLANTS = (4, -9, 17, -31, 44, 68, -83)
 """How wires are slanted, degrees from upright."""
 
@@ -22,12 +22,12 @@ SLANTS = (4, -9, 17, -31, 44, 68, -83)
 
 
 def camera() -> Camera:
-    """40° from (0, 0, 3.2) towards the origin, near 0.5, far 10."""
+    """The camera at (0, 0, 3.2), towards the origin, 40° from top to bottom, near 0.5, far 10."""
     return Camera.look_at((0.0, 0.0, DISTANCE), (0, 0, 0), fov_y=FOV, near=0.5, far=10.0)
 
 
 def pixel(depth: float, size: int) -> float:
-    """World width of one pixel at a depth, of an image of `size` rows."""
+    """World width of one pixel at a camera depth, in a square image of `size` rows."""
     return 2 * depth * np.tan(np.radians(FOV / 2)) / size
 
 
@@ -44,7 +44,7 @@ def normalised(points: np.ndarray) -> np.ndarray:
 
 
 def rotation_xy(ax: float, ay: float) -> np.ndarray:
-    """R_x(ax) · R_y(ay) (3, 3), radians."""
+    """The rotation R_x(ax) · R_y(ay) (3, 3), angles in radians."""
     cx, sx, cy, sy = np.cos(ax), np.sin(ax), np.cos(ay), np.sin(ay)
     return np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]) @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
 
@@ -60,12 +60,12 @@ def turned(ax: float, ay: float) -> np.ndarray:
 
 
 def rectangle(left: float, top: float, right: float, bottom: float, depth: float, size: int) -> np.ndarray:
-    """Corners (4, 3) of an upright card that is seen between these pixel coordinates."""
+    """World corners (4, 3) of a card at a camera depth, facing the camera, seen between these pixel coordinates."""
     return on_screen(np.array([[left, bottom], [right, bottom], [right, top], [left, top]]), depth, size)
 
 
 def grid(count_u: int, count_v: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (V, 2) in [−1, 1]² and triangles of a sheet of count_u × count_v cells."""
+    """Parameters (V, 2) in [−1, 1]² and triangles (T, 3) of a sheet of count_u × count_v cells."""
     u, v = np.meshgrid(np.linspace(-1, 1, count_u + 1), np.linspace(-1, 1, count_v + 1), indexing="ij")
     index = np.arange(u.size).reshape(u.shape)
     a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
@@ -97,7 +97,7 @@ def textured_spot(folder: Path) -> Part:
     """The cow Spot with its texture, unlit and culled.
 
     Args:
-        folder: of spot_triangulated.obj and spot_texture.png.
+        folder: the folder with spot_triangulated.obj and spot_texture.png.
     """
     (part,) = load(folder / "spot_triangulated.obj")
     if "texture" not in part.theta:
@@ -109,7 +109,7 @@ def textured_spot(folder: Path) -> Part:
 
 
 def turned_box() -> tuple[Part, Part]:
-    """A box with a colour a face, and the card with a pattern behind it."""
+    """A box with one colour on each face, and a card with a pattern behind it."""
     vertices, faces = box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
     hues = np.array(
         [[0.9, 0.3, 0.1], [0.2, 0.7, 0.3], [0.8, 0.8, 0.2], [0.5, 0.2, 0.7], [0.1, 0.4, 0.9], [0.3, 0.8, 0.8]]
@@ -139,14 +139,14 @@ def cards(count: int) -> tuple[list[Part], list[float]]:
 
 
 def of_glass(part: Part, alpha: float) -> Part:
-    """A part with a colour a vertex, as glass of this alpha."""
+    """A part with a colour for each vertex, made translucent with this alpha."""
     colors = np.asarray(part.theta["colors"])[:, :3]
     colors = np.concatenate([colors, np.full_like(colors[:, :1], alpha)], axis=1)
     return part.replace(theta={**part.theta, "colors": colors}, shader=plugin("rts.shaders", "unlit")(opaque=False))
 
 
 def behind_glass() -> list[Part]:
-    """A glass ball, a card behind it, and a pane of glass that hides neither."""
+    """A glass ball, an opaque card behind it, and a glass pane."""
     vertices, faces = icosphere(3)
     ball = of_glass(unlit(0.5 * vertices, faces, (0.2, 0.9, 0.4)), 0.5)
     corners = np.array([[-0.9, -0.5, -0.8], [0.3, -0.6, -0.8], [0.4, 0.35, -0.8], [-0.8, 0.45, -0.8]])
@@ -158,8 +158,8 @@ def wires(size: int, widths: Sequence[float]) -> Part:
     """Seven thin quads from nearly upright to nearly level.
 
     Args:
-        size: of the image, in pixels.
-        widths: of each wire, in pixels.
+        size: height of the square image, pixels.
+        widths: width of each wire, pixels.
     """
     vertices, faces = [], []
     for i, (slant, width) in enumerate(zip(np.radians(SLANTS), widths, strict=True)):

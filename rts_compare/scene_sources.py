@@ -27,7 +27,7 @@ from rts_compare.skip_reasons import one_line
 
 SIZE = (256, 256)
 FEW = 6
-"""Arrays of at most so many numbers have a mode for each."""
+"""Arrays of at most so many numbers have a mode for each number."""
 VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
@@ -39,17 +39,18 @@ def scene_of(
     *,
     surface: str = "mesh",
 ) -> Scene:
-    """The scene that a user means.
+    """Make a `Scene` from any of the forms in which users name or give one.
 
     Args:
         scene: a `Scene`; the name of a built-in one; the path of a model; the path of a Python file, perhaps with
             ":name" of a function in it, "scene" by default; or a function: () or parameters → (parts, camera).
         parameters: of the function: an array, or nested dicts and lists of them. A Python file may have them under
-            the name "parameters". None for a function without arguments, whose parts move in five ways.
-        directions: mode → direction of the parameters; None for one mode for each number of small arrays, and one at
-            random for each larger array.
+            the name "parameters". None for a function without arguments, whose parts move in the
+            modes of `moving`.
+        directions: mode → direction of the parameters; None for one mode for each number of small arrays, and one
+            random direction for each larger array.
         size: (height, width); None for the scene's own, 256² where it has none.
-        surface: the kind of surface that reads a model.
+        surface: the name of the surface that reads a model, such as "mesh" or "bezier".
 
     Raises:
         InputError: there is no such scene, or it does not give parts and a camera.
@@ -77,10 +78,10 @@ def scene_of(
 
 
 def some_modes(scene: Scene, modes: Sequence[str] | None) -> Scene:
-    """The scene with some of its modes; None for all.
+    """The scene with the modes of these names; None for all.
 
     Raises:
-        InputError: it has no such modes.
+        InputError: the scene lacks one of them.
     """
     if modes is None:
         return scene
@@ -124,12 +125,12 @@ def of_model(path: Path, surface: str, size: tuple[int, int]) -> Scene:
 
 
 def _module(path: Path) -> Any:
-    """A Python file, run; it finds modules in its own folder."""
+    """The module of a Python file, run with its folder on the import path."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if not path.is_file() or spec is None or spec.loader is None:
         raise InputError(f"{path} does not exist; expected a Python file")
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up.
+    # Dataclasses look up their module there.
     sys.modules.setdefault(path.stem, module)
     sys.path.insert(0, str(path.parent.resolve()))
     try:
@@ -142,7 +143,7 @@ def _module(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _told(what: str) -> Iterator[None]:
-    """Errors of a user's code, told in one line."""
+    """Turn errors in the block, a user's code, into an InputError of one line."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -185,7 +186,7 @@ def _float_array(x: Any) -> Any:
 
 
 def engines_for(scene: Scene, chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
-    """The engines that can compute a scene, the one that errors are measured with first; and why others cannot.
+    """The engines that can compute a scene, first the one that measures errors; and a line on each engine that cannot.
 
     Args:
         scene: the scene; where its parameters are arrays of an engine, no other one can.
@@ -213,7 +214,7 @@ def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
     """The parts and the camera that a function gave.
 
     Raises:
-        InputError: it gave something else.
+        InputError: it gave something else, or colours of other than three channels.
     """
     if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera)):
         raise InputError(f"{name} gave {quoted(found)}; expected (parts, camera)")
@@ -227,7 +228,7 @@ def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
 
 
 def _modes(parameters: Tree) -> dict[str, Tree]:
-    """A mode for each number of small arrays, and one at random for each larger array."""
+    """Mode → direction: one for each number of arrays of at most `FEW`, a random one for each larger array."""
     names, shapes = [*_names(parameters)], [tuple(np.shape(x)) for x in leaves(parameters)]
     found = {}
     for index, (name, shape) in enumerate(zip(names, shapes, strict=True)):
@@ -253,6 +254,6 @@ def _names(tree: Tree, place: str = "") -> Iterator[str]:
 
 
 def _only(parameters: Tree, index: int, values: np.ndarray) -> Tree:
-    """A direction that is zero but in one leaf."""
+    """A direction with `values` in the leaf `index` of the parameters, and zeros in all other leaves."""
     number = iter(range(sum(1 for _ in leaves(parameters))))
     return map_leaves(lambda x: values if next(number) == index else np.zeros(np.shape(x)), parameters)

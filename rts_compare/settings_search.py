@@ -16,30 +16,31 @@ from rts_compare.measurements import TOGETHER, Measurements
 LAYERS = (1, 2, 4, 8)
 SUPERSAMPLE = (1, 2, "adaptive:4", 3, 4)
 HOPELESS = 2.0
-"""The error of a splatter up to which it is tried further, as a multiple of the best one's."""
+"""A splatter is tried further if its error is at most this many times the best splatter's."""
 ALIKE = 0.9
 """The share of another setting's time below which a setting counts as faster."""
 TURNS = 6
-"""Timed turns of the fastest settings; settings mentioned beside the chosen one have a sixth."""
+"""The most timed turns of a setting; settings that are only compared with the chosen one have one."""
 MORE_WORK = 2.0
-"""A setting with this many times the work of a sufficient one is not tried: no splatter is worth it."""
+"""A setting of more than this many times the estimated cost of an accurate one is not tried, whatever its splatter."""
 SLOWER = 3.0
-"""A setting that takes this many times as long as the fastest has one call."""
+"""A setting that takes more than this many times the fastest one's time is called only once."""
 ENOUGH = 3
-"""The least turns of the chosen setting."""
+"""The fewest timed turns of the chosen setting."""
 NEARLY = 1.2
-"""A setting is skipped if the best with as many samples has this many times the tolerance."""
+"""A setting is skipped if even the most layers and finest surface, with its samples, err by more than this many
+times the tolerance."""
 FAR = 1.5
-"""A setting is skipped if errors with fewer samples predict this many times the tolerance for it."""
+"""A setting is skipped if errors with fewer samples predict more than this many times the tolerance for it."""
 
 
 class Found(NamedTuple):
-    """The choice of a search.
+    """The setting that a search chose.
 
     Attributes:
-        setting: of the sampler, splatter, layers, samples and rate.
-        reasons: a line for each choice.
-        error: the largest along a mode.
+        setting: sampler, splatter, layers, samples, rate and engine.
+        reasons: a line for each of these but the engine, and for failures.
+        error: the largest error of the derivative along any mode, relative L2.
         seconds: median time of a render and gradient.
     """
 
@@ -54,8 +55,8 @@ class Search:
 
     Args:
         measured: the scene and its measurements.
-        samplers: names, each with the sampler whose errors it shares; "" for the usual one.
-        tolerance: of the error.
+        samplers: sampler → the sampler whose errors it shares, as `Measurements.kinds`.
+        tolerance: the largest error allowed along any mode, relative L2.
         deadline: when to stop measuring, on the clock of `time.perf_counter`.
         phase: shows progress.
     """
@@ -76,7 +77,7 @@ class Search:
         self.late = False
 
     def run(self, splatters: Sequence[str]) -> Found:
-        """The best setting, with one of these splatters, that time allows to find."""
+        """The fastest setting within the tolerance that is found in time; if there is none, the most accurate one."""
         cells: list[Setting] = []
         within: list[Setting] = []
         for kind in dict.fromkeys(self.samplers.values()):
@@ -86,7 +87,7 @@ class Search:
         within = [s for s in within if not self._needless(s, [other for other in within if other != s])]
         chosen = self._fastest(self._sampled(within or [self._best(cells)]))
         reasons, faster = self._reasons(chosen, cells, splatters)
-        if faster is not None:  # More work need not take longer.
+        if faster is not None:  # A setting of more work may take less time.
             chosen = faster
             reasons, _ = self._reasons(chosen, cells, splatters)
         error, seconds = self._error(chosen), self._timed([chosen], ENOUGH)[chosen]
@@ -115,12 +116,12 @@ class Search:
         supersample: Sequence[int | str] = SUPERSAMPLE,
         rates: bool = True,
     ) -> list[Setting]:
-        """All settings of a kind of sampler that may differ in their error, the cheapest first."""
+        """All settings whose sampler has errors of one kind, a value of `samplers`; the least work first."""
         settings = self.measured.settings(TOGETHER, splatters, layers, supersample, [kind], rates)
         return sorted(settings, key=lambda s: math.prod(self._work(s)))
 
     def _promising(self, splatters: Sequence[str], kind: str) -> list[str]:
-        """The splatters that are accurate enough, or nearly as accurate as the best, with two layers and one sample."""
+        """Splatters that are accurate enough with one or two layers and one sample, or nearly as good as the best."""
         known: dict[str, float] = {}
         for setting in self._cells(splatters, kind, LAYERS[:2], SUPERSAMPLE[:1], rates=False):
             if not self._over():
@@ -129,7 +130,7 @@ class Search:
         return [name for name in splatters if known.get(name, 0.0) <= allowed]
 
     def _sampled(self, settings: Sequence[Setting]) -> list[Setting]:
-        """Settings with each sampler: those that share their errors, and others that are accurate enough, too."""
+        """Each setting with all samplers that share its errors, and with others that are accurate enough."""
         sampled = []
         for setting in settings:
             for name, kind in self.samplers.items():
@@ -139,7 +140,7 @@ class Search:
         return sampled
 
     def _cell(self, setting: Setting) -> Setting:
-        """The key of a setting's error."""
+        """The setting that the error is kept under: with the sampler whose errors are shared, without engine."""
         return setting._replace(sampler=self.samplers.get(setting.sampler, setting.sampler), engine="")
 
     def _work(self, setting: Setting) -> tuple[float, ...]:
@@ -147,7 +148,7 @@ class Search:
         return layers, supersample**2, rate
 
     def _within(self, cells: Sequence[Setting]) -> list[Setting]:
-        """The settings within the tolerance, without those that a cheaper one makes needless."""
+        """Settings whose error is within the tolerance, without settings that are `_needless` beside a cheaper one."""
         done = self.phase("errors", len(cells))
         accurate: list[Setting] = []
         passed: list[Setting] = []
@@ -173,7 +174,7 @@ class Search:
         return True
 
     def _needless(self, setting: Setting, accurate: Sequence[Setting]) -> bool:
-        """True if an accurate setting costs far less, or is of the same kind and costs no more in any respect."""
+        """True if an accurate setting costs far less, or no more in any respect with the same splatter and sampler."""
         mine = self._work(setting)
         if any(self._cost(setting) > MORE_WORK * self._cost(s) for s in accurate):
             return True
@@ -184,9 +185,9 @@ class Search:
         )
 
     def _far(self, setting: Setting) -> bool:
-        """True if errors with fewer samples, extrapolated as a power of their number, predict one far too large."""
+        """True if errors with fewer samples, extrapolated as a power of the number, predict an error far too large."""
         if isinstance(setting.supersample, str):
-            return False  # At outlines its error is that of as many samples everywhere.
+            return False  # The error of "adaptive" is that of as many samples everywhere.
         numbers = [n for n in SUPERSAMPLE if not isinstance(n, str) and n < setting.supersample]
         fewer = {n: self._cell(setting._replace(supersample=n)) for n in numbers}
         known = [(n, self.bounds[cell]) for n, cell in fewer.items() if cell in self.bounds]
@@ -204,7 +205,10 @@ class Search:
         return math.sqrt(layers * rate) * samples
 
     def _in_vain(self, setting: Setting, cells: Sequence[Setting], accurate: list[Setting]) -> bool:
-        """True if a similar setting failed, and with these samples neither more layers nor a finer surface suffice."""
+        """True if this splatter and samples are too inaccurate even with the most layers and finest surface.
+
+        That setting is tried here, once any other setting of this splatter, sampler and samples was tried.
+        """
         level = [s for s in cells if s._replace(layers=0, rate="") == setting._replace(layers=0, rate="")]
         best = max(level, key=lambda s: (self._work(s)[2], self._work(s)[0]))
         if setting == best or not any(self._cell(s) in self.bounds for s in level) or self._over():
@@ -214,7 +218,7 @@ class Search:
         return self.bounds.get(self._cell(best), 0.0) > NEARLY * self.tolerance
 
     def _best(self, cells: Sequence[Setting]) -> Setting:
-        """The tried setting with the least error; the first of all if none was tried."""
+        """The tried setting with the least error; if none was tried, the first of `cells`."""
         least, best = math.inf, cells[0] if cells else None
         for setting in sorted(self.bounds, key=lambda s: self.bounds[s]):
             if self.bounds[setting] >= least:
@@ -227,7 +231,7 @@ class Search:
         return best
 
     def _bound(self, setting: Setting) -> float:
-        """The largest error along a mode, or the first that is beyond the tolerance."""
+        """The largest of a setting's errors along the modes, or the first of them beyond the tolerance."""
         worst = 0.0
         for mode in self.modes:
             error = self._along(mode, setting)
@@ -241,7 +245,7 @@ class Search:
         return worst
 
     def _error(self, setting: Setting) -> float:
-        """The largest error along a mode."""
+        """The largest of a setting's errors along the modes."""
         worst = max(self._along(mode, setting) for mode in self.modes)
         self.bounds[self._cell(setting)] = worst
         return worst
@@ -257,7 +261,7 @@ class Search:
         return self.late
 
     def _timed(self, settings: Sequence[Setting], turns: int = 1) -> dict[Setting, float]:
-        """Seconds of settings, without those that fail or come too late."""
+        """Setting → median seconds; without settings that fail, or whose turn comes after the deadline."""
         calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
         timed = self.measured.timing(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
         return {Setting(*s): ms["median"] / 1e3 for s, ms in timed.items()}
@@ -279,7 +283,7 @@ class Search:
     def _reasons(
         self, chosen: Setting, cells: Sequence[Setting], splatters: Sequence[str]
     ) -> tuple[list[str], Setting | None]:
-        """Lines on each choice: the cheaper one's fault, the dearer one's cost; and a setting better still, or None."""
+        """Lines on each choice: the cheaper one's error, the dearer one's time; and a faster accurate setting."""
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),
@@ -295,7 +299,7 @@ class Search:
         return lines, min(faster, key=lambda s: times[s], default=None)
 
     def _others(self, chosen: Setting, name: str, values: Sequence) -> tuple[Setting | None, Setting | None]:
-        """The next cheaper and the next dearer setting in one respect; for names, settings with another name."""
+        """The next cheaper and next dearer setting in one field; for plugins, None and the most accurate other one."""
         alternatives = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
         if name in ("splatter", "sampler"):
             known = [s for s in alternatives if self._cell(s) in self.bounds]
@@ -308,7 +312,7 @@ class Search:
     def _reason(
         self, chosen: Setting, name: str, below: Setting | None, above: Setting | None, times: Mapping[Setting, float]
     ) -> str:
-        """One line on one choice."""
+        """The line on one field of the chosen setting: the cheaper one's error, the dearer one's time and error."""
         parts = []
         if below is not None and not self._over():
             parts.append(f"{_value(below, name)} is off by {_percent(self._error(below))}")
@@ -320,7 +324,7 @@ class Search:
 
 
 def _value(setting: Setting, name: str) -> str:
-    """A choice in the form that a user would write."""
+    """The value of a field of a setting, in the form that a user would write."""
     value = getattr(setting, name)
     if name == "rate":
         return value or "the surfaces as they are given"

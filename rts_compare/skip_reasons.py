@@ -13,7 +13,7 @@ LONGEST = 200
 
 
 def one_line(text: str) -> str:
-    """The text in one line, cut where it is too long."""
+    """The text in one line, cut to at most `LONGEST` characters."""
     text = " ".join(text.split())
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
 
@@ -24,7 +24,7 @@ class TooSlow(Exception):
 
 @contextlib.contextmanager
 def limited(seconds: float) -> Iterator[None]:
-    """Raise `TooSlow` in a block of Python code that takes longer; without effect outside of the main thread."""
+    """Raise `TooSlow` in a block that takes longer than `seconds`; no effect outside the main thread or on Windows."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         yield
         return

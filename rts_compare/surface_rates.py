@@ -13,11 +13,11 @@ from rts_compare.moving_scenes import SceneFunction, parts_of
 
 
 class SceneAtRate(NamedTuple):
-    """A scene at some rates.
+    """A scene some of whose surfaces have another rate (`rts.Rate`).
 
     Attributes:
         at: parameters → (parts, camera).
-        work: how much it is, relative to the scene as it is given; roughly.
+        work: estimated cost relative to the scene as it is given.
     """
 
     at: SceneFunction
@@ -25,13 +25,13 @@ class SceneAtRate(NamedTuple):
 
 
 def scenes_at_rates(at: SceneFunction, parts: Sequence[Part]) -> dict[str, SceneAtRate]:
-    """The scene at several rates by what differs, such as "tolerance=0.4"; "" is the scene as it is given.
+    """Name of a rate, such as "tolerance=0.4" → the scene at this rate; "" → the scene as it is given.
 
     Surfaces of one kind are changed together, each to the first rate that it offers, to its second, and so on.
 
     Args:
         at: parameters → (parts, camera).
-        parts: what it gives; where θ has arrays of an engine, derivatives are taken.
+        parts: the parts that `at` gives; arrays of an engine in θ are differentiated, NumPy arrays are not.
     """
     offered: dict[tuple[type, int], dict[int, Rate]] = {}
     for index, part in enumerate(parts):
@@ -48,7 +48,7 @@ def scenes_at_rates(at: SceneFunction, parts: Sequence[Part]) -> dict[str, Scene
 
 
 def _changed(at: SceneFunction, rates: Mapping[int, Rate]) -> SceneFunction:
-    """A scene some of whose parts have other surfaces."""
+    """The scene with the surfaces and θ of `rates`, index of a part → its rate."""
 
     def changed(parameters: Tree) -> tuple[list[Part], Camera]:
         found = at(parameters)

@@ -27,9 +27,9 @@ from rts_compare.measurement_keys import layers_of, state_key
 from rts_compare.moving_scenes import Scene, parts_of
 
 SAMPLES = 16
-"""The square root of the number of points a pixel."""
+"""The square root of the number of points a pixel, on each grid."""
 STEP = 0.25
-"""Length of the difference, pixels."""
+"""Length of the central difference, pixels of motion."""
 AT_ONCE = 8
 """Number of points of each pixel that one call renders."""
 
@@ -41,7 +41,7 @@ class Truth(NamedTuple):
     """The change of an image along one mode.
 
     Attributes:
-        derivative: (H, W, 3) a pixel of motion, the mean of the two grids'.
+        derivative: (H, W, 3), change of colour per pixel of motion, the mean over both grids.
         error: estimated error of `derivative`, relative L2 through the low-pass of `scores`: half the difference of
             the grids, as if both erred equally and independently.
         grids: (2, H, W, 3) the derivative on each of the grids.
@@ -53,7 +53,7 @@ class Truth(NamedTuple):
 
     @property
     def noise(self) -> dict[str, float]:
-        """Relative L2 of the difference of both grids: raw, and through the low-pass."""
+        """Relative L2 of the difference of the grids' derivatives: as they are, and through the low-pass."""
         return {
             "relative_l2": relative_l2(self.grids[0], self.grids[1], self.derivative),
             "low_relative_l2": 2 * self.error,
@@ -112,7 +112,7 @@ def area_image(
 def truth_key(
     scene: Scene, mode: str, step: float, samples: int, engine: Engine | None, grids: Grids = lattices
 ) -> str:
-    """A hash of everything that determines the truth: the exact scene at the ends of the difference, and the grids."""
+    """A hash of everything that determines the truth: the exact scene at the ends of `step`, and the grids."""
     states = [state_key(*shown(scene, mode, by, engine), scene.size) for by in (-step / 2, step / 2)]
     points = () if grids is lattices else (fingerprint(grids(samples)),)
     return hashlib.sha256(repr((samples, states, *points)).encode()).hexdigest()[:20]
@@ -123,9 +123,9 @@ def shown(scene: Scene, mode: str, by: float, engine: Engine | None) -> tuple[li
 
     Args:
         scene: the scene.
-        mode: of it.
-        by: how far along the mode's direction.
-        engine: None for NumPy, where the scene takes it.
+        mode: a mode of the scene.
+        by: the factor of the mode's direction.
+        engine: the engine of the parameters; None for NumPy, if the scene is `separate`.
     """
     found = (scene.exact or scene.at)(scene.moved(mode, by, engine))
     return parts_of(found), found[1]
@@ -147,10 +147,10 @@ def truth(
 
     Args:
         scene: the scene.
-        mode: of it.
-        pixel: how far along the mode's direction one pixel of motion is.
-        samples: the square root of the number of points a pixel.
-        step: length of the difference, pixels.
+        mode: a mode of the scene.
+        pixel: the factor of the mode's direction that moves the fastest point by one pixel.
+        samples: the square root of the number of points a pixel, on each grid.
+        step: length of the central difference, pixels of motion.
         grids: `samples` → two grids of points (S, 2) of a pixel.
         engine: as in `shown`.
         folder: where truths are kept; None for the folder of caches.

@@ -23,23 +23,24 @@ from rts_compare.settings_search import SUPERSAMPLE, Search
 from rts_compare.true_derivatives import SAMPLES
 
 TRUTH_SAMPLES = (4, 8, SAMPLES)
-"""Samples of truths, along each side of a pixel: more where the error of the truth itself is too large."""
+"""Samples of truths along each side of a pixel: the next number where the truth's own error is too large."""
 TRUE = 0.3
-"""The largest error of a truth, as a share of the tolerance, which it makes larger by a twentieth."""
+"""The largest error of a truth, as a share of the tolerance; it makes an error of the tolerance seem 5 % larger."""
 SAMPLED = 1.0
-"""Seconds that a sampler may take, for 512² pixels or fewer."""
+"""Seconds that a sampler may take for an image of at most 512² pixels; in proportion for more."""
 
 
 class Tuned(NamedTuple):
-    """Settings, and what is to be rendered with them.
+    """The settings that `tune` chose, and the scene to render with them.
 
     Attributes:
         parts: the scene's parts at the parameters, without derivatives, their surfaces at the rates that were chosen.
         settings: keyword arguments of `rts.render`: sampler, splatter, layers and supersample.
-        rate: what is other about the surfaces, such as "tolerance=0.4"; "" for nothing.
-        reasons: a line for each choice: what the cheaper one lacks, and what the next costs.
-        scene: parameters → (parts, camera), with the same rates: what a fit renders.
-        error: the largest error of the derivatives along the modes, relative L2 through a Gaussian of 2 pixels.
+        rate: how the surfaces differ from the given ones, such as "tolerance=0.4"; "" if they do not.
+        reasons: a line for each choice: the error of a cheaper one, and the time of a dearer one.
+        scene: the function parameters → (parts, camera) with these rates, for a fit to render.
+        error: the largest error of the derivatives along any mode: relative L2, smoothed by a Gaussian of standard
+            deviation 2 pixels.
         seconds: median time of a render and gradient.
     """
 
@@ -71,30 +72,30 @@ def tune(
 ) -> Tuned:
     """Find the cheapest settings whose derivatives are accurate enough.
 
-    They are for `rts.render(tuned.parts, camera, size, **tuned.settings)`.
+    Render with them by `rts.render(tuned.parts, camera, size, **tuned.settings)`.
 
-    Sampler, splatter, layers, samples a pixel, and the rates that surfaces offer: tolerances, lattices, meshes of fewer
-    faces where no derivative is taken of their vertices. Errors are measured as in `rts_compare.compare`, of cheap
-    settings first; dearer ones are not looked at. Those that are accurate enough are timed in turns, and the slower
-    half is left out each time.
+    The choices are sampler, splatter, layers, samples a pixel, and the rates that surfaces offer: tolerances, lattices,
+    and meshes of fewer faces where no derivative is taken of their vertices. Errors are measured as in
+    `rts_compare.compare`, of cheap settings first, until dearer ones are not needed. Settings that are accurate enough
+    are timed in turns, and the slower half is left out each time.
 
     Args:
         scene: as in `rts_compare.compare`.
         parameters: of the scene's function: where derivatives are taken.
-        tolerance: the largest error of the derivatives along any mode, such as 0.05.
+        tolerance: the largest error of the derivatives along any mode, see `Tuned.error`; such as 0.05.
         budget_s: seconds of measuring, after which the best so far is taken. The truth, which is made before and kept,
-            is not refined when that would take longer than half of it.
+            is not refined when that would take longer than half the budget.
         directions: as in `compare`.
         size: (height, width); None for the scene's own. Errors and times are those of this size.
         modes: as in `compare`.
-        engine: its name; None for that of the parameters, or for the first that is installed.
+        engine: the engine's name; None for the engine of the parameters, or the first that is installed.
         samplers: names; None for all that suit the scene.
         splatters: names; None for all.
-        surface: the kind of surface that reads a model.
-        truths: the folder of truths; None for the folder of caches.
-        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
-            None for 4, 8 or 16, of each mode as few as make that error, which is measured, less than a third of the
-            tolerance. Where that takes too long, or 16 do not, a reason says so.
+        surface: the name of the surface that reads a model, such as "mesh" or "bezier".
+        truths: the folder of true derivatives; None for the folder of caches.
+        truth_samples: samples of true derivatives along each side of a pixel; fewer are faster and less exact. None for
+            4, 8 or 16: for each mode the fewest that make the truth's estimated error less than 0.3 of the tolerance.
+            Where that takes too long, or 16 do not suffice, a reason says so.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
@@ -142,7 +143,7 @@ def tune(
 
 
 def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase: Phase, finer: Sequence[int]) -> None:
-    """Make the truths; those that are too rough anew, of more samples, if that takes no longer than some seconds."""
+    """Make the truths; make rough ones anew with `finer` samples, while each such pass takes at most `seconds`."""
 
     def told(modes: Sequence[str], samples: int) -> Callable[[], None]:
         return phase(f"truth, {samples} × {samples}", 4 * samples**2 * len(modes))
@@ -160,7 +161,7 @@ def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase
 
 
 def _told_of_truths(measured: Measurements, tolerance: float) -> list[str]:
-    """A line for where errors are measured against a truth that is too rough for the tolerance."""
+    """A list of one line on the modes whose truth is too rough for the tolerance; empty if there are none."""
     rough = measured.rough(TRUE * tolerance)
     if not rough:
         return []
