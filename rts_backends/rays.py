@@ -10,6 +10,14 @@ from rts import Camera, InputError, Part, RaySurface, Sampler, engine_of, namesp
 from rts.plugin_api.arrays import Array, constants, exemplar, map_leaves, shape_of
 from rts.plugin_api.checks import check_camera
 from rts.plugin_api.records import ArraySpec, Cells, RayHits, Request, Samples
+from rts.plugin_api.splats import outline_cells
+
+
+REACH = 3.0
+"""Distance of outlines, in pixels, up to which deepest points tell how they move: beyond, a chord ends elsewhere."""
+
+ROOM = 16
+"""Rows of a capacity for each pair of rows at outlines, beside the capacity."""
 
 
 class Rays(Sampler):
@@ -71,7 +79,57 @@ class Rays(Sampler):
         facing = None
         if request.facing and hits.entering is not None:
             facing = _facing(xp.reshape(hits.entering, (layers, *size)), row)
-        return Samples(ids, params, Cells(row, depth, facing), overflow, followed=followed)
+        samples = Samples(ids, params, Cells(row, depth, facing), overflow, followed=followed)
+        asked = request.exits and request.cells is None and hits.entering is not None
+        if not (asked and type(surface).deepest is not RaySurface.deepest):
+            return samples
+        width = rays.spread[0] + rays.spread[1] * depth[0, ...]
+        start = origins + xp.reshape(hits.distance[0, ...], (-1, 1)) * directions
+        begins = xp.reshape(hits.entering, hit.shape)[0, ...] & (row[0, ...] >= 0)
+        reach = REACH * xp.reshape(width, (-1,))
+        return _with_deepest(samples, surface, theta, begins, (start, directions, reach), capacity)
+
+
+def _with_deepest(
+    samples: Samples, surface: RaySurface, theta: Any, begins: Array, rays: tuple[Array, ...], capacity: int | None
+) -> Samples:
+    """Samples with further rows, pairs beside the deepest points of rays through cells at outlines; see `Cells.exit`.
+
+    Args:
+        samples: the samples.
+        surface: the surface.
+        theta: its θ, constant.
+        begins: (H, W) bool, cells whose ray enters a solid at the front.
+        rays: points of the surface, directions, and reach, for all cells, as `RaySurface.deepest` takes them.
+        capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none.
+    """
+    engine, xp, rows = engine_of(samples.ids, begins), namespace(begins), samples.ids.shape[0]
+    room = begins.shape[0] * begins.shape[1] if capacity is None else -(-capacity // ROOM)
+
+    def find(row: np.ndarray, depth: np.ndarray, begins: np.ndarray) -> tuple[np.ndarray, ...]:
+        cells = outline_cells(row >= 0, depth)
+        cells = cells[begins.reshape(-1)[cells]][:room]
+        number = np.full(begins.shape, -1, np.int32)
+        number.reshape(-1)[cells] = np.arange(len(cells), dtype=np.int32)
+        listed = np.zeros(max(1, len(cells)) if capacity is None else room, np.int32)
+        listed[: len(cells)] = cells
+        return listed, number
+
+    specs = ArraySpec((room,), np.int32, packed=capacity is None), ArraySpec(tuple(begins.shape), np.int32)
+    cells, number = engine.call_host(find, specs, samples.row, samples.depth, begins)
+    result = surface.deepest(theta, *(xp.take(x, cells, axis=0) for x in rays))
+    assert result is not None
+    params, there = result
+    flat = xp.reshape(number, (-1,))
+    there = (number >= 0) & xp.reshape(xp.take(there, xp.where(flat >= 0, flat, 0), axis=0), number.shape)
+    first = rows + 2 * number
+    exits = xp.where(there[None, ...], xp.stack([first, first + 1]), -1)
+    params = xp.reshape(params, (-1, params.shape[-1]))
+    return samples.replace(
+        ids=xp.concat([samples.ids, xp.astype(params[:, : samples.ids.shape[1]], samples.ids.dtype)]),
+        params=xp.concat([samples.params, xp.astype(params, samples.params.dtype, copy=False)]),
+        exit=xp.astype(exits, xp.int32, copy=False),
+    )
 
 
 def _facing(entering: Array, row: Array) -> Array:

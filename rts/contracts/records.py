@@ -101,8 +101,10 @@ class Cells:
             consistently oriented: a piece seen from opposite sides in two neighbouring cells is not one sheet there.
             Numbers are larger by `MORE_BEHIND` in the last layer of cells whose K layers are all covered. None where
             no sides are recorded.
-        exit: (H, W) int32, the index of the sample where the ray leaves the closed part behind its front, or −1. Exits
-            are further samples, not in `row`, in cells at outlines and beside them. None if none are recorded.
+        exit: (E, H, W) int32, indices of one or two further samples, not in `row`, in cells at outlines and beside
+            them, or −1. The first alone is the sample where the ray leaves the closed part behind its front. Two are
+            samples beside the deepest point of the front's chord in a field: the sum of their motions is that of the
+            outline (`rts.splatting.rims`). None if none are recorded.
         settled: (H, W) integers. In a cell whose colour cannot change, however the scene moves, the index of a sample
             of this colour; −1 in others. Such a cell may lack a sample of its own, and so may cells around it that
             affect no others. Samples in it and in the eight cells around it have its colour. None if no cells are

@@ -271,3 +271,24 @@ class RaySurface(Surface):
             directions: (R, 3), not of unit length; distances are in units of them.
             layers: K.
         """
+
+    def deepest(
+        self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array
+    ) -> tuple[Array, Array] | None:
+        """Pairs of samples beside the deepest points of rays; they tell splatters how outlines of fields move.
+
+        A ray enters a solid at a point of its surface. The field is least at the deepest point of the chord that begins
+        there, and the outline is where this least value is zero. The motions of the two samples add up to the motion of
+        the outline. Two are needed where the field has a kink, one on each side of it; elsewhere they nearly coincide.
+
+        Args:
+            theta: θ without derivatives.
+            points: (R, 3), points of the surface, local space.
+            directions: (R, 3), the rays' directions, of any length.
+            reach: (R,), the distance from the ray beyond which an outline is of no interest, local units.
+
+        Returns:
+            `Samples.params` (R, 2, P) of the pairs, for surfaces whose hits have no ids, and marks (R,) bool of rays
+            that have one. None, the default, for surfaces without a field.
+        """
+        return None

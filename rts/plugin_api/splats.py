@@ -1,6 +1,7 @@
 """The splatters in array code, which compiled ones extend."""
 
+from rts.sampling.exits import outline_cells
 from rts.splatting.single_and_multi import Multi, Single
 from rts.splatting.visible import Visible
 
-__all__ = ["Multi", "Single", "Visible"]
+__all__ = ["Multi", "Single", "Visible", "outline_cells"]

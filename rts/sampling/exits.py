@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling.threads import read_only
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments
 
 
@@ -28,6 +28,24 @@ class Exits(NamedTuple):
         """The exits among `backs` (1, 1, M), triangles seen from behind: those not nearer than their cell's front."""
         front = fragments.depth[0].reshape(-1)[cells]
         return cls(cells, backs, (backs.triangle_ids >= 0) & (backs.depth >= front))
+
+
+def outline_cells(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Covered cells (M,) int32 whose front ends towards a neighbour, by depths alone, as flat indices.
+
+    A front ends towards an empty cell, and where it does not pair with the neighbour's front: where a hidden layer of
+    one is nearer to the front of the other.
+
+    Args:
+        covered: (K, H, W) bool.
+        depth: (K, H, W), depths of the samples; anything where nothing is covered.
+    """
+    from rts.sampling import exits_loops
+
+    marks = np.zeros(covered.shape[1:], np.bool_)
+    arguments = read_only(covered), read_only(depth), marks
+    parallel(exits_loops.mark_ends, len(marks), *arguments, work=20 * covered.size)
+    return np.flatnonzero(marks).astype(np.int32)
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:

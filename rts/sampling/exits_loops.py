@@ -34,6 +34,35 @@ def find(kept, cells):
     return count
 
 
+@loop
+def mark_ends(start, stop, covered, depth, marks):
+    """Mark cells of rows [start, stop) whose front ends towards a neighbour; see `exits.outline_cells`."""
+    layers, height, width = covered.shape
+    for y in range(start, stop):
+        for x in range(width):
+            if covered[0, y, x]:
+                marks[y, x] = _ends(covered, depth, y, x, layers, height, width)
+
+
+@compiled
+def _ends(covered, depth, y, x, layers, height, width):
+    """True if the front of a covered cell ends towards one of the eight cells around it."""
+    z = depth[0, y, x]
+    for n in range(9):
+        v, u = y + n // 3 - 1, x + n % 3 - 1
+        if n == 4 or not (0 <= v < height and 0 <= u < width):
+            continue
+        if not covered[0, v, u]:
+            return True
+        gap = abs(depth[0, v, u] - z)
+        for k in range(1, layers):
+            if covered[k, v, u] and abs(depth[k, v, u] - z) < gap:
+                return True
+            if covered[k, y, x] and abs(depth[k, y, x] - depth[0, v, u]) < gap:
+                return True
+    return False
+
+
 @compiled
 def _list(cells, count, first, marks):
     """Append the indices of a row's marked cells to `cells`; the first cell has index `first`. Returns the count."""

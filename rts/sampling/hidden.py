@@ -236,9 +236,9 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
         if exits:
             if (most := exits[0].max(initial=-1)) >= total:
                 raise InputError(f"exit refers to sample {most} of {total}; sample this scene anew")
-            near = np.full(exits[0].size, -1, np.int32)
+            near = np.full((len(exits[0]), kept[0].size), -1, np.int32)
             cells = beside_outlines(kept)[0]
-            near[cells] = exits[0].reshape(-1)[cells]
+            near[:, cells] = exits[0].reshape(len(near), -1)[:, cells]
             exits = (near.reshape(exits[0].shape),)
             numbering.use(exits[0], exits[0] >= 0)
         numbering.use(row, kept)

@@ -27,13 +27,25 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
     part, row, depth, *facing = engine_of(tables).by_host(on_host, elsewhere, *tables)
     xp, start = namespace(row), 0
-    exits, left = xp.full_like(row[0], -1), None
+    exits = None
     for i, s in enumerate(samples):
         row = xp.where(part == i, row + start, row) if start else row
         if s.exit is not None:
-            left = exits = xp.where((part[0] == i) & (s.exit >= 0), s.exit + start, exits)
+            before = xp.full_like(s.exit, -1) if exits is None else exits
+            own, before = _as_many(s.exit, before)
+            exits = xp.where((part[0] == i) & (own >= 0), own + start, before)
         start += s.ids.shape[0]
-    return Sampled(tuple(samples), Cells(row, depth, facing[0] if facing else None, left), overflow)
+    return Sampled(tuple(samples), Cells(row, depth, facing[0] if facing else None, exits), overflow)
+
+
+def _as_many(one: Array, other: Array) -> tuple[Array, Array]:
+    """`Cells.exit` of two parts, (E, H, W) each, with as many entries a cell; those appended are −1."""
+    xp, more = namespace(one), one.shape[0] - other.shape[0]
+
+    def longer(x: Array, by: int) -> Array:
+        return x if by <= 0 else xp.concat([x, *[xp.full_like(x[:1, ...], -1)] * by])
+
+    return longer(one, -more), longer(other, more)
 
 
 def _nothing_told(row: Array) -> Array:

@@ -62,7 +62,7 @@ def lift(
     packed = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0, *beside, views=views)
     exit_rows = None
     if exits is not None:
-        exit_rows = np.full(kept[0].shape, -1, np.int32)
+        exit_rows = np.full((1, *kept[0].shape), -1, np.int32)
         exit_rows.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
     ids, params, row, depth, total = packed[:5]
     return Samples(ids, params, Cells(row, depth, exit=exit_rows), np.asarray(max(0, total - len(ids)), np.int32))

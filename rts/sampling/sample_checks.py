@@ -113,7 +113,9 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
         sampler: the sampler.
     """
     count, shape = samples.ids.shape[-2], tuple(samples.row.shape)
-    own = {"row": shape[:1] + tuple(grid), "depth": shape, "facing": shape, "settled": shape[1:], "exit": shape[1:]}
+    own = {"row": shape[:1] + tuple(grid), "depth": shape, "facing": shape, "settled": shape[1:]}
+    if samples.exit is not None:
+        own["exit"] = (*samples.exit.shape[:1], *shape[1:])
     try:
         for name, expected in own.items():
             array: Any = getattr(samples, name)

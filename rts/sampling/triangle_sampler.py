@@ -219,7 +219,7 @@ class TriangleSampler(Sampler):
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
             **({"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not refines else {}),
-            **({"exit": ArraySpec(size, np.int32)} if exits else {}),
+            **({"exit": ArraySpec((1, *size), np.int32)} if exits else {}),
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
         }
 

@@ -136,7 +136,7 @@ class Layers(Depths):
 
     Attributes:
         position: for each layer (h, w, 3); any value where the layer is not covered.
-        exit: a mask of the cells with an exit (h, w), and its position (h, w, 3), see `Splats`; or None.
+        exits: for each entry of `Splats.exit` a mask of the cells that have it (h, w), and its position (h, w, 3).
     """
 
     def __init__(self, weights: Callable[[Array], Any], splats: Splats, facing: Array | None = None):
@@ -145,11 +145,11 @@ class Layers(Depths):
         cells = bordered(splats.row)
         every = [cells[k] for k in range(splats.row.shape[0])]
         self.position = [unpack(splats.positions, c) for c in every]
-        self.exit: tuple[Array, Array] | None = None
+        self.exits: list[tuple[Array, Array]] = []
         if splats.exit is not None:
             check_rows(splats.exit, splats.positions.shape[0])
-            exits = bordered(splats.exit[None])[0]
-            self.exit = exits >= 0, unpack(splats.positions, exits)
+            exits = bordered(splats.exit)
+            self.exits = [(exits[e] >= 0, unpack(splats.positions, exits[e])) for e in range(exits.shape[0])]
         sides = None if facing is None else list(bordered(facing, 0))
         super().__init__([p[..., 2] for p in self.position], cells >= 0, sides)
         self._color = [_weighted(unpack(splats.rgba, c), (c >= 0)[..., None]) for c in every]

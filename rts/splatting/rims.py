@@ -11,6 +11,8 @@ its eight neighbours. A direction is off if p + n is empty or not paired front t
 off, −n is not, and p₁ = p − n is covered. It is deep if it is usable, p₂ = p − 2n continues the surface, too, and the
 depths of all three fall off as on a smooth rim. The first rule that applies gives β and the partner:
 
+- Deepest: a direction is usable, and p has two samples beside the deepest point of its ray in a field. The partner's
+  motion is the sum of theirs, β = −1: an outline is where the least value of the field along a ray is zero.
 - Chord: p has an exit, where the ray leaves the closed part that it met, or else a second layer of the same part; and
   the square of the gap behind its front runs to zero along a usable direction. The partner is that exit or layer,
   β = −½: the middle of a quadric's chord moves as its rim does.
@@ -23,6 +25,8 @@ If several directions qualify, the one that points most along the sum of all off
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +44,8 @@ CONVERGING = 1.5
 """Ratio of the squares of two gaps, a pixel apart, from which a surface closes within two pixels."""
 HALF = 0.5
 """β of the line, and −β of the chord."""
+DEEPEST = -1.0
+"""β of deepest points, and of no other rule."""
 
 
 def gains(
@@ -98,13 +104,13 @@ class Back(NamedTuple):
     Attributes:
         own: (H, W) bool, cells whose chord may end there.
         covered: (h, w) bool, cells that have such an end, with a border of one cell.
-        gap: (h, w), distance of the end behind the front, without derivative.
-        position: (h, w, 3), position of the end.
+        gap: (h, w), distance of the end behind the front, without derivative; None for deepest points.
+        position: (h, w, 3), position of the end; for deepest points the sum of two.
     """
 
     own: Array
     covered: Array
-    gap: Array
+    gap: Array | None
     position: Array
 
 
@@ -150,8 +156,9 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
         beta = xp.where(take, xp.where(rim, _root(xp.where(rim, ratio, 2.0), xp), HALF), beta)
     chord = xp.full_like(inward, -1)
     for i, back in enumerate(_backs(layers, part)):
-        chord = xp.where(_closes(layers, usable, back), i, chord)
-    return chord, xp.where(chord >= 0, -HALF, beta), xp.where(chord >= 0, -1, inward)
+        closes = _closes(layers, usable, back)
+        chord, beta = xp.where(closes, i, chord), xp.where(closes, DEEPEST if back.gap is None else -HALF, beta)
+    return chord, beta, xp.where(chord >= 0, -1, inward)
 
 
 def chords(covered: np.ndarray) -> np.ndarray:
@@ -195,21 +202,28 @@ def _root(ratio: Array, xp: Any) -> Array:
 
 
 def _backs(layers: Layers, part: Array | None) -> list[Back]:
-    """The ends of chords: exits, and in cells without one the second layer of the front's part."""
+    """The ends of chords: deepest points, exits, and in cells without these the second layer of the front's part."""
     backs = []
-    if layers.exit is not None:
-        covered, position = layers.exit
+    if layers.exits:
+        covered, position = layers.exits[0]
+        if len(layers.exits) > 1:
+            pairs, second = layers.exits[1]
+            backs.append(Back(layers.at(pairs, 0, 0), pairs, None, position + second))
+            covered = covered & ~pairs
         backs.append(Back(layers.at(covered, 0, 0), covered, stopped(layers.behind(position[..., 2])), position))
     if part is not None and len(layers.position) > 1:
         covered, position = layers.covered[1], layers.position[1]
         own = layers.at(covered, 0, 0) & (part[0] == part[1])
-        own = own & ~backs[0].own if backs else own
+        for back in backs:
+            own = own & ~back.own
         backs.append(Back(own, covered, stopped(layers.behind(position[..., 2])), position))
     return backs
 
 
 def _closes(layers: Layers, usable: dict[Steps, Array], back: Back) -> Array:
-    """True where fronts and their far ends meet along a usable direction, (H, W)."""
+    """True where fronts and their far ends meet along a usable direction, (H, W); for deepest points, if there is one."""
+    if back.gap is None:
+        return functools.reduce(operator.or_, usable.values()) & back.own
     gap, closing = layers.at(back.gap, 0, 0), False
     for n in AROUND:
         inner = layers.at(back.gap, *n)

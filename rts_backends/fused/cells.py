@@ -104,8 +104,7 @@ class Cells:
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
         settled: (H, W) integers, the sample whose colour a target shows, whatever moves, or −1; None, or no rows, for
             no such targets.
-        exits: (H, W) integers, the sample where the ray leaves the part of the front, or −1; None, or no rows, if
-            unknown.
+        exits: (E, H, W) integers, `Cells.exit` of the records; None, or no entries, if unknown.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -130,11 +129,11 @@ class Cells:
         shape, row = row.shape, row[:1] if settings.kind == "single" else row
         if choices is None:
             _check_grids(shape, part=part, facing=facing)
-            _check_grids(shape[1:], exit=exits, wanted=wanted)
+            _check_grids(shape[1:], wanted=wanted, exit=exits[0] if exits is not None and len(exits) else None)
             Visible.check(row, len(positions), settled if settled is not None and len(settled) else None, exits)
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
-        self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
+        self.exits = read_only(self.row[:0] if exits is None else exits, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
         self._settled = np.empty((0, row.shape[2]), np.int8) if settled is None else np.asarray(settled)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
@@ -275,6 +274,7 @@ class Cells:
         result = Outlines(
             np.empty((height, width), kind),
             np.empty((height, width), np.int32),
+            self.exits[1:],
             offsets,
             np.empty(offsets[-1], np.int32),
             np.empty((offsets[-1], 9), np.uint8),

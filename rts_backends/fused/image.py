@@ -102,7 +102,7 @@ _OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": used,
 IMAGE = Operation(
     "rts.image",
     specification,
-    (2, 2, 3, 3, 3, 2, 2, 2),
+    (2, 2, 3, 3, 3, 2, 2, 3),
     _shape,
     _forward,
     _push,
@@ -114,4 +114,4 @@ IMAGE = Operation(
 """The image of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit: (H, W, 4), less
 the border, which is cut off.
 
-The last five are fields of `Splats`; absent ones have no rows: (0, H, W) or (0, W)."""
+The last five are fields of `Splats`; absent ones have no rows: (0, H, W), or (0, W) of `wanted` and `settled`."""

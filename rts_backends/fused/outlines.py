@@ -47,6 +47,7 @@ class Outlines(NamedTuple):
     Attributes:
         beta: (H, W), β at the targets below that are covered: v̂ = v + β (v − the motion of the partner's sample).
         partner: (H, W) int32, the partner's sample, an index of positions, where β is not 0.
+        second: (1, H, W) int32, where β is −1 a second sample, whose motion is added to the partner's; or no entries.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
         columns: (M,) int32, the targets' columns.
         gives: (M, 9) uint8, the kind of coverage from each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
@@ -56,6 +57,7 @@ class Outlines(NamedTuple):
 
     beta: np.ndarray
     partner: np.ndarray
+    second: np.ndarray
     offsets: np.ndarray
     columns: np.ndarray
     gives: np.ndarray
@@ -134,17 +136,25 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     layers, height, width = row.shape
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
     bits, front = ends[y, x] & DIRECTIONS, positions[row[0, y, x], 2]
-    leaves = len(exits) > 0 and exits[y, x] >= 0
+    if len(exits) > 1 and exits[1, y, x] >= 0:
+        for m in range(9):
+            n = OUTWARD[bits, m]
+            py, px = y + 1 - n // 3, x + 1 - n % 3
+            if n >= 0 and 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
+                return -positions.dtype.type(1), exits[0, y, x]
+    leaves = len(exits) > 0 and exits[0, y, x] >= 0 and not (len(exits) > 1 and exits[1, y, x] >= 0)
     # The other end of the chord, if any: where the ray leaves, or a second layer of the front's part.
     second = min(1, layers - 1)
-    back = exits[y, x] if leaves else row[second, y, x]
+    back = exits[0, y, x] if leaves else row[second, y, x]
     same = layers > 1 if one_part else len(part) > 1 and part[0, y, x] == part[1, y, x]
     own, m = positions[back, 2] - front, 0
     while back >= 0 and (leaves or same) and OUTWARD[bits, m] >= 0:
         py, px = y + 1 - OUTWARD[bits, m] // 3, x + 1 - OUTWARD[bits, m] % 3
         j = -1
         if 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
-            j = exits[py, px] if leaves else row[second, py, px]
+            j = exits[0, py, px] if leaves else row[second, py, px]
+            if leaves and len(exits) > 1 and exits[1, py, px] >= 0:
+                j = -1
         inner = positions[j, 2] - positions[row[0, py, px], 2] if j >= 0 else zero
         if j >= 0 and rules.converging * own * own <= inner * inner:
             return -rules.half, back
@@ -199,7 +209,7 @@ def fill(
         grid: the samples.
         part: (K, H, W), the part of each sample, or no layers.
         one_part: True if all samples are of one part.
-        exits: (H, W), where rays leave the part of the front, or no rows.
+        exits: (E, H, W), see `rts.plugin_api.records.Cells`.
         extent: largest less least depth of the fronts, the camera's 0 included.
         rules: limits of the rules.
         crossed: (H, W) uint8, the pairs of `crossing_pairs.py`, or no rows.
@@ -210,7 +220,7 @@ def fill(
         ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`, or of `narrow`.
         result: `Outlines`, to be filled but for its offsets.
     """
-    beta, partner, offsets, columns, gives, slopes, changes = result
+    beta, partner, _, offsets, columns, gives, slopes, changes = result
     positions, row, peak = grid.positions, grid.row, grid.peak
     kind, width = positions.dtype.type, ends.shape[1]
     around, which, samples = np.empty((9, 3), positions.dtype), np.empty(9, np.int64), np.empty(9, np.int64)
@@ -348,17 +358,22 @@ def _part(gives, d, part, ends, y, x):
 
 
 @compiled
-def _outline(t_positions, row, beta, partner, y, x, axis):
+def _outline(t_positions, row, beta, partner, second, y, x, axis):
     """The motion v̂ of the outline beside a cell, along an axis."""
     b, own = beta[y, x], t_positions[row[0, y, x], axis]
-    return own + b * (own - t_positions[partner[y, x], axis]) if b != 0 else own
+    if b == 0:
+        return own
+    other = t_positions[partner[y, x], axis]
+    if b == -1:
+        other += t_positions[second[0, y, x], axis]
+    return own + b * (own - other)
 
 
 @compiled
 def gain(d, t_positions, row, outlines, y):
     """The growth of a target's coverage by moving outlines along a tangent, in front and at the surface."""
     front, surface = outlines.slopes.dtype.type(0), outlines.slopes.dtype.type(0)
-    x, beta, partner = outlines.columns[d], outlines.beta, outlines.partner
+    x, rule = outlines.columns[d], (outlines.beta, outlines.partner, outlines.second)
     for n in range(9):
         kind = outlines.gives[d, n]
         if kind == NOTHING:
@@ -367,8 +382,8 @@ def gain(d, t_positions, row, outlines, y):
         i, qy, qx = row[0, y - v, x - u], y - v, x - u
         if kind == JOINED:
             qy, qx = y, x
-        along = outlines.slopes[d, n, 0] * (_outline(t_positions, row, beta, partner, qy, qx, 0) - t_positions[i, 0])
-        along += outlines.slopes[d, n, 1] * (_outline(t_positions, row, beta, partner, qy, qx, 1) - t_positions[i, 1])
+        along = outlines.slopes[d, n, 0] * (_outline(t_positions, row, *rule, qy, qx, 0) - t_positions[i, 0])
+        along += outlines.slopes[d, n, 1] * (_outline(t_positions, row, *rule, qy, qx, 1) - t_positions[i, 1])
         if kind == FRONT:
             front += along
         else:
@@ -402,15 +417,15 @@ def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_posi
 @loop
 def _pull(start, stop, row, outlines, border, g, first, g_positions):
     """`pull` of every other band of rows, from band `first` on: such bands share no sample."""
-    beta, partner, offsets, columns, gives, slopes, changes = outlines
-    arrays = beta, partner, offsets, columns, gives, slopes, changes
+    beta, partner, second, offsets, columns, gives, slopes, changes = outlines
+    arrays = beta, partner, second, offsets, columns, gives, slopes, changes
     for band in range(start, stop):
         top = (2 * band + first) * BAND
         _pull_rows(border + top, border + min(top + BAND, len(g)), row, *arrays, border, g, g_positions)
 
 
 @compiled
-def _pull_rows(top, bottom, row, beta, partner, offsets, columns, gives, slopes, changes, border, g, g_positions):
+def _pull_rows(top, bottom, row, beta, partner, second, offsets, columns, gives, slopes, changes, border, g, g_positions):
     """`pull` of the targets of rows [top, bottom)."""
     width, zero = g.shape[1], g_positions.dtype.type(0)
     for y in range(top, bottom):
@@ -423,11 +438,11 @@ def _pull_rows(top, bottom, row, beta, partner, offsets, columns, gives, slopes,
                 front += g[y - border, x - border, c] * changes[d, 0, c]
                 surface += g[y - border, x - border, c] * changes[d, 1, c]
             if front != zero or surface != zero:
-                _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front, surface)
+                _pull_target(g_positions, row, beta, partner, second, gives, slopes, d, y, x, front, surface)
 
 
 @compiled
-def _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front, surface):
+def _pull_target(g_positions, row, beta, partner, second, gives, slopes, d, y, x, front, surface):
     """`pull` of a target, from the gradients of the coverage of its buffers in front and at the surface."""
     zero = g_positions.dtype.type(0)
     joined_x, joined_y = zero, zero
@@ -443,17 +458,17 @@ def _pull_target(g_positions, row, beta, partner, gives, slopes, d, y, x, front,
             g_positions[i, 1] -= h_y
             joined_x, joined_y = joined_x + h_x, joined_y + h_y
         else:
-            _lead(g_positions, row, beta, partner, py, px, h_x, h_y)
+            _lead(g_positions, row, beta, partner, second, py, px, h_x, h_y)
     if joined_x != zero or joined_y != zero:
         i = row[0, y, x]
         g_positions[i, 0] += joined_x
         g_positions[i, 1] += joined_y
-        _lead(g_positions, row, beta, partner, y, x, joined_x, joined_y)
+        _lead(g_positions, row, beta, partner, second, y, x, joined_x, joined_y)
 
 
 @compiled(inline="always")
-def _lead(g_positions, row, beta, partner, y, x, g_x, g_y):
-    """Pass on the gradient of an outline's motion relative to its front: to the front's sample and its partner."""
+def _lead(g_positions, row, beta, partner, second, y, x, g_x, g_y):
+    """Pass on the gradient of an outline's motion relative to its front: to the front's sample and its partners."""
     b = beta[y, x]
     if b != 0:
         i, j = row[0, y, x], partner[y, x]
@@ -461,3 +476,7 @@ def _lead(g_positions, row, beta, partner, y, x, g_x, g_y):
         g_positions[i, 1] += b * g_y
         g_positions[j, 0] -= b * g_x
         g_positions[j, 1] -= b * g_y
+        if b == -1:
+            k = second[0, y, x]
+            g_positions[k, 0] += g_x
+            g_positions[k, 1] += g_y

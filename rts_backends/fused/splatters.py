@@ -75,9 +75,10 @@ class _Fused(SummingSplatter):
         part = splats.row[:0, :, :] if splats.part is None else splats.part
         facing = self._facing(splats)
         facing = splats.row[:0, :, :] if facing is None else facing
-        none = splats.row[0, :0, :]
-        known = splats.wanted, splats.settled, self._exits(splats)
-        return splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
+        none, exits = splats.row[0, :0, :], self._exits(splats)
+        exits = splats.row[:0, :, :] if exits is None else exits
+        known = *(none if x is None else x for x in (splats.wanted, splats.settled)), exits
+        return splats.positions, splats.rgba, splats.row, part, facing, *known
 
     def _facing(self, splats: Splats) -> Array | None:
         return splats.facing if "facing" in self.reads else None

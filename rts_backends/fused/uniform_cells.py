@@ -54,7 +54,7 @@ def survey(
         positions: (N, 3).
         rgba: (N, 4).
         row: (K, H, W).
-        exits: (H, W), samples where rays leave the part of the front, or no rows.
+        exits: (E, H, W), see `rts.plugin_api.records.Cells`.
         fronts: True if front layers alone make a target FLAT; otherwise they must be opaque, to hide those behind.
         reach: the largest offset of a sample from its cell's centre, pixels, at which weights are sure to sum to one.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
@@ -94,8 +94,8 @@ def survey(
                 elif asks and k > 0:
                     _hide(row[k, y], near[now])
             if start <= y < stop:
-                if len(exits) > 0:
-                    counts[y] += _note_exits(exits[y], seen)
+                for e in range(len(exits)):
+                    counts[y] += _note_exits(exits[e, y], seen)
                 for b in range(blocks):  # Assigning arrays compiles an error about their shapes as well: a second.
                     near[now, b] = hidden[y, b]
         if y > start and asks:

@@ -26,6 +26,17 @@ FLATTEST = 1e-6
 """Least squared slope by which a level is divided to move points, as a share of the usual one; this bounds motion."""
 
 
+MARCH, FIRST, GROWTH = 16, 1 / 24, 1.5
+"""Steps along a ray that seek its deepest point; the first, as a share of the reach; and their growth."""
+
+HALVINGS = 14
+"""Halvings of the bracket of a deepest point."""
+
+APART = 1 / 1500
+"""Distance of the two samples from their deepest point, as a share of the reach: beyond rounding, lest both lie on one
+side of a kink."""
+
+
 class Region(NamedTuple):
     """The region in which rays are followed: a `ball` or a `box`.
 
@@ -76,13 +87,14 @@ def box(low: np.ndarray, high: np.ndarray) -> Region:
 
 
 def moving(level: Callable[[Array], Array], points: Array, hit: Array) -> Array:
-    """Parameters (M, 6): points (M, 3) of a surface, and their motion for each unit by which the level falls.
+    """Parameters (M, 7): points (M, 3) of a surface, their motion for each unit by which the level falls, and zeros.
 
     The motion is w = ∇f / |∇f|²: the point x₀ − f(x₀) w is on the surface, to first order. `hit` (M,) bool is true for
     rows that are points of the surface; others pad.
     """
     engine = engine_of(points)
-    return engine.stop_gradient(engine.namespace.concat([points, per_level(gradient(level, points), hit)], axis=-1))
+    xp, slope = engine.namespace, per_level(gradient(level, points), hit)
+    return engine.stop_gradient(xp.concat([points, slope, xp.zeros_like(points[:, :1])], axis=-1))
 
 
 def per_level(slope: Array, hit: Array) -> Array:
@@ -150,6 +162,94 @@ def cast(
     if engine.padded(origins):
         return _cast_all(level, free, describe, rays, enter, layers, most)
     return _cast_some(level, free, describe, rays, enter, layers, most)
+
+
+def deepest(
+    level: Callable[[Array], Array],
+    free: Callable[[Array], Array],
+    points: Array,
+    directions: Array,
+    reach: Array,
+) -> tuple[Array, Array]:
+    """Pairs of samples beside the deepest points of rays; see `rts.RaySurface.deepest`.
+
+    Let s₋ ≤ 0 and s₊ ≥ 0 be the slopes of the level f along the ray just before and just behind the deepest point, and
+    λ = s₊ / (s₊ − s₋). Then G = λ ∇f₋ + (1 − λ) ∇f₊ is perpendicular to the ray, and the outline moves by
+    −(λ ∂f₋/∂θ + (1 − λ) ∂f₊/∂θ) G / |G|² (envelope theorem). A pair has the motions λ G / |G|² and (1 − λ) G / |G|².
+    Near an outline its distance from the ray is −f / |G|.
+
+    Args:
+        level: points (M, 3) → (M,), negative inside.
+        free: points (M, 3) → marks (M,) bool of points whose level follows θ; others have no motion.
+        points: (R, 3), points of the surface at which rays enter.
+        directions: (R, 3).
+        reach: (R,), the farthest distance of outlines.
+
+    Returns:
+        Parameters (R, 2, 7): points, motions for each unit of level, and levels; and marks (R,) bool of rays with a
+        pair.
+    """
+    engine = engine_of(points)
+    xp = engine.namespace
+    along = directions / xp.sqrt(xp.sum(directions * directions, axis=-1, keepdims=True))
+    value_at = partial(_without_derivative, level)
+
+    def at(t: Array) -> Array:
+        return points + t[:, None] * along
+
+    def slope_at(t: Array) -> Array:
+        return engine.stop_gradient(gradient(level, at(t)))
+
+    def march(state: dict[str, Array]) -> dict[str, Array]:
+        t, low, high = state["t"], state["low"], state["high"]
+        further = t + state["step"]
+        value = value_at(at(further))
+        passed = (value > state["value"]) & (high == 0)
+        return {
+            "low": xp.where(passed, state["before"], low),
+            "high": xp.where(passed, further, high),
+            "before": t,
+            "t": further,
+            "step": GROWTH * state["step"],
+            "value": value,
+        }
+
+    def halve(state: dict[str, Array]) -> dict[str, Array]:
+        middle = (state["low"] + state["high"]) / 2
+        falls = xp.sum(slope_at(middle) * along, axis=-1) < 0
+        return {"low": xp.where(falls, middle, state["low"]), "high": xp.where(falls, state["high"], middle)}
+
+    zero = xp.zeros_like(reach)
+    state = {"low": zero, "high": zero, "before": zero, "t": zero, "step": FIRST * reach, "value": value_at(points)}
+    state = engine.repeat(march, lambda state: xp.any(state["high"] == 0), state, MARCH)
+    passed = state["high"] > 0
+    state = {"low": state["low"], "high": state["high"]}
+    state = engine.repeat(halve, lambda state: xp.any(state["high"] > state["low"]), state, HALVINGS)
+    apart = APART * reach + 4 * xp.finfo(points.dtype).eps * xp.max(xp.abs(points), axis=-1)
+    sides = xp.clip(state["low"] - apart, 0.0, None), state["high"] + apart
+    slopes, levels = [slope_at(t) for t in sides], [value_at(at(t)) for t in sides]
+    # Squares of small slopes are no numbers of single precision.
+    largest = xp.max(xp.abs(xp.concat(slopes, axis=-1)), axis=-1)
+    largest = xp.where((largest > 0) & xp.isfinite(largest), largest, 1.0)
+    slopes = [s / largest[:, None] for s in slopes]
+    falls, rises = (xp.sum(s * along, axis=-1) for s in slopes)
+    falls, rises = xp.clip(-falls, 0.0, None), xp.clip(rises, 0.0, None)
+    bend = falls + rises
+    share = xp.where(bend > 0, rises / xp.where(bend > 0, bend, 1.0), 0.5)
+    across = share[:, None] * slopes[0] + (1 - share)[:, None] * slopes[1]
+    across = across - xp.sum(across * along, axis=-1, keepdims=True) * along
+    square = xp.sum(across * across, axis=-1)
+    far = -(levels[0] + levels[1]) / 2 / largest
+    near = passed & (square > 0) & (far * far < reach * reach * square)
+    move = across / (xp.where(near, square, 1.0) * largest)[:, None]
+    pair = []
+    for t, part, value in zip(sides, (share, 1 - share), levels, strict=True):
+        place = at(t)
+        part = xp.where(near & free(place), part, 0.0)
+        pair.append(xp.concat([place, part[:, None] * move, value[:, None]], axis=-1))
+    params = xp.stack(pair, axis=1)
+    near = near & xp.all(xp.isfinite(params), axis=(1, 2))
+    return engine.stop_gradient(xp.where(near[:, None, None], params, 0.0)), near
 
 
 class _Rays(NamedTuple):

@@ -179,13 +179,12 @@ class Implicit(Surface):
         """Refuse θ that lacks an entry which the field reads."""
         self.field.check(theta)
 
-    def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
-        """The G-buffer where rays met the field, at x₀ − f(x₀) w, with x₀ and w the first six parameters of samples.
+    def at_hits(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """The G-buffer where rays met the field, at x₀ − (f(x₀) − f₀) w, with x₀, w and f₀ the parameters of samples.
 
         Args:
             theta: θ.
-            samples: samples with the parameters of `rts_surfaces.implicit.casting.moving`.
-            level: f, points (M, 3) → (M,), differentiable in θ.
+            samples: samples with the parameters (N, 7) of `rts_surfaces.implicit.casting.moving`.
         """
         params = self.field.suited(theta, samples.params)
         xp = namespace(params)
@@ -193,7 +192,8 @@ class Implicit(Surface):
         used = xp.any(params != 0, axis=1, keepdims=True)
         params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
         points, along = params[:, :3], params[:, 3:6]
-        return self.gbuffer(theta, points - level(points)[:, None] * along)
+        change = self.field.level(theta, points) - params[:, 6]
+        return self.gbuffer(theta, points - change[:, None] * along)
 
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
         """Normals (N, 3) of unit length, outwards, at positions on the surface; zero where the field has no slope."""

@@ -21,7 +21,7 @@ from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import ArraySpec, Proxy, RayHits, Rays, Samples
 from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import marching_cubes
-from rts_surfaces.implicit.casting import box, cast, per_level
+from rts_surfaces.implicit.casting import box, cast, deepest, per_level
 from rts_surfaces.implicit.field import SIDES, Implicit, check_isovalue, known_number
 from rts_surfaces.implicit.function_on_lattice import FunctionOnLattice
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
@@ -285,6 +285,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             steps=int(np.ceil(steps)) if self.lipschitz is None else None,
         )
 
+    def deepest(
+        self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array
+    ) -> tuple[Array, Array]:
+        """See `rts.RaySurface`; caps do not move."""
+        points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
+        level = partial(self._capped if self.closed else self.field.level, theta)
+        return deepest(level, lambda x: level(x) <= self.field.level(theta, x), points, directions, reach)
+
     def _capped(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The level (M,), or if larger, the distance beyond the bounds, negative inside, times `lipschitz` or 1."""
         xp, level = namespace(points), self.field.level(theta, points)
@@ -335,8 +343,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, normals along the field's gradient, and attributes."""
         if samples.ids.shape[1] == 0:
-            was = self.field.suited(theta, samples.params[:, 6])
-            return self.at_hits(theta, samples, lambda points: self.field.level(theta, points) - was)
+            return self.at_hits(theta, samples)
         values, rows = self.field.six(theta, samples)
         isovalue, sign = self.field.level_of_values
         params = namespace(values).astype(samples.params, values.dtype, copy=False)

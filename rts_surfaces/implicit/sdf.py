@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from rts import GBuffer, InputError, Part, RaySurface
+from rts import GBuffer, InputError, Part, RaySurface, namespace
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_numbers, check_positive, is_count, quoted
 from rts.plugin_api.records import RayHits, Samples
-from rts_surfaces.implicit.casting import ball, cast, moving
+from rts_surfaces.implicit.casting import ball, cast, deepest, moving
 from rts_surfaces.implicit.field import Field, Function, Implicit, known_number
 from rts_surfaces.implicit.fields import swept_sphere
 
@@ -43,7 +43,7 @@ class Sdf(Implicit, RaySurface):
         InputError: wrong arguments.
     """
 
-    sample_widths = (0, 6)
+    sample_widths = (0, 7)
 
     def __init__(
         self,
@@ -95,4 +95,12 @@ class Sdf(Implicit, RaySurface):
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, "normal" of unit length, outwards, and the attributes."""
-        return self.at_hits(theta, samples, partial(self.field.level, theta))
+        return self.at_hits(theta, samples)
+
+    def deepest(
+        self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array
+    ) -> tuple[Array, Array]:
+        """See `rts.RaySurface`; in θ's dtype."""
+        points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
+        level, xp = partial(self.field.level, theta), namespace(points)
+        return deepest(level, lambda x: xp.ones_like(x[:, 0], dtype=xp.bool), points, directions, reach)
