@@ -507,7 +507,7 @@ SAMPLERS = {
     },
     "hidden_samples_are_left_out_where_it_says_so": {"keeps everything": Hoarder()},
     "exits_lie_on_the_part_behind_its_front": {
-        "fronts": OddExits(lambda found: found.row[0]),
+        "fronts": OddExits(lambda found: found.row[:1]),
         "none": OddExits(lambda found: np.full_like(found.exit, -1)),
         "nothing told": OddExits(lambda found: None),
         "others' exits": OddExits(lambda found: turned_about(found.exit)),

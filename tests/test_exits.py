@@ -44,7 +44,7 @@ def points(part, samples, rows):
 def test_rays_leave_a_ball_behind_its_front(sampler):
     part = ball()
     found = sampled(part, sampler=sampler, layers=1)
-    row, leaves = to_numpy(found.row)[0], to_numpy(found.exit)
+    row, leaves = to_numpy(found.row)[0], to_numpy(found.exit)[0]
     there = leaves >= 0
     covered = row >= 0
     ring = covered & dilated(covered & dilated(~covered))
@@ -173,7 +173,7 @@ def test_exits_that_cells_share_add_up_in_one_order(monkeypatch):
     y, x = np.nonzero(covered)
     positions = np.stack([x + 0.5, y + 0.5, 1 + 0.5 * (np.indices(shape).sum(axis=0)[covered] % 9 % 4 == 0)], axis=1)
     positions = np.concatenate([positions, [[30, 45, 2.0]]])
-    exits, g = np.where(covered, len(y), -1).astype(np.int32), rng.normal(size=(*shape, 4))
+    exits, g = np.where(covered, len(y), -1).astype(np.int32)[None], rng.normal(size=(*shape, 4))
     settings, part = fused.Visible()._settings(0), np.where(row >= 0, 0, -1)
     found = []
     for threads in (1, 2, 2, 2):
@@ -203,14 +203,14 @@ def test_pruned_scenes_of_several_parts_keep_their_exits():
     parts = two(arrays("torch-cpu", np.eye(4)))
     found = sampled(parts, fused.Visible(), layers=2)
     whole = sampled(parts, None, layers=2)
-    leaves, part = to_numpy(found.exit), to_numpy(found.part)[0]
+    leaves, part = to_numpy(found.exit)[0], to_numpy(found.part)[0]
     assert (part[leaves >= 0] == 1).all() and (leaves >= 0).sum() > 50
     first, count = found.samples[0].ids.shape[0], found.samples[1].ids.shape[0]
     named = leaves[leaves >= 0] - first
     assert named.min() >= 0 and named.max() < count
     # Those that are left are where they were.
     ends = points(parts[1], found.samples[1], named)
-    before = to_numpy(whole.exit)[leaves >= 0] - whole.samples[0].ids.shape[0]
+    before = to_numpy(whole.exit)[0][leaves >= 0] - whole.samples[0].ids.shape[0]
     np.testing.assert_array_equal(ends, points(parts[1], whole.samples[1], before))
 
 

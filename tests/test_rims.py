@@ -62,7 +62,7 @@ def centres(layers, height, width):
 
 
 def rule(pairing, cell, part, exits):
-    """Name of the rule of a cell, β and the partner's row."""
+    """Name of the rule of a cell, β and the partner's rows."""
     (y, x), row = cell, pairing.row
     ends = {n: pairing.ends(cell, n) for n in STEPS if n != (0, 0)}
     inner = {n: (y - n[1], x - n[0]) for n in ends}
@@ -83,19 +83,22 @@ def rule(pairing, cell, part, exits):
         here, near, far = (pairing.depth(0, *c) for c in (cell, inner[n], farther))
         return (here - near) / (near - far) if near - far > 1e-5 * pairing.extent else 0
 
-    if exits is not None and exits[cell] >= 0:
-        if closes(exits):
-            return "exit", -0.5, exits[cell]
+    if exits is not None and exits[1][cell] >= 0:
+        if any(ends.values()):
+            return "deepest", -1.0, exits[:, *cell]
+    elif exits is not None and exits[0][cell] >= 0:
+        if closes(np.where(exits[1] < 0, exits[0], -1)):
+            return "exit", -0.5, exits[:1, *cell]
     elif part is not None and len(row) > 1 and row[1, y, x] >= 0 and part[0, y, x] == part[1, y, x] and closes(row[1]):
-        return "chord", -0.5, row[1, y, x]
+        return "chord", -0.5, row[1:2, y, x]
     deep = [n for n in usable if ratio(n) > 1.23]
     if not usable:
-        return "none", 0.0, row[0, y, x]
+        return "none", 0.0, row[:1, y, x]
     best = max(deep or usable, key=lambda n: (n[0] * outward[0] + n[1] * outward[1]) / math.hypot(*n))
     if not deep:
-        return "line", 0.5, row[0, *inner[best]]
+        return "line", 0.5, row[:1, *inner[best]]
     r = ratio(best)
-    return "root", min(max((1 + 2 * r - r * r) / (2 * r * (r - 1)), 0.0), 2.5), row[0, *inner[best]]
+    return "root", min(max((1 + 2 * r - r * r) / (2 * r * (r - 1)), 0.0), 2.5), row[:1, *inner[best]]
 
 
 def corrections_by_loops(splatter, splats, tangent):
@@ -104,7 +107,7 @@ def corrections_by_loops(splatter, splats, tangent):
     pairing = Pairing(positions, row, visible=True)
     rules = {cell: rule(pairing, cell, splats.part, splats.exit) for cell in pairing.cells if pairing.covers(*cell)}
     own = {cell: tangent[row[0, *cell], :2] for cell in rules}
-    outline = {c: own[c] + beta * (own[c] - tangent[partner, :2]) for c, (_, beta, partner) in rules.items()}
+    outline = {c: own[c] + beta * (own[c] - tangent[partner, :2].sum(axis=0)) for c, (_, beta, partner) in rules.items()}
     total = sum(math.exp(-(u * u + v * v) / (2 * splatter.sigma**2)) for u, v in STEPS)
     added = np.zeros((*row.shape[1:], 4))
     for target in pairing.cells:
@@ -155,11 +158,14 @@ def composited(sums, gains, splatter, splats, target):
 def rough(layers, seed, height=6, width=7, exits=False):
     """Random scenes, where all rules apply to some cells: bumps with rims, steps, holes and layers that close.
 
-    With exits, the layer that would be the second is where rays leave, in most cells.
+    With exits, the layer that would be the second is where rays leave, in most cells; some have a second exit.
     """
     if exits:
         splats = rough(layers + 1, seed, height, width)
-        leaves = np.where(np.random.default_rng(seed).random((height, width)) < 0.8, splats.row[1], -1)
+        random = np.random.default_rng(seed)
+        leaves = np.where(random.random((height, width)) < 0.8, splats.row[1], -1)
+        leaves = np.stack([leaves, np.where(random.random(leaves.shape) < 0.3, leaves[::-1], -1)])
+        leaves[1] = np.where(leaves[0] < 0, -1, leaves[1])
         row, part = (np.delete(x, 1, axis=0) for x in (splats.row, splats.part))
         return splats.replace(row=row, part=part, exit=leaves.astype(np.int32))
     rng = np.random.default_rng(seed)
@@ -184,15 +190,15 @@ def double():
     jax.config.update("jax_enable_x64", False)
 
 
-RULES = (1, "root"), (2, "chord"), (3, "line"), (1, "exit"), (2, "exit")
-CASES = [*[(target, *rule) for target in TORCH for rule in RULES], ("jax", 1, "root"), ("jax", 1, "exit")]
+RULES = (1, "root"), (2, "chord"), (3, "line"), (1, "exit"), (2, "exit"), (2, "deepest")
+CASES = [*[(target, *rule) for target in TORCH for rule in RULES], ("jax", 1, "root"), ("jax", 1, "deepest")]
 
 
 @pytest.mark.parametrize("target, layers, name", CASES)
 def test_derivatives_change_as_the_loops_say(target, layers, name, double):
     seen = []
     for seed in range(4 if target in TORCH else 1):
-        splats = rough(layers, seed, exits=name == "exit")
+        splats = rough(layers, seed, exits=name in ("exit", "deepest"))
         tangent = np.random.default_rng(seed).normal(size=splats.positions.shape)
         expected, names = corrections_by_loops(Visible(), splats, tangent)
         image, found = pushed(Visible(crossings=False), splats, tangent, target)
@@ -408,7 +414,7 @@ def moved(size, velocity, layers=1, color=(1, 1, 1, 1), splatter=None):
     color = color(points) if callable(color) else color
     splats = packed(covered, place, depth, color, np.zeros(covered.shape) if layers > 1 else None)
     if leaves:
-        splats = splats.replace(row=splats.row[:1], part=splats.part[:1], exit=splats.row[1])
+        splats = splats.replace(row=splats.row[:1], part=splats.part[:1], exit=splats.row[1:])
     tangent = np.concatenate([speed, -v[..., 2:]], axis=-1)[covered]
     return pushed(splatter or Visible(), splats, tangent)[1]
 

@@ -205,6 +205,24 @@ class TriangleSurface(Surface):
         """
         return samples
 
+    def refine_outlines(
+        self, inputs: Tree, rays: Rays, depth: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Pairs of samples beside the deepest points of rays, on the host; see `RaySurface.deepest`.
+
+        Called for cells at outlines of surfaces with a `refine` that does not move samples.
+
+        Args:
+            inputs: the result of `proxy_inputs`, on the host.
+            rays: the rays (R, 3), local space.
+            depth: (R,), the depth of each ray's front.
+
+        Returns:
+            Ids (R, 2, I) and params (R, 2, P) of the pairs, as after `refine`, and marks (R,) bool of rays that have
+            one. None, the default, for surfaces without a field.
+        """
+        return None
+
     def why_no_triangles(self, inputs: Tree) -> str:
         """The predicate of a warning on a part whose `proxy` has no triangles, beginning with a verb.
 

@@ -6,8 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.arrays.trees import Tree
 from rts.compiling.threads import parallel, read_only
-from rts.contracts.records import Fragments
+from rts.contracts.records import Fragments, Samples
+from rts.contracts.surface import TriangleSurface
+from rts.scene.rays import Rays
 
 
 class Exits(NamedTuple):
@@ -46,6 +49,31 @@ def outline_cells(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
     arguments = read_only(covered), read_only(depth), marks
     parallel(exits_loops.mark_ends, len(marks), *arguments, work=20 * covered.size)
     return np.flatnonzero(marks).astype(np.int32)
+
+
+def with_pairs(samples: Samples, surface: TriangleSurface, inputs: Tree, rays: Rays) -> Samples:
+    """Samples with further rows, the pairs of a surface's `refine_outlines`, which `exit` (2, H, W) names.
+
+    Args:
+        samples: refined samples on the host, a row for each covered cell.
+        surface: the surface.
+        inputs: the result of its `proxy_inputs`, on the host.
+        rays: the rays of the samples' rows.
+    """
+    exits = np.full((2, *samples.row.shape[1:]), -1, np.int32)
+    cells = outline_cells(samples.row >= 0, samples.depth)
+    fronts = samples.row[0].reshape(-1)[cells]
+    own = Rays(rays.origins[fronts], rays.directions[fronts], rays.spread)
+    result = surface.refine_outlines(inputs, own, samples.depth[0].reshape(-1)[cells]) if len(cells) else None
+    if result is None:
+        return samples.replace(exit=exits)
+    ids, params, there = result
+    first = len(samples.ids) + 2 * np.arange(np.count_nonzero(there), dtype=np.int32)
+    exits.reshape(2, -1)[:, cells[there]] = first, first + 1
+    ids, params = (x[there].reshape(-1, x.shape[2]) for x in (ids, params))
+    return samples.replace(
+        ids=np.concatenate([samples.ids, ids]), params=np.concatenate([samples.params, params]), exit=exits
+    )
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:

@@ -69,7 +69,9 @@ def lift(
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
-    """Samples of the cells that are kept, packed anew and numbered layer by layer.
+    """Samples of the cells that are kept, packed anew and numbered layer by layer; exits get the last rows.
+
+    Exits find room where rows are left, in pairs if there are two a cell.
 
     Args:
         samples: on the host.
@@ -81,6 +83,14 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
     number = np.full(samples.row.shape, -1, np.int32)
     number[kept] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
     index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
+    exits = None if samples.exit is None else np.full(samples.exit.shape, -1, np.int32)
+    if exits is not None and capacity is None:
+        rows = min(rows + int(np.count_nonzero(samples.exit >= 0)), max(1, samples.row.size))
+    if exits is not None:
+        cells = np.nonzero(samples.exit[-1] >= 0)
+        cells = tuple(x[: (rows - len(index)) // len(exits)] for x in cells)
+        first, index = len(index), np.concatenate([index, samples.exit[:, *cells].T.reshape(-1)])
+        exits[:, *cells] = np.arange(first, len(index), dtype=np.int32).reshape(-1, len(exits)).T
 
     def packed(x: np.ndarray) -> np.ndarray:
         rows_kept = np.zeros((rows, *x.shape[1:]), x.dtype)
@@ -91,7 +101,7 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
         samples,
         ids=packed(samples.ids),
         params=packed(samples.params),
-        cells=replace(samples.cells, row=number, depth=np.where(number >= 0, samples.depth, np.float32(0))),
+        cells=replace(samples.cells, row=number, exit=exits, depth=np.where(number >= 0, samples.depth, np.float32(0))),
         overflow=overflow,
         tables={name: packed(x) if name in samples.by_sample else x for name, x in samples.tables.items()},
     )

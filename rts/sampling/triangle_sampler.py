@@ -19,7 +19,7 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, PluginError
 from rts.plugin_base import overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
-from rts.sampling.exits import Exits, beside_outlines
+from rts.sampling.exits import Exits, beside_outlines, with_pairs
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.layer_order import on_surface, refined
@@ -203,7 +203,7 @@ class TriangleSampler(Sampler):
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
         Sides are not recorded for surfaces that move samples off their triangles. Exits are not recorded for surfaces
-        with a `refine`, for surfaces that are not `centered`, nor for lists of cells.
+        with a `refine` but no `refine_outlines`, for surfaces that are not `centered`, nor for lists of cells.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -216,17 +216,19 @@ class TriangleSampler(Sampler):
         sides = request.facing and layers > 1 and part.cull == "none" and not moves
         sides = sides and overrides(surface, "pieces", TriangleSurface)
         exits = request.exits and part.cull == "back" and listed is None and not refines and surface.centered
+        pairs = request.exits and listed is None and refines and not moves
+        pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
             **({"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not refines else {}),
-            **({"exit": ArraySpec((1, *size), np.int32)} if exits else {}),
+            **({"exit": ArraySpec((1 + pairs, *size), np.int32)} if exits or pairs else {}),
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(cells[0], np.int32) if cells else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own)
-            samples = search.moved() if moves else search.in_place(sides, exits)
+            samples = search.moved() if moves else search.in_place(sides, exits, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
@@ -298,8 +300,8 @@ class _Search:
     entry: Entry | None
     cells: np.ndarray | None
 
-    def in_place(self, sides: bool, exits: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them."""
+    def in_place(self, sides: bool, exits: bool, pairs: bool) -> Samples:
+        """Samples on the triangles, or refined by a surface that does not move them; with `pairs`, those at outlines."""
         known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
         # All refined samples stay, also those amid one colour.
@@ -312,7 +314,11 @@ class _Search:
             lifted = lift(fragments, known.proxy, self.shape.capacity, kept, behind)
             return lifted.replace(facing=facing, settled=decision.settled)
         lifted = lift(fragments, known.proxy, None, kept)
-        samples, _ = refined(self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells)
+        samples, rays = refined(
+            self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells
+        )
+        if pairs:
+            samples = with_pairs(samples, self.surface, self.inputs, rays)
         return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
 
     def moved(self) -> Samples:

@@ -11,7 +11,7 @@ its eight neighbours. A direction is off if p + n is empty or not paired front t
 off, −n is not, and p₁ = p − n is covered. It is deep if it is usable, p₂ = p − 2n continues the surface, too, and the
 depths of all three fall off as on a smooth rim. The first rule that applies gives β and the partner:
 
-- Deepest: a direction is usable, and p has two samples beside the deepest point of its ray in a field. The partner's
+- Deepest: a direction is off, and p has two samples beside the deepest point of its ray in a field. The partner's
   motion is the sum of theirs, β = −1: an outline is where the least value of the field along a ray is zero.
 - Chord: p has an exit, where the ray leaves the closed part that it met, or else a second layer of the same part; and
   the square of the gap behind its front runs to zero along a usable direction. The partner is that exit or layer,
@@ -156,7 +156,7 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
         beta = xp.where(take, xp.where(rim, _root(xp.where(rim, ratio, 2.0), xp), HALF), beta)
     chord = xp.full_like(inward, -1)
     for i, back in enumerate(_backs(layers, part)):
-        closes = _closes(layers, usable, back)
+        closes = _closes(layers, off if back.gap is None else usable, back)
         chord, beta = xp.where(closes, i, chord), xp.where(closes, DEEPEST if back.gap is None else -HALF, beta)
     return chord, beta, xp.where(chord >= 0, -1, inward)
 
@@ -220,12 +220,12 @@ def _backs(layers: Layers, part: Array | None) -> list[Back]:
     return backs
 
 
-def _closes(layers: Layers, usable: dict[Steps, Array], back: Back) -> Array:
-    """True where fronts and their far ends meet along a usable direction, (H, W); for deepest points, if there is one."""
+def _closes(layers: Layers, directions: dict[Steps, Array], back: Back) -> Array:
+    """True where fronts and their far ends meet along a direction, (H, W); for deepest points, where there is one."""
     if back.gap is None:
-        return functools.reduce(operator.or_, usable.values()) & back.own
+        return functools.reduce(operator.or_, directions.values()) & back.own
     gap, closing = layers.at(back.gap, 0, 0), False
     for n in AROUND:
         inner = layers.at(back.gap, *n)
-        closing = closing | (usable[n] & layers.at(back.covered, *n) & (CONVERGING * gap * gap <= inner * inner))
+        closing = closing | (directions[n] & layers.at(back.covered, *n) & (CONVERGING * gap * gap <= inner * inner))
     return closing & back.own

@@ -244,7 +244,8 @@ class SamplerConformance(Conformance):
                 continue
             if sampled.exit is None:
                 continue
-            exits, row = np.asarray(sampled.exit), np.asarray(sampled.row)
+            claim(len(sampled.exit) == 1, f"part {index}: exit has {len(sampled.exit)} entries a cell")
+            exits, row = np.asarray(sampled.exit)[0], np.asarray(sampled.row)
             there = exits >= 0
             told.append(there.any())
             claim(exits.shape == row.shape[1:], f"part {index}: exit has shape {exits.shape}")

@@ -137,12 +137,8 @@ def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
     bits, front = ends[y, x] & DIRECTIONS, positions[row[0, y, x], 2]
     if len(exits) > 1 and exits[1, y, x] >= 0:
-        for m in range(9):
-            n = OUTWARD[bits, m]
-            py, px = y + 1 - n // 3, x + 1 - n % 3
-            if n >= 0 and 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
-                return -positions.dtype.type(1), exits[0, y, x]
-    leaves = len(exits) > 0 and exits[0, y, x] >= 0 and not (len(exits) > 1 and exits[1, y, x] >= 0)
+        return -positions.dtype.type(1), exits[0, y, x]
+    leaves = len(exits) > 0 and exits[0, y, x] >= 0
     # The other end of the chord, if any: where the ray leaves, or a second layer of the front's part.
     second = min(1, layers - 1)
     back = exits[0, y, x] if leaves else row[second, y, x]

@@ -134,7 +134,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             None if lipschitz is None else known_number("lipschitz", check_positive("lipschitz", lipschitz))
         )
         self._usual: dict[tuple, float] = {}
-        self.sample_widths = (6, 16 if motion == "normal" else 4)
+        self.sample_widths = (6, 16)
         if f is not None:
             if shape is None:
                 raise InputError("shape is None; expected (X, Y, Z), how finely to look at f")
@@ -245,15 +245,34 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         points = np.zeros((len(samples.ids), 6), np.int32)
         params = np.zeros((len(samples.ids), self.sample_widths[1]), np.float32)
         least = 0.0 if self.near_singular == "keep" else NEAR_SINGULAR * self._usual_difference(inputs)
-        if self.motion == "edge":
-            params[:, 3] = least if self.near_singular == "bound" else 0.0
+        along_edges = self.motion == "edge"
         isovalue, sign = self.field.level_of_values
         arguments = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
         # Where no cell is covered there is a row nevertheless, of nothing.
         count = int(samples.row.max()) + 1
         results = points, params, least / lattice.step.max()
         parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *results, work=300 * count)
+        if along_edges:
+            params[:, 3:] = 0
+            params[:, 3] = least if self.near_singular == "bound" else 0.0
         return self.field.tabled(replace(samples, ids=points, params=params))
+
+    def refine_outlines(
+        self, inputs: Mapping[str, np.ndarray], rays: Rays, depth: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """See `rts.TriangleSurface`; not in a band, whose cells end before deepest points, nor with a table."""
+        from rts_surfaces.implicit import lattice_samples_loops
+
+        if "corners" in inputs or self.field.table:
+            return None
+        lattice, count = self.field.lattice(inputs), len(depth)
+        isovalue, sign = self.field.level_of_values
+        values = np.ascontiguousarray(inputs["values"]).reshape(-1)
+        results = np.zeros((count, 2, 6), np.int32), np.zeros((count, 2, 16), np.float32), np.zeros(count, np.bool_)
+        arguments = values, float(values.dtype.type(isovalue)), sign, self.closed, lattice.shape, lattice.low, lattice.step
+        given = *arguments, *rays[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
+        parallel(lattice_samples_loops.deepest, count, *given, *results, work=2000 * count)
+        return results
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
         """The median difference of the field between the ends of crossed edges; `proxy` keeps it for `refine`."""
@@ -346,11 +365,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             return self.at_hits(theta, samples)
         values, rows = self.field.six(theta, samples)
         isovalue, sign = self.field.level_of_values
-        params = namespace(values).astype(samples.params, values.dtype, copy=False)
-        if self.motion == "normal":
-            return self.gbuffer(theta, ALONG_NORMAL(values, params, rows, isovalue=isovalue, sign=sign))
-        lattice, numbers = self.field.lattice(theta), self.field.numbers(samples)
-        position = ALONG_EDGES(values, params, rows, numbers, isovalue=isovalue, lattice=lattice.fixed)
+        xp = namespace(values)
+        params = xp.astype(samples.params, values.dtype, copy=False)
+        position = ALONG_NORMAL(values, params, rows, isovalue=isovalue, sign=sign)
+        if self.motion == "edge":
+            lattice, numbers = self.field.lattice(theta), self.field.numbers(samples)
+            by_edges = ALONG_EDGES(values, params[:, :4], rows, numbers, isovalue=isovalue, lattice=lattice.fixed)
+            # Pairs at outlines have no barycentrics.
+            position = xp.where(xp.any(params[:, :3] != 0, axis=1, keepdims=True), by_edges, position)
         return self.gbuffer(theta, position)
 
 

@@ -30,6 +30,7 @@ class LatticeField(ScalarField):
     """
 
     name = "theta['values']"
+    table = False
 
     def __init__(self, bounds: Any, isovalue: float, sign: float, shape: Any = None):
         self.bounds, self.isovalue, self.sign = bounds, isovalue, sign

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
+from rts_surfaces.implicit.casting import APART, FIRST, GROWTH, HALVINGS, MARCH, REACH
 
 LARGEST = 1e38
 """Larger motions, beyond single precision, become zero: where fields are flat to the last digit nothing moves."""
@@ -109,3 +110,169 @@ def hand_on(start, stop, faces, ends, cells, caps, ids):
             for i in range(2):
                 ids[t, 2 * k + i] = ends[faces[t, k], i]
         ids[t, 6], ids[t, 7] = cells[t], caps[t]
+
+
+@compiled
+def _level(values, isovalue, sign, capped, shape, low, step, at, slope):
+    """The level at a point, interpolated along each axis, and its gradient in `slope`; beyond the bounds see below.
+
+    Returns the level, the lowest corner of the cell, and True if a cap decides: if `capped`, the level is at least the
+    distance beyond the bounds. Otherwise the level is infinite there.
+    """
+    side, beyond = 0, -np.inf
+    for i in range(3):
+        high = low[i] + step[i] * (shape[i] - 1)
+        for end in range(2):
+            over = at[i] - high if end else low[i] - at[i]
+            if over > beyond:
+                side, beyond = 2 * i + end, over
+    if beyond > 0 and not capped:
+        return np.inf, 0, True
+    base = 0
+    for i in range(3):
+        cell = min(max(int(np.floor((at[i] - low[i]) / step[i])), 0), shape[i] - 2)
+        base = base * shape[i] + cell
+    x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
+    near_x = min(max((at[0] - low[0]) / step[0] - x, 0.0), 1.0)
+    near_y = min(max((at[1] - low[1]) / step[1] - y, 0.0), 1.0)
+    near_z = min(max((at[2] - low[2]) / step[2] - z, 0.0), 1.0)
+    level = 0.0
+    slope[:] = 0
+    for i in range(8):
+        a, b, c = i & 1, i >> 1 & 1, i >> 2 & 1
+        value = sign * (np.float64(values[base + (a * shape[1] + b) * shape[2] + c]) - isovalue)
+        along_x, along_y = (near_x if a else 1 - near_x), (near_y if b else 1 - near_y)
+        along_z = near_z if c else 1 - near_z
+        level += along_x * along_y * along_z * value
+        slope[0] += (2 * a - 1) * along_y * along_z * value / step[0]
+        slope[1] += (2 * b - 1) * along_x * along_z * value / step[1]
+        slope[2] += (2 * c - 1) * along_x * along_y * value / step[2]
+    if capped and beyond > level:
+        slope[:] = 0
+        slope[side // 2] = 1 if side & 1 else -1
+        return beyond, base, True
+    return level, base, False
+
+
+@compiled
+def _rest(at, base, shape, low, step, out):
+    """Fill the places (3,) of a point in the cell with this lowest corner, 0 to 1 along each axis."""
+    x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
+    out[0] = min(max((at[0] - low[0]) / step[0] - x, 0.0), 1.0)
+    out[1] = min(max((at[1] - low[1]) / step[1] - y, 0.0), 1.0)
+    out[2] = min(max((at[2] - low[2]) / step[2] - z, 0.0), 1.0)
+
+
+@compiled
+def _along(start, direction, t, out):
+    for i in range(3):
+        out[i] = start[i] + t * direction[i]
+
+
+@loop
+def deepest(
+    start, stop, values, isovalue, sign, capped, shape, low, step, origins, directions, depth, spread, points, params, there
+):
+    """Fill pairs of samples beside the deepest points of rays [start, stop); see `casting.deepest`.
+
+    Args:
+        start: the first ray.
+        stop: the ray after the last.
+        values: (M,), of all lattice points.
+        isovalue: see `fill`.
+        sign: see `fill`.
+        capped: True if the surface is closed at the bounds.
+        shape: see `fill`.
+        low: see `fill`.
+        step: see `fill`.
+        origins: (R, 3), of `rts.plugin_api.records.Rays`.
+        directions: (R, 3), also of `Rays`.
+        depth: (R,), depths of the surface's points on the rays.
+        spread: (2,), of `Rays`.
+        points: (R, 2, 6) int32, to be filled with the numbers of lattice points.
+        params: (R, 2, 16), zeros, to be filled as in `fill`, with barycentrics of zero.
+        there: (R,) bool, to be filled: rays that have a pair.
+    """
+    first, unit, at = np.empty(3), np.empty(3), np.empty(3)
+    slope, near, ends = np.empty(3), np.empty(3), np.empty((2, 3))
+    for n in range(start, stop):
+        there[n] = False
+        length = np.sqrt(directions[n, 0] ** 2 + directions[n, 1] ** 2 + directions[n, 2] ** 2)
+        for i in range(3):
+            first[i], unit[i] = origins[n, i] + depth[n] * directions[n, i], directions[n, i] / length
+        reach = REACH * (spread[0] + spread[1] * depth[n])
+        # Steps that grow pass the deepest point.
+        before, t, move = 0.0, 0.0, FIRST * reach
+        value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, slope)
+        a, b = 0.0, 0.0
+        for _ in range(MARCH):
+            _along(first, unit, t + move, at)
+            after, _, _ = _level(values, isovalue, sign, capped, shape, low, step, at, slope)
+            if after > value:
+                a, b = before, t + move
+                break
+            before, t, move, value = t, t + move, GROWTH * move, after
+        if b == 0 or not np.isfinite(after):
+            continue
+        for _ in range(HALVINGS):
+            middle = (a + b) / 2
+            _along(first, unit, middle, at)
+            _level(values, isovalue, sign, capped, shape, low, step, at, slope)
+            if slope[0] * unit[0] + slope[1] * unit[1] + slope[2] * unit[2] < 0:
+                a = middle
+            else:
+                b = middle
+        a, b, level = max(a - APART * reach, 0.0), b + APART * reach, 0.0
+        falls, rises = 0.0, 0.0
+        for k in range(2):
+            _along(first, unit, b if k else a, at)
+            value, base, cap = _level(values, isovalue, sign, capped, shape, low, step, at, ends[k])
+            rate = ends[k, 0] * unit[0] + ends[k, 1] * unit[1] + ends[k, 2] * unit[2]
+            if k:
+                rises = max(rate, 0.0)
+            else:
+                falls = max(-rate, 0.0)
+            level += value / 2
+            _tetrahedron(values, isovalue, base, shape, low, step, at, near, points[n, k], params[n, k])
+            params[n, k, 15] = np.nan if cap else params[n, k, 15]
+        share = rises / (falls + rises) if falls + rises > 0 else 0.5
+        across, square = 0.0, 0.0
+        for i in range(3):
+            slope[i] = share * ends[0, i] + (1 - share) * ends[1, i]
+            across += slope[i] * unit[i]
+        for i in range(3):
+            slope[i] -= across * unit[i]
+            square += slope[i] * slope[i]
+        if not (level <= 0 and level * level < reach * reach * square):
+            params[n] = 0
+            continue
+        there[n] = True
+        for k in range(2):
+            part = 1 - share if k else share
+            if np.isnan(params[n, k, 15]):
+                part, params[n, k, 15] = 0.0, 0.0
+            for i in range(3):
+                moved = part * slope[i] / square
+                params[n, k, 12 + i] = moved if abs(moved) < LARGEST else 0.0
+
+
+@compiled
+def _tetrahedron(values, isovalue, base, shape, low, step, at, near, points, params):
+    """Fill the four lattice points, and their weights, that interpolate at a point; its place, and the level there."""
+    _rest(at, base, shape, low, step, near)
+    number, left, level = base, 1.0, 0.0
+    for k in range(6):
+        points[k], params[3 + k] = number, 0
+        if k > 3:
+            continue
+        # The next corner lies along the axis with the largest place of those that remain.
+        axis = 0 if near[0] >= near[1] and near[0] >= near[2] else 1 if near[1] >= near[2] else 2
+        own = near[axis] if k < 3 else 0.0
+        params[3 + k] = left - own
+        level += (left - own) * (np.float64(values[number]) - isovalue)
+        if k < 3:
+            number += shape[1] * shape[2] if axis == 0 else shape[2] if axis == 1 else 1
+            left, near[axis] = own, -1.0
+    for i in range(3):
+        params[9 + i] = at[i]
+    params[15] = level
