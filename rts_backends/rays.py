@@ -43,7 +43,7 @@ class Rays(Sampler):
         rays = camera.rays(size)
         directions = xp.reshape(rays.directions, (-1, 3))
         origins = xp.reshape(rays.origins, (-1, 3))
-        listed = True
+        listed, view = True, size
         if request.cells is not None:
             index: Array = xp.reshape(constants(request.cells, engine, like), (-1,))
             size, listed = tuple(request.cells.shape), index[None] >= 0
@@ -80,18 +80,26 @@ class Rays(Sampler):
         if request.facing and hits.entering is not None:
             facing = _facing(xp.reshape(hits.entering, (layers, *size)), row)
         samples = Samples(ids, params, Cells(row, depth, facing), overflow, followed=followed)
-        asked = request.exits and request.cells is None and hits.entering is not None
+        asked = request.exits and hits.entering is not None
         if not (asked and type(surface).deepest is not RaySurface.deepest):
             return samples
         width = rays.spread[0] + rays.spread[1] * depth[0, ...]
         start = origins + xp.reshape(hits.distance[0, ...], (-1, 1)) * directions
         begins = xp.reshape(hits.entering, hit.shape)[0, ...] & (row[0, ...] >= 0)
         reach = REACH * xp.reshape(width, (-1,))
-        return _with_deepest(samples, surface, theta, begins, (start, directions, reach), capacity)
+        cells = None if request.cells is None else constants(request.cells, engine, like)
+        return _with_deepest(samples, surface, theta, begins, (start, directions, reach), capacity, cells, view)
 
 
 def _with_deepest(
-    samples: Samples, surface: RaySurface, theta: Any, begins: Array, rays: tuple[Array, ...], capacity: int | None
+    samples: Samples,
+    surface: RaySurface,
+    theta: Any,
+    begins: Array,
+    rays: tuple[Array, ...],
+    capacity: int | None,
+    listed: Array | None,
+    view: tuple[int, int],
 ) -> Samples:
     """Samples with further rows, pairs beside the deepest points of rays through cells at outlines; see `Cells.exit`.
 
@@ -102,12 +110,14 @@ def _with_deepest(
         begins: (H, W) bool, cells whose ray enters a solid at the front.
         rays: points of the surface, directions, and reach, for all cells, as `RaySurface.deepest` takes them.
         capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none.
+        listed: (L, C), `Request.cells`.
+        view: (height, width) of the grid.
     """
     engine, xp, rows = engine_of(samples.ids, begins), namespace(begins), samples.ids.shape[0]
     room = begins.shape[0] * begins.shape[1] if capacity is None else -(-capacity // ROOM)
 
-    def find(row: np.ndarray, depth: np.ndarray, begins: np.ndarray) -> tuple[np.ndarray, ...]:
-        cells = outline_cells(row >= 0, depth)
+    def find(row: np.ndarray, depth: np.ndarray, begins: np.ndarray, *own: np.ndarray) -> tuple[np.ndarray, ...]:
+        cells = outline_cells(row >= 0, depth, *own, size=view)
         cells = cells[begins.reshape(-1)[cells]][:room]
         number = np.full(begins.shape, -1, np.int32)
         number.reshape(-1)[cells] = np.arange(len(cells), dtype=np.int32)
@@ -116,8 +126,8 @@ def _with_deepest(
         return listed, number
 
     specs = ArraySpec((room,), np.int32, packed=capacity is None), ArraySpec(tuple(begins.shape), np.int32)
-    cells, number = engine.call_host(find, specs, samples.row, samples.depth, begins)
-    result = surface.deepest(theta, *(xp.take(x, cells, axis=0) for x in rays))
+    found, number = engine.call_host(find, specs, samples.row, samples.depth, begins, *([] if listed is None else [listed]))
+    result = surface.deepest(theta, *(xp.take(x, found, axis=0) for x in rays))
     assert result is not None
     params, there = result
     flat = xp.reshape(number, (-1,))

@@ -160,10 +160,12 @@ def with_fine(
     cells = FineGrid(size, adaptive.samples, settings.apron)
     grid = Grid.sampled(scene, camera, (cells.side * size[0], cells.side * size[1]), cells.apron)
     where = Where(adaptive, adaptive.dilates(scene.parts), scene.opaque, colors)
+    reads, gradient = settings.reader.reads, scene.context.engine.differentiates
     flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
 
     def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
-        return _taken(scene, grid, Request(capacity, listed, facing="facing" in settings.reader.reads), count, hidden)
+        request = Request(capacity, listed, facing="facing" in reads, exits="exit" in reads and gradient)
+        return _taken(scene, grid, request, count, hidden)
 
     fine = fine_samples(coarse, cells, where, taken, hidden, settings.layers, settings.capacity, flat)
     return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)

@@ -33,25 +33,45 @@ class Exits(NamedTuple):
         return cls(cells, backs, (backs.triangle_ids >= 0) & (backs.depth >= front))
 
 
-def outline_cells(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def outline_cells(
+    covered: np.ndarray, depth: np.ndarray, cells: np.ndarray | None = None, size: tuple[int, int] = (0, 0)
+) -> np.ndarray:
     """Covered cells (M,) int32 whose front ends towards a neighbour, by depths alone, as flat indices.
 
     A front ends towards an empty cell, and where it does not pair with the neighbour's front: where a hidden layer of
     one is nearer to the front of the other.
 
     Args:
-        covered: (K, H, W) bool.
-        depth: (K, H, W), depths of the samples; anything where nothing is covered.
+        covered: (K, H, W) bool; or (K, L, C) for listed cells, and the result are indices in this list.
+        depth: depths of the samples, of the same shape; anything where nothing is covered.
+        cells: (L, C), the listed cells, as flat indices in the grid, −1 for none; None for all. Others count as empty.
+        size: (height, width) of the grid, for listed cells.
     """
     from rts.sampling import exits_loops
 
+    if cells is not None:
+        listed, layers = np.flatnonzero(cells >= 0), len(covered)
+        own = cells.reshape(-1)[listed]
+        grids = np.zeros((layers, size[0] * size[1]), np.bool_), np.zeros((layers, size[0] * size[1]), depth.dtype)
+        for grid, x in zip(grids, (covered, depth), strict=True):
+            grid[:, own] = x.reshape(layers, -1)[:, listed]
+        marks = np.zeros(size[0] * size[1], np.bool_)
+        marks[outline_cells(*(x.reshape(layers, *size) for x in grids))] = True
+        return listed[marks[own]].astype(np.int32)
     marks = np.zeros(covered.shape[1:], np.bool_)
     arguments = read_only(covered), read_only(depth), marks
     parallel(exits_loops.mark_ends, len(marks), *arguments, work=20 * covered.size)
     return np.flatnonzero(marks).astype(np.int32)
 
 
-def with_pairs(samples: Samples, surface: TriangleSurface, inputs: Tree, rays: Rays) -> Samples:
+def with_pairs(
+    samples: Samples,
+    surface: TriangleSurface,
+    inputs: Tree,
+    rays: Rays,
+    listed: np.ndarray | None,
+    size: tuple[int, int],
+) -> Samples:
     """Samples with further rows, the pairs of a surface's `refine_outlines`, which `exit` (2, H, W) names.
 
     Args:
@@ -59,9 +79,11 @@ def with_pairs(samples: Samples, surface: TriangleSurface, inputs: Tree, rays: R
         surface: the surface.
         inputs: the result of its `proxy_inputs`, on the host.
         rays: the rays of the samples' rows.
+        listed: (L, C), the cells of the samples; None for all. See `outline_cells`.
+        size: (height, width) of the grid.
     """
     exits = np.full((2, *samples.row.shape[1:]), -1, np.int32)
-    cells = outline_cells(samples.row >= 0, samples.depth)
+    cells = outline_cells(samples.row >= 0, samples.depth, listed, size)
     fronts = samples.row[0].reshape(-1)[cells]
     own = Rays(rays.origins[fronts], rays.directions[fronts], rays.spread)
     result = surface.refine_outlines(inputs, own, samples.depth[0].reshape(-1)[cells]) if len(cells) else None

@@ -236,10 +236,11 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
         if exits:
             if (most := exits[0].max(initial=-1)) >= total:
                 raise InputError(f"exit refers to sample {most} of {total}; sample this scene anew")
-            near = np.full((len(exits[0]), kept[0].size), -1, np.int32)
-            cells = beside_outlines(kept)[0]
-            near[:, cells] = exits[0].reshape(len(near), -1)[:, cells]
-            exits = (near.reshape(exits[0].shape),)
+            if len(exits[0]) == 1:  # Pairs are in cells at outlines alone.
+                near = np.full((1, kept[0].size), -1, np.int32)
+                cells = beside_outlines(kept)[0]
+                near[:, cells] = exits[0].reshape(1, -1)[:, cells]
+                exits = (near.reshape(exits[0].shape),)
             numbering.use(exits[0], exits[0] >= 0)
         numbering.use(row, kept)
         indices = [index if len(index) else np.zeros(1, np.int32) for index in numbering.indices()]

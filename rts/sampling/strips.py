@@ -288,21 +288,32 @@ def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
     specs += [ArraySpec(laid, np.int16) for _ in facing]
     amid = [] if sampled.settled is None else [sampled.settled]
     specs += [ArraySpec(laid[1:], np.int8) for _ in amid]
+    leaves = [] if sampled.exit is None else [sampled.exit]
+    specs += [ArraySpec((x.shape[0], *laid[1:]), np.int32) for x in leaves]
 
     def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *optional: np.ndarray) -> tuple[np.ndarray, ...]:
         sides = [
             np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in optional[: len(facing)]
         ]
-        *placed, settled = _arranged(row, place, cells, sizes, grid.fine[1], *optional[len(facing) :])
-        return *placed, *sides, *([settled] if amid else [])
+        settled = optional[len(facing) : len(facing) + len(amid)]
+        index, shift, *placed, settled = _arranged(row, place, cells, sizes, grid.fine[1], *settled)
+        exits = ()
+        if leaves:
+            index, shift, *exits = _with_exits(index, shift, placed[0][0], place, optional[-1], splats)
+        return index, shift, *placed, *sides, *([settled] if amid else []), *exits
 
-    arguments = sampled.row, layout.place, layout.cells, *facing, *amid
+    arguments = sampled.row, layout.place, layout.cells, *facing, *amid, *leaves
     index, shift, row, part, *optional = engine.call_host(host, tuple(specs), *arguments)
     return Fine(
         sampled.samples,
         index,
         shift,
-        Cells(row, facing=optional[0] if facing else None, settled=optional[-1] if amid else None),
+        Cells(
+            row,
+            facing=optional[0] if facing else None,
+            settled=optional[len(facing)] if amid else None,
+            exit=optional[-1] if leaves else None,
+        ),
         part,
         layout.wanted,
         layout.pixel,
@@ -337,6 +348,30 @@ def _arranged(
     arguments = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
     parallel(strips_loops.arrange, lines, *arguments, work=2 * laid.size)
     return index, shift, laid, part, shown
+
+
+def _with_exits(
+    index: np.ndarray, shift: np.ndarray, fronts: np.ndarray, place: np.ndarray, exits: np.ndarray, most: int
+) -> tuple[np.ndarray, ...]:
+    """Index and shift of splats with those of exits behind them, at most `most` in all; and `Cells.exit` (E, h, w).
+
+    Args:
+        index: (M,), see `Fine`.
+        shift: (M, 3), see `Fine`.
+        fronts: (h, w), the splat of the front in each place of the layout, or −1.
+        place: see `Layout`.
+        exits: (E, L, LINE), samples of the listed cells; all E of a cell, or none.
+        most: the room.
+    """
+    count, laid = len(exits), np.full((len(exits), *place.shape), -1, np.int32)
+    listed = exits.reshape(count, -1)
+    there = np.nonzero((fronts >= 0) & (place >= 0) & (listed[-1, place] >= 0))
+    there = tuple(x[: max(0, most - len(index)) // count] for x in there)
+    first, own = len(index), listed[:, place[there]].T.reshape(-1)
+    index = np.concatenate([index, own.astype(index.dtype)])
+    shift = np.concatenate([shift, np.repeat(shift[fronts[there]], count, axis=0)])
+    laid[:, *there] = np.arange(first, len(index), dtype=np.int32).reshape(-1, count).T
+    return index, shift, laid
 
 
 def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:

@@ -203,7 +203,8 @@ class TriangleSampler(Sampler):
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
         Sides are not recorded for surfaces that move samples off their triangles. Exits are not recorded for surfaces
-        with a `refine` but no `refine_outlines`, for surfaces that are not `centered`, nor for lists of cells.
+        with a `refine` but no `refine_outlines`, and for surfaces that are not `centered`. Lists of cells get only
+        those of `refine_outlines`.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -216,12 +217,12 @@ class TriangleSampler(Sampler):
         sides = request.facing and layers > 1 and part.cull == "none" and not moves
         sides = sides and overrides(surface, "pieces", TriangleSurface)
         exits = request.exits and part.cull == "back" and listed is None and not refines and surface.centered
-        pairs = request.exits and listed is None and refines and not moves
+        pairs = request.exits and refines and not moves
         pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
             **({"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not refines else {}),
-            **({"exit": ArraySpec((1 + pairs, *size), np.int32)} if exits or pairs else {}),
+            **({"exit": ArraySpec((1 + pairs, *shape.size), np.int32)} if exits or pairs else {}),
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
         }
 
@@ -318,7 +319,7 @@ class _Search:
             self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells
         )
         if pairs:
-            samples = with_pairs(samples, self.surface, self.inputs, rays)
+            samples = with_pairs(samples, self.surface, self.inputs, rays, self.cells, self.shape.view)
         return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
 
     def moved(self) -> Samples:

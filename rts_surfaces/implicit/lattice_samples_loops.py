@@ -201,6 +201,8 @@ def deepest(
         for i in range(3):
             first[i], unit[i] = origins[n, i] + depth[n] * directions[n, i], directions[n, i] / length
         reach = REACH * (spread[0] + spread[1] * depth[n])
+        # A kink of the field spreads over a cell.
+        apart = max(APART * reach, 0.5 * min(step))
         # Steps that grow pass the deepest point.
         before, t, move = 0.0, 0.0, FIRST * reach
         value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, slope)
@@ -222,7 +224,7 @@ def deepest(
                 a = middle
             else:
                 b = middle
-        a, b, level = max(a - APART * reach, 0.0), b + APART * reach, 0.0
+        a, b, level = max(a - apart, 0.0), b + apart, 0.0
         falls, rises = 0.0, 0.0
         for k in range(2):
             _along(first, unit, b if k else a, at)
