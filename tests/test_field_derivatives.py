@@ -8,6 +8,7 @@ from helpers import quick
 
 import rts
 from rts import Camera, Part
+from rts_backends.fused.splatters import Visible
 from rts_surfaces.implicit.casting import per_level
 from rts_surfaces.implicit.fields import swept_sphere
 
@@ -99,13 +100,13 @@ ALONG = {"center": RANDOM.normal(size=3), "radius": RANDOM.normal(size=())}
 WEIGHTS = RANDOM.normal(size=(*SIZE, 4))
 
 
-def both(engine, surface, sampler, shader):
+def both(engine, surface, sampler, shader, **more):
     """⟨J v, w⟩ in forward mode and ⟨v, Jᵀ w⟩ in reverse mode, in float64."""
     constant = rts.engine_of(engine.zeros(1)).constant
     one = engine.ones((), dtype=engine.float64)
 
     def image(theta):
-        return rts.render(Part(surface, theta, shader), CAMERA, SIZE, sampler=sampler, layers=2)
+        return rts.render(Part(surface, theta, shader), CAMERA, SIZE, sampler=sampler, layers=2, **more)
 
     theta, along = ({k: constant(x, one) for k, x in given.items()} for given in (THETA, ALONG))
     weights, chosen = constant(WEIGHTS, one), rts.engine_of(one)
@@ -138,7 +139,9 @@ def test_forward_and_reverse_mode_agree(engine, surface, field):
 @pytest.mark.parametrize("field", ["root", "steep", "large", "small", "cube"])
 @pytest.mark.parametrize("engine", ["torch"], indirect=True)
 def test_fields_with_one_surface_have_one_derivative(engine, field):
-    found, expected = (both(engine, *SURFACES["sdf"](f), "normals")[1] for f in (FIELDS[field], ball))
+    # A pixel is eight times as wide as the shell in which "steep" is a distance; deepest points lie beyond.
+    more = {"splatter": Visible(exits=False)} if field == "steep" else {}
+    found, expected = (both(engine, *SURFACES["sdf"](f), "normals", **more)[1] for f in (FIELDS[field], ball))
     # Rays find the root of a cube less exactly.
     assert found == pytest.approx(expected, rel=0.1 if field == "cube" else 0.01)
 

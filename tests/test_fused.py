@@ -268,7 +268,7 @@ def test_rows_beyond_the_samples_are_refused(kind):
 @pytest.mark.parametrize("name", ["part", "facing", "exit", "wanted", "settled"])
 def test_what_is_told_of_other_cells_is_refused(name):
     positions, rgba, row = cells(2)
-    other = np.zeros(row.shape if name in ("part", "facing") else row.shape[1:], np.int32)[..., :-1]
+    other = np.zeros(row.shape if name in ("part", "facing", "exit") else row.shape[1:], np.int32)[..., :-1]
     with pytest.raises(rts.InputError, match=rf"{name} has shape .*; expected .*, as row says"):
         KINDS["visible"]().image(splats_of(positions, rgba, row, **{name: other}))
 

@@ -83,7 +83,7 @@ def test_positions_and_colours_that_do_not_belong_together_are_refused(shapes, t
     settings = Settings("visible", 0.5, 1e-3, 1.0)
     positions, rgba, row = arrays(target, (*[np.random.default_rng(0).random(s) for s in shapes], rows(2)))
     with refused("positions and rgba have shapes"):
-        fused.IMAGE(positions, rgba, row, row[:0], row[:0], *[row[0, :0]] * 3, settings=settings)
+        fused.IMAGE(positions, rgba, row, row[:0], row[:0], *[row[0, :0]] * 2, row[:0], settings=settings)
 
 
 # ----------------------------------------------------------------------------------------------- operations

@@ -393,7 +393,9 @@ def test_samples_that_do_not_fit_are_refused(changes, message, supersample):
     class Odd(raster):
         def sample(self, part, camera, size, layers, request):
             found = super().sample(part, camera, size, layers, request)
-            return found.replace(**{k: np.broadcast_to(v, size) if v.ndim == 0 else v for k, v in changes.items()})
+            shapes = {"exit": (1, *size)}
+            odd = {k: np.broadcast_to(v, shapes.get(k, size)) if v.ndim == 0 else v for k, v in changes.items()}
+            return found.replace(**odd)
 
     parts = [mesh_part(mesh) for mesh in (box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8))]
     with pytest.raises(rts.InputError, match=re.escape(message)):

@@ -103,7 +103,7 @@ class Cells:
             no sides are recorded.
         exit: (E, H, W) int32, indices of one or two further samples, not in `row`, in cells at outlines and beside
             them, or −1. The first alone is the sample where the ray leaves the closed part behind its front. Two are
-            samples beside the deepest point of the front's chord in a field: the sum of their motions is that of the
+            samples beside the deepest point of the front's chord in a field: the mean of their motions is that of the
             outline (`rts.splatting.rims`). None if none are recorded.
         settled: (H, W) integers. In a cell whose colour cannot change, however the scene moves, the index of a sample
             of this colour; −1 in others. Such a cell may lack a sample of its own, and so may cells around it that

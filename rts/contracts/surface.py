@@ -206,8 +206,8 @@ class TriangleSurface(Surface):
         return samples
 
     def refine_outlines(
-        self, inputs: Tree, rays: Rays, depth: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        self, inputs: Tree, rays: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
         """Pairs of samples beside the deepest points of rays, on the host; see `RaySurface.deepest`.
 
         Called for cells at outlines of surfaces with a `refine` that does not move samples.
@@ -216,10 +216,12 @@ class TriangleSurface(Surface):
             inputs: the result of `proxy_inputs`, on the host.
             rays: the rays (R, 3), local space.
             depth: (R,), the depth of each ray's front.
+            tables: the tables that `refine` filled. None may be `by_sample`.
 
         Returns:
-            Ids (R, 2, I) and params (R, 2, P) of the pairs, as after `refine`, and marks (R,) bool of rays that have
-            one. None, the default, for surfaces without a field.
+            Ids (R, 2, I) and params (R, 2, P) of the pairs, as after `refine`, marks (R,) bool of rays that have one,
+            and the tables, perhaps with further rows; where these exceed their specs there are no pairs. None, the
+            default, for surfaces without a field.
         """
         return None
 
@@ -296,7 +298,7 @@ class RaySurface(Surface):
         """Pairs of samples beside the deepest points of rays; they tell splatters how outlines of fields move.
 
         A ray enters a solid at a point of its surface. The field is least at the deepest point of the chord that begins
-        there, and the outline is where this least value is zero. The motions of the two samples add up to the motion of
+        there, and the outline is where this least value is zero. The mean of the two samples' motions is the motion of
         the outline. Two are needed where the field has a kink, one on each side of it; elsewhere they nearly coincide.
 
         Args:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from rts.arrays.trees import Tree
 from rts.compiling.threads import parallel, read_only
-from rts.contracts.records import Fragments, Samples
+from rts.contracts.records import ArraySpec, Fragments, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.scene.rays import Rays
 
@@ -71,6 +72,7 @@ def with_pairs(
     rays: Rays,
     listed: np.ndarray | None,
     size: tuple[int, int],
+    specs: Mapping[str, ArraySpec],
 ) -> Samples:
     """Samples with further rows, the pairs of a surface's `refine_outlines`, which `exit` (2, H, W) names.
 
@@ -81,21 +83,22 @@ def with_pairs(
         rays: the rays of the samples' rows.
         listed: (L, C), the cells of the samples; None for all. See `outline_cells`.
         size: (height, width) of the grid.
+        specs: the result of the surface's `table_specs`.
     """
     exits = np.full((2, *samples.row.shape[1:]), -1, np.int32)
     cells = outline_cells(samples.row >= 0, samples.depth, listed, size)
     fronts = samples.row[0].reshape(-1)[cells]
     own = Rays(rays.origins[fronts], rays.directions[fronts], rays.spread)
-    result = surface.refine_outlines(inputs, own, samples.depth[0].reshape(-1)[cells]) if len(cells) else None
-    if result is None:
+    depth = samples.depth[0].reshape(-1)[cells]
+    result = surface.refine_outlines(inputs, own, depth, samples.tables) if len(cells) else None
+    if result is None or any(len(x) > specs[name].shape[0] for name, x in result[3].items()):
         return samples.replace(exit=exits)
-    ids, params, there = result
+    ids, params, there, tables = result
     first = len(samples.ids) + 2 * np.arange(np.count_nonzero(there), dtype=np.int32)
     exits.reshape(2, -1)[:, cells[there]] = first, first + 1
     ids, params = (x[there].reshape(-1, x.shape[2]) for x in (ids, params))
-    return samples.replace(
-        ids=np.concatenate([samples.ids, ids]), params=np.concatenate([samples.params, params]), exit=exits
-    )
+    ids, params = np.concatenate([samples.ids, ids]), np.concatenate([samples.params, params])
+    return samples.replace(ids=ids, params=params, exit=exits, tables=tables)
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:

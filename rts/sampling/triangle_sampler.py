@@ -319,7 +319,8 @@ class _Search:
             self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells
         )
         if pairs:
-            samples = with_pairs(samples, self.surface, self.inputs, rays, self.cells, self.shape.view)
+            more = self.cells, self.shape.view, self.tables
+            samples = with_pairs(samples, self.surface, self.inputs, rays, *more)
         return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
 
     def moved(self) -> Samples:

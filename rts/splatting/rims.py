@@ -12,7 +12,7 @@ off, −n is not, and p₁ = p − n is covered. It is deep if it is usable, p�
 depths of all three fall off as on a smooth rim. The first rule that applies gives β and the partner:
 
 - Deepest: a direction is off, and p has two samples beside the deepest point of its ray in a field. The partner's
-  motion is the sum of theirs, β = −1: an outline is where the least value of the field along a ray is zero.
+  motion is the mean of theirs, β = −1: an outline is where the least value of the field along a ray is zero.
 - Chord: p has an exit, where the ray leaves the closed part that it met, or else a second layer of the same part; and
   the square of the gap behind its front runs to zero along a usable direction. The partner is that exit or layer,
   β = −½: the middle of a quadric's chord moves as its rim does.
@@ -105,7 +105,7 @@ class Back(NamedTuple):
         own: (H, W) bool, cells whose chord may end there.
         covered: (h, w) bool, cells that have such an end, with a border of one cell.
         gap: (h, w), distance of the end behind the front, without derivative; None for deepest points.
-        position: (h, w, 3), position of the end; for deepest points the sum of two.
+        position: (h, w, 3), position of the end; for deepest points the mean of two.
     """
 
     own: Array
@@ -208,7 +208,7 @@ def _backs(layers: Layers, part: Array | None) -> list[Back]:
         covered, position = layers.exits[0]
         if len(layers.exits) > 1:
             pairs, second = layers.exits[1]
-            backs.append(Back(layers.at(pairs, 0, 0), pairs, None, position + second))
+            backs.append(Back(layers.at(pairs, 0, 0), pairs, None, (position + second) / 2))
             covered = covered & ~pairs
         backs.append(Back(layers.at(covered, 0, 0), covered, stopped(layers.behind(position[..., 2])), position))
     if part is not None and len(layers.position) > 1:

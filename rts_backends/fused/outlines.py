@@ -47,7 +47,7 @@ class Outlines(NamedTuple):
     Attributes:
         beta: (H, W), β at the targets below that are covered: v̂ = v + β (v − the motion of the partner's sample).
         partner: (H, W) int32, the partner's sample, an index of positions, where β is not 0.
-        second: (1, H, W) int32, where β is −1 a second sample, whose motion is added to the partner's; or no entries.
+        second: (1, H, W) int32, where β is −1 a second partner: the mean of both motions counts; or no entries.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
         columns: (M,) int32, the targets' columns.
         gives: (M, 9) uint8, the kind of coverage from each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
@@ -361,7 +361,7 @@ def _outline(t_positions, row, beta, partner, second, y, x, axis):
         return own
     other = t_positions[partner[y, x], axis]
     if b == -1:
-        other += t_positions[second[0, y, x], axis]
+        other = (other + t_positions[second[0, y, x], axis]) / 2
     return own + b * (own - other)
 
 
@@ -470,9 +470,9 @@ def _lead(g_positions, row, beta, partner, second, y, x, g_x, g_y):
         i, j = row[0, y, x], partner[y, x]
         g_positions[i, 0] += b * g_x
         g_positions[i, 1] += b * g_y
+        if b == -1:
+            k, b = second[0, y, x], b / 2
+            g_positions[k, 0] -= b * g_x
+            g_positions[k, 1] -= b * g_y
         g_positions[j, 0] -= b * g_x
         g_positions[j, 1] -= b * g_y
-        if b == -1:
-            k = second[0, y, x]
-            g_positions[k, 0] += g_x
-            g_positions[k, 1] += g_y

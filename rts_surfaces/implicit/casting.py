@@ -178,7 +178,8 @@ def deepest(
 
     Let s₋ ≤ 0 and s₊ ≥ 0 be the slopes of the level f along the ray just before and just behind the deepest point, and
     λ = s₊ / (s₊ − s₋). Then G = λ ∇f₋ + (1 − λ) ∇f₊ is perpendicular to the ray, and the outline moves by
-    −(λ ∂f₋/∂θ + (1 − λ) ∂f₊/∂θ) G / |G|² (envelope theorem). A pair has the motions λ G / |G|² and (1 − λ) G / |G|².
+    −(λ ∂f₋/∂θ + (1 − λ) ∂f₊/∂θ) G / |G|² (envelope theorem). The mean of a pair's motions is to be this: they
+    are 2 λ G / |G|² and 2 (1 − λ) G / |G|² for each unit by which the level falls.
     Near an outline its distance from the ray is −f / |G|.
 
     Args:
@@ -246,7 +247,7 @@ def deepest(
     near = passed & (square > 0) & (far * far < reach * reach * square)
     move = across / (xp.where(near, square, 1.0) * largest)[:, None]
     pair = []
-    for t, part, value in zip(sides, (share, 1 - share), levels, strict=True):
+    for t, part, value in zip(sides, (2 * share, 2 - 2 * share), levels, strict=True):
         place = at(t)
         part = xp.where(near & free(place), part, 0.0)
         pair.append(xp.concat([place, part[:, None] * move, value[:, None]], axis=-1))

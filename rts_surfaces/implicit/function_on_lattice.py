@@ -159,6 +159,18 @@ class FunctionOnLattice(Field):
             ids = np.minimum(ids, room - 1)
         return samples.replace(ids=ids, row=row, overflow=overflow, tables={"points": points[:room].astype(np.int32)})
 
+    def in_tables(
+        self, points: np.ndarray, tables: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
+        """Ids of samples with these lattice points, as in `tabled`, and the tables, with the points that they lack."""
+        if not self.table:
+            return points, tables
+        known = tables["points"]
+        whole = np.concatenate([known, np.setdiff1d(points, known)])
+        order = np.argsort(whole, kind="stable")
+        ids = order[np.searchsorted(whole, points, sorter=order)]
+        return ids.astype(np.int32), {"points": whole.astype(np.int32)}
+
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
         """Levels (M,), differentiable; and for each sample the indices (N, 6) int32 of its six values among them."""
         if self.table:

@@ -258,12 +258,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def refine_outlines(
-        self, inputs: Mapping[str, np.ndarray], rays: Rays, depth: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """See `rts.TriangleSurface`; not in a band, whose cells end before deepest points, nor with a table."""
+        self, inputs: Mapping[str, np.ndarray], rays: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
+        """See `rts.TriangleSurface`; none in a band, whose cells end before deepest points."""
         from rts_surfaces.implicit import lattice_samples_loops
 
-        if "corners" in inputs or self.field.table:
+        if "corners" in inputs:
             return None
         lattice, count = self.field.lattice(inputs), len(depth)
         isovalue, sign = self.field.level_of_values
@@ -272,7 +272,9 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         arguments = values, float(values.dtype.type(isovalue)), sign, self.closed, lattice.shape, lattice.low, lattice.step
         given = *arguments, *rays[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
         parallel(lattice_samples_loops.deepest, count, *given, *results, work=2000 * count)
-        return results
+        points, params, there = results
+        ids, tables = self.field.in_tables(points, tables)
+        return ids, params, there, tables
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
         """The median difference of the field between the ends of crossed edges; `proxy` keeps it for `refine`."""

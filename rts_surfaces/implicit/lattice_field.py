@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from rts import namespace
 from rts.plugin_api.arrays import Array, Tree, shape_of
 from rts.plugin_api.records import ArraySpec, Samples
@@ -30,7 +32,6 @@ class LatticeField(ScalarField):
     """
 
     name = "theta['values']"
-    table = False
 
     def __init__(self, bounds: Any, isovalue: float, sign: float, shape: Any = None):
         self.bounds, self.isovalue, self.sign = bounds, isovalue, sign
@@ -75,6 +76,12 @@ class LatticeField(ScalarField):
     def tabled(self, samples: Samples) -> Samples:
         """The samples unchanged."""
         return samples
+
+    def in_tables(
+        self, points: np.ndarray, tables: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
+        """Ids of samples with these lattice points, and the tables: both unchanged."""
+        return points, tables
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
         """All values (M,), and for each sample the indices (N, 6) of its six values among them."""

@@ -201,8 +201,8 @@ def deepest(
         for i in range(3):
             first[i], unit[i] = origins[n, i] + depth[n] * directions[n, i], directions[n, i] / length
         reach = REACH * (spread[0] + spread[1] * depth[n])
-        # A kink of the field spreads over a cell.
-        apart = max(APART * reach, 0.5 * min(step))
+        # A kink of the field spreads over a cell; where cells are wider than pixels it is a face.
+        apart = max(APART * reach, min(0.5 * min(step), reach / 6))
         # Steps that grow pass the deepest point.
         before, t, move = 0.0, 0.0, FIRST * reach
         value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, slope)
@@ -250,7 +250,7 @@ def deepest(
             continue
         there[n] = True
         for k in range(2):
-            part = 1 - share if k else share
+            part = 2 - 2 * share if k else 2 * share
             if np.isnan(params[n, k, 15]):
                 part, params[n, k, 15] = 0.0, 0.0
             for i in range(3):

@@ -1,0 +1,270 @@
+"""Outlines of fields move as closed forms say: balls, tori, cylinders and rounded boxes, grown, shifted and turned."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers import TORCH, arrays, quick, to_numpy
+
+import rts
+from rts import Camera, Part
+from rts.plugin_api.records import Request
+from rts.sampling.exits import outline_cells
+from rts_surfaces.implicit.casting import deepest
+
+pytestmark = pytest.mark.rendering
+
+Sdf, Isosurface = rts.plugin("surfaces", "sdf"), rts.plugin("surfaces", "isosurface")
+SIZE, HEIGHT = (80, 80), 3.2
+PIXEL = HEIGHT / SIZE[0]
+BOUNDS, SHAPE = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), (121, 121, 121)
+SHIFT = 0.013
+"""Keeps outlines off the symmetry of the pixels."""
+
+
+# -------------------------------------------------------------------------------------------------------- fields
+
+
+def length(x):
+    return rts.namespace(x).sqrt(rts.namespace(x).sum(x * x, axis=-1) + 1e-12)
+
+
+def stack(*columns):
+    return rts.namespace(columns[0]).stack(list(columns), axis=-1)
+
+
+def ball(q, p):
+    return length(p) - q[0]
+
+
+def torus(q, p):
+    """About the y axis: radii of the ring and of the tube."""
+    return length(stack(length(stack(p[:, 0], p[:, 2])) - q[0], p[:, 1])) - q[1]
+
+
+def cylinder(q, p):
+    """About the y axis: radius and half the height."""
+    xp = rts.namespace(p)
+    return xp.maximum(length(stack(p[:, 0], p[:, 2])) - q[0], xp.abs(p[:, 1]) - q[1])
+
+
+def rounded_box(q, p):
+    """Half the sides within the rounding along x and z, of 0.5 along y; turned about y by the third entry."""
+    xp = rts.namespace(p)
+    c, s = xp.cos(q[2]), xp.sin(q[2])
+    x, z = c * p[:, 0] - s * p[:, 2], s * p[:, 0] + c * p[:, 2]
+    d = stack(xp.abs(x) - q[0], xp.abs(p[:, 1]) - 0.5, xp.abs(z) - q[1])
+    return length(xp.clip(d, 0.0, None)) + xp.clip(xp.max(d, axis=-1), None, 0.0) - 0.1
+
+
+def shadow(q):
+    """Derivatives of the area of the turned box as seen along z: a rectangle with rounded corners."""
+    c, s, high = math.cos(q[2]), math.sin(q[2]), 2 * (0.5 + 0.1)
+    return 2 * c * high, 2 * s * high, (2 * q[1] * c - 2 * q[0] * s) * high
+
+
+ALONG, ACROSS = (0, 4, 0), (0, 0, 4)
+SHAPES = {
+    "ball": (ball, (0.9,), ACROSS, lambda q: [2 * math.pi * q[0]]),
+    "torus along its axis": (torus, (0.9, 0.3), ALONG, lambda q: [4 * math.pi * q[1], 4 * math.pi * q[0]]),
+    "torus across": (torus, (0.9, 0.3), ACROSS, lambda q: [4 * q[1], 4 * q[0] + 2 * math.pi * q[1]]),
+    "cylinder across": (cylinder, (0.7, 0.6), ACROSS, lambda q: [4 * q[1], 4 * q[0]]),
+    "cylinder along": (cylinder, (0.7, 0.6), ALONG, lambda q: [2 * math.pi * q[0], 0]),
+    "box, turned": (rounded_box, (0.6, 0.4, 0.5), ACROSS, shadow),
+}
+"""A field, its parameters, the eye, and the derivatives of the area of its outline."""
+
+WAYS = {
+    "sdf": lambda f: (Sdf(f, 1.6, lipschitz=None), {"sampler": "rays"}),
+    "rays": lambda f: (Isosurface(BOUNDS, f=f, shape=SHAPE), {"sampler": "rays"}),
+    "lattice": lambda f: (Isosurface(BOUNDS, f=f, shape=SHAPE), {}),
+    "edge": lambda f: (Isosurface(BOUNDS, f=f, shape=SHAPE, motion="edge"), {}),
+}
+
+
+def camera(eye):
+    up = (0, 1, 0) if eye[1] == 0 else (0, 0, -1)
+    return Camera.orthographic(eye, (0, 0, 0), up, height=HEIGHT)
+
+
+def coverage(f, eye, way, **more):
+    """A function of q and a shift (3,) to the coverage (H, W) of a field."""
+    surface, options = WAYS[way](lambda theta, p: f(theta["q"], p - theta["shift"]))
+
+    def image(q, shift):
+        return rts.render(Part(surface, {"q": q, "shift": shift}, "silhouette"), camera(eye), SIZE, **options, **more)[
+            ..., 3
+        ]
+
+    return image
+
+
+@pytest.mark.parametrize("way", quick(list(WAYS), 3))
+@pytest.mark.parametrize("name", SHAPES)
+def test_areas_of_outlines_grow_as_closed_forms_say(name, way):
+    torch = pytest.importorskip("torch")
+    f, q, eye, expected = SHAPES[name]
+    image, shift = coverage(f, eye, way), torch.tensor([SHIFT, SHIFT, SHIFT])
+    found = torch.func.jacrev(lambda q: image(q, shift).sum() * PIXEL**2)(torch.tensor(q)).numpy()
+    # On a lattice the cylinder's sharp edges spread over a cell.
+    rounding = 0.06 if f is cylinder and way in ("lattice", "edge") else 0.02
+    np.testing.assert_allclose(found, expected(q), rtol=rounding, atol=rounding * max(map(abs, expected(q))))
+
+
+@pytest.mark.parametrize("way", quick(["sdf", "lattice", "edge", "rays"], 2))
+@pytest.mark.parametrize("name", ["ball", "torus across", "box, turned"])
+def test_outlines_shift_with_the_surface(name, way):
+    """As x shifts by one unit, the sum of x · α grows by the area; and nothing grows."""
+    torch = pytest.importorskip("torch")
+    f, q, eye, _ = SHAPES[name]
+    image, q = coverage(f, eye, way, supersample=2), torch.tensor(q)
+    x = (torch.arange(SIZE[1]) + 0.5 - SIZE[1] / 2) * PIXEL
+    shift = torch.tensor([SHIFT, SHIFT, SHIFT])
+    area = float(image(q, shift).sum()) * PIXEL**2
+    moment, grown = torch.func.jacrev(lambda s: torch.stack([(x * image(q, s)).sum(), image(q, s).sum()]) * PIXEL**2)(
+        shift
+    ).numpy()[:, 0]
+    assert abs(moment - area) < 0.02 * area
+    assert abs(grown) < 0.02 * area
+
+
+@pytest.mark.parametrize(("way", "name"), [("sdf", "box, turned"), ("lattice", "torus across")])
+def test_fine_samples_at_outlines_have_pairs_too(way, name):
+    torch = pytest.importorskip("torch")
+    f, q, eye, expected = SHAPES[name]
+    image, shift = coverage(f, eye, way, supersample=rts.Adaptive(4)), torch.tensor([SHIFT, SHIFT, SHIFT])
+    found = torch.func.jacfwd(lambda q: image(q, shift).sum() * PIXEL**2)(torch.tensor(q)).numpy()
+    np.testing.assert_allclose(found, expected(q), rtol=0.01, atol=0.01 * max(expected(q)))
+
+
+@pytest.mark.parametrize("way", ["sdf", "lattice"])
+def test_a_compiled_program_has_the_derivative_of_an_eager_one(way):
+    jax = pytest.importorskip("jax")
+    f, q, eye, _ = SHAPES["torus across"]
+    image, q, shift = coverage(f, eye, way, layers=2), jax.numpy.asarray(q), jax.numpy.full(3, SHIFT)
+    gradient = jax.grad(lambda q: (image(q, shift) * jax.numpy.arange(SIZE[1])).sum())
+    np.testing.assert_allclose(jax.jit(gradient)(q), gradient(q), rtol=1e-3)
+
+
+# -------------------------------------------------------------------------------------------------- deepest points
+
+
+def unit_rays(count, seed=0):
+    """Rays along −z towards a unit ball, from its surface, at distances below one from its axis."""
+    rng = np.random.default_rng(seed)
+    angle, off = rng.uniform(0, 2 * math.pi, count), np.sqrt(rng.uniform(0.5, 0.99, count))
+    points = np.stack([off * np.cos(angle), off * np.sin(angle), np.sqrt(1 - off**2)], axis=1)
+    return points, np.tile([0.0, 0.0, -2.0], (count, 1)), off
+
+
+@pytest.mark.parametrize("target", ["numpy", *TORCH, "jax"])
+def test_the_deepest_point_of_a_ball_is_nearest_to_its_centre(target):
+    points, directions, off = unit_rays(50)
+    given = (arrays(target, x, np.float64) for x in (points, directions, np.full(50, 0.5)))
+    params, there = map(to_numpy, deepest(lambda p: length(p) - 1, lambda p: p[:, 0] == p[:, 0], *given))
+    np.testing.assert_array_equal(there, 1 - off < 0.5)
+    pair, own = params[there].astype(np.float64), points[there] * [1, 1, 0]
+    np.testing.assert_allclose(pair[:, :, :3], np.repeat(own[:, None], 2, axis=1), atol=2e-3)
+    # Growing by one moves the outline by one, outwards.
+    np.testing.assert_allclose(pair[:, :, 3:6].mean(axis=1), own / off[there, None], atol=5e-3)
+    np.testing.assert_allclose(pair[:, 0, 6], off[there] - 1, atol=1e-5)
+
+
+def test_at_a_kink_each_side_has_its_share():
+    """A wedge of two planes, seen along −z: its edge moves by each plane as their slopes along the ray say."""
+    tilts = np.radians([[35.0, 60.0]])
+    a, b = (np.array([math.sin(t), 0, s * math.cos(t)]) for t, s in zip(tilts[0], (1, -1), strict=True))
+
+    def level(p):
+        return np.maximum(p @ a, p @ b)
+
+    x = np.array([-0.02, -0.1])
+    points = np.stack([x, 0 * x, -x * math.tan(tilts[0, 0])], axis=1)
+    params, there = deepest(level, lambda p: p[:, 0] < 9, points, np.tile([0.0, 0, -1], (2, 1)), np.full(2, 0.5))
+    assert there.all()
+    # The edge a · p = b · p = 0 seen along z: level of the ray is the combination without z.
+    share = math.cos(tilts[0, 1]) / np.cos(tilts[0]).sum()
+    g = share * a + (1 - share) * b
+    np.testing.assert_allclose(params[:, 0, 3], 2 * share / g[0], rtol=1e-5)
+    np.testing.assert_allclose(params[:, 1, 3], 2 * (1 - share) / g[0], rtol=1e-5)
+    assert (params[:, 0, 2] > params[:, 1, 2]).all()
+
+
+def test_rays_through_the_middle_of_a_wall_have_no_pair():
+    """A wall across the ray has an outline nowhere near; and a ray that finds no least level has none."""
+    points, directions = np.array([[0.0, 0, 0.3], [0, 0, 0]]), np.tile([0.0, 0, -1], (2, 1))
+
+    def level(p):
+        return np.where(p[:, 0] == 0, np.abs(p[:, 2]) - 0.3, 0)
+
+    _, there = deepest(level, lambda p: p[:, 0] < 9, points[:1], directions[:1], np.full(1, 0.5))
+    assert not there.any()
+    _, there = deepest(lambda p: p[:, 2], lambda p: p[:, 0] < 9, points[1:], directions[1:], np.full(1, 0.5))
+    assert not there.any()
+
+
+# -------------------------------------------------------------------------------------------------------- samplers
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("capacity", [None, 6000])
+def test_pairs_lie_on_the_rays_of_cells_at_outlines(way, capacity):
+    f, q, eye, _ = SHAPES["torus across"]
+    surface, options = WAYS[way](lambda theta, p: f(theta["q"], p))
+    part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")
+    sampler = rts.plugin("samplers", options.get("sampler", "raster"))()
+    found = sampler.sample(part, camera(eye), SIZE, 2, Request(capacity, exits=True))
+    exits, row = np.asarray(found.exit), np.asarray(found.row)
+    assert exits.shape == (2, *SIZE)
+    there = exits[0] >= 0
+    np.testing.assert_array_equal(exits[1][there], exits[0][there] + 1)
+    assert (exits[1][~there] == -1).all() and not np.isin(exits[exits >= 0], row).any()
+    ends = np.zeros(SIZE, bool)
+    ends.reshape(-1)[outline_cells(row >= 0, np.asarray(found.depth))] = True
+    assert there.sum() > 0.9 * ends.sum() and not (there & ~ends).any()
+    points = np.asarray(surface.evaluate(part.theta, found)["position"])
+    for side in exits:
+        place = np.asarray(camera(eye).project(points[side[there]], SIZE))
+        y, x = np.nonzero(there)
+        np.testing.assert_allclose(place[:, :2], np.stack([x, y], axis=1) + 0.5, atol=2e-3)
+        assert (place[:, 2] > np.asarray(found.depth)[0][there] - 1e-4).all()
+
+
+def test_listed_cells_have_the_pairs_of_the_whole_grid():
+    part, size = Isosurface.example().replace(shader="silhouette"), (24, 32)
+    view, sampler = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=40, aspect=4 / 3), rts.plugin("samplers", "raster")()
+    whole = sampler.sample(part, view, size, 2, Request(exits=True))
+    cells = np.arange(24 * 32, dtype=np.int32)[::-1].reshape(-1, 8)
+    listed = sampler.sample(part, view, size, 2, Request(cells=cells, exits=True))
+    of_whole, of_list = (np.asarray(x.params)[np.asarray(x.exit)] for x in (whole, listed))
+    of_whole[np.asarray(whole.exit) < 0] = of_list[np.asarray(listed.exit) < 0] = 0
+    np.testing.assert_array_equal(of_list.reshape(2, -1, 16)[:, ::-1], of_whole.reshape(2, -1, 16))
+    assert np.asarray(whole.exit).max() > 0
+
+
+def test_outlines_are_where_fronts_end():
+    covered, depth = np.zeros((2, 5, 6), bool), np.zeros((2, 5, 6), np.float32)
+    covered[0, 1:4, 1:5] = True
+    depth[0, 1:4, 1:5] = 1
+    found = np.zeros((5, 6), bool)
+    found.reshape(-1)[outline_cells(covered, depth)] = True
+    expected = covered[0].copy()
+    expected[2, 2:4] = False
+    np.testing.assert_array_equal(found, expected)
+    covered[0] = covered[1, :, :3] = True
+    depth[0, :, :3], depth[1, :, :3], depth[0, :, 3:] = 1, 2.1, 2
+    found = np.zeros((5, 6), bool)
+    found.reshape(-1)[outline_cells(covered, depth)] = True
+    assert found[:, 2:4].all() and found.sum() == 10
+
+
+def test_views_together_have_the_gradients_of_views_alone():
+    torch = pytest.importorskip("torch")
+    f, q, _, _ = SHAPES["box, turned"]
+    surface, options = WAYS["lattice"](lambda theta, p: f(theta["q"], p))
+    cameras = [Camera.look_at(eye, (0, 0, 0), fov_y=45) for eye in ((1, 2, 3), (-2, 1, 3))]
+    part = lambda q: Part(surface, {"q": q}, "silhouette")  # noqa: E731
+    together = torch.func.jacrev(lambda q: rts.render_views(part(q), cameras, (32, 32))[..., 3].sum())
+    alone = torch.func.jacrev(lambda q: sum(rts.render(part(q), c, (32, 32))[..., 3].sum() for c in cameras))
+    q = torch.tensor(q)
+    np.testing.assert_allclose(together(q).numpy(), alone(q).numpy(), rtol=1e-4)
