@@ -12,7 +12,6 @@ from rts.plugin_api.checks import check_camera
 from rts.plugin_api.records import ArraySpec, Cells, RayHits, Request, Samples
 from rts.plugin_api.splats import outline_cells
 
-
 REACH = 3.0
 """Distance of outlines, in pixels, up to which deepest points tell how they move: beyond, a chord ends elsewhere."""
 
@@ -126,7 +125,9 @@ def _with_deepest(
         return listed, number
 
     specs = ArraySpec((room,), np.int32, packed=capacity is None), ArraySpec(tuple(begins.shape), np.int32)
-    found, number = engine.call_host(find, specs, samples.row, samples.depth, begins, *([] if listed is None else [listed]))
+    found, number = engine.call_host(
+        find, specs, samples.row, samples.depth, begins, *([] if listed is None else [listed])
+    )
     result = surface.deepest(theta, *(xp.take(x, found, axis=0) for x in rays))
     assert result is not None
     params, there = result

@@ -107,7 +107,9 @@ def corrections_by_loops(splatter, splats, tangent):
     pairing = Pairing(positions, row, visible=True)
     rules = {cell: rule(pairing, cell, splats.part, splats.exit) for cell in pairing.cells if pairing.covers(*cell)}
     own = {cell: tangent[row[0, *cell], :2] for cell in rules}
-    outline = {c: own[c] + beta * (own[c] - tangent[partner, :2].mean(axis=0)) for c, (_, beta, partner) in rules.items()}
+    outline = {
+        c: own[c] + beta * (own[c] - tangent[partner, :2].mean(axis=0)) for c, (_, beta, partner) in rules.items()
+    }
     total = sum(math.exp(-(u * u + v * v) / (2 * splatter.sigma**2)) for u, v in STEPS)
     added = np.zeros((*row.shape[1:], 4))
     for target in pairing.cells:

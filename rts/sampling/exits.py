@@ -53,11 +53,10 @@ def outline_cells(
     if cells is not None:
         listed, layers = np.flatnonzero(cells >= 0), len(covered)
         own = cells.reshape(-1)[listed]
-        grids = np.zeros((layers, size[0] * size[1]), np.bool_), np.zeros((layers, size[0] * size[1]), depth.dtype)
-        for grid, x in zip(grids, (covered, depth), strict=True):
-            grid[:, own] = x.reshape(layers, -1)[:, listed]
+        whole, deep = (np.zeros((layers, size[0] * size[1]), x.dtype) for x in (covered, depth))
+        whole[:, own], deep[:, own] = (x.reshape(layers, -1)[:, listed] for x in (covered, depth))
         marks = np.zeros(size[0] * size[1], np.bool_)
-        marks[outline_cells(*(x.reshape(layers, *size) for x in grids))] = True
+        marks[outline_cells(whole.reshape(layers, *size), deep.reshape(layers, *size))] = True
         return listed[marks[own]].astype(np.int32)
     marks = np.zeros(covered.shape[1:], np.bool_)
     arguments = read_only(covered), read_only(depth), marks

@@ -83,13 +83,13 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
     number = np.full(samples.row.shape, -1, np.int32)
     number[kept] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
     index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
-    exits = None if samples.exit is None else np.full(samples.exit.shape, -1, np.int32)
-    if exits is not None and capacity is None:
-        rows = min(rows + int(np.count_nonzero(samples.exit >= 0)), max(1, samples.row.size))
+    exits = samples.exit
     if exits is not None:
-        cells = np.nonzero(samples.exit[-1] >= 0)
-        cells = tuple(x[: (rows - len(index)) // len(exits)] for x in cells)
-        first, index = len(index), np.concatenate([index, samples.exit[:, *cells].T.reshape(-1)])
+        if capacity is None:
+            rows = min(rows + int(np.count_nonzero(exits >= 0)), max(1, samples.row.size))
+        cells = tuple(x[: (rows - len(index)) // len(exits)] for x in np.nonzero(exits[-1] >= 0))
+        first, index = len(index), np.concatenate([index, exits[:, *cells].T.reshape(-1)])
+        exits = np.full_like(exits, -1)
         exits[:, *cells] = np.arange(first, len(index), dtype=np.int32).reshape(-1, len(exits)).T
 
     def packed(x: np.ndarray) -> np.ndarray:

@@ -302,7 +302,7 @@ class _Search:
     cells: np.ndarray | None
 
     def in_place(self, sides: bool, exits: bool, pairs: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them; with `pairs`, those at outlines."""
+        """Samples on the triangles, or refined by a surface that does not move them; `pairs` also at outlines."""
         known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
         # All refined samples stay, also those amid one colour.

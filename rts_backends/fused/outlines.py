@@ -421,7 +421,9 @@ def _pull(start, stop, row, outlines, border, g, first, g_positions):
 
 
 @compiled
-def _pull_rows(top, bottom, row, beta, partner, second, offsets, columns, gives, slopes, changes, border, g, g_positions):
+def _pull_rows(
+    top, bottom, row, beta, partner, second, offsets, columns, gives, slopes, changes, border, g, g_positions
+):
     """`pull` of the targets of rows [top, bottom)."""
     width, zero = g.shape[1], g_positions.dtype.type(0)
     for y in range(top, bottom):

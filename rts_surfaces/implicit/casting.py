@@ -30,7 +30,7 @@ MARCH, FIRST, GROWTH = 16, 1 / 24, 1.5
 """Steps along a ray that seek its deepest point; the first, as a share of the reach; and their growth."""
 
 REACH = 3.0
-"""Distance in pixels beyond which an outline is of no interest, for triangles' samples; see `rts.RaySurface.deepest`."""
+"""The reach in pixels at triangles' samples: farther outlines are of no interest; see `rts.RaySurface.deepest`."""
 
 HALVINGS = 14
 """Halvings of the bracket of a deepest point."""

@@ -267,10 +267,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             return None
         lattice, count = self.field.lattice(inputs), len(depth)
         isovalue, sign = self.field.level_of_values
-        values = np.ascontiguousarray(inputs["values"]).reshape(-1)
+        values, where = np.ascontiguousarray(inputs["values"]).reshape(-1), (lattice.shape, lattice.low, lattice.step)
         results = np.zeros((count, 2, 6), np.int32), np.zeros((count, 2, 16), np.float32), np.zeros(count, np.bool_)
-        arguments = values, float(values.dtype.type(isovalue)), sign, self.closed, lattice.shape, lattice.low, lattice.step
-        given = *arguments, *rays[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
+        given = values, float(values.dtype.type(isovalue)), sign, self.closed, *where
+        given = *given, *rays[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
         parallel(lattice_samples_loops.deepest, count, *given, *results, work=2000 * count)
         points, params, there = results
         ids, tables = self.field.in_tables(points, tables)
@@ -306,9 +306,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             steps=int(np.ceil(steps)) if self.lipschitz is None else None,
         )
 
-    def deepest(
-        self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array
-    ) -> tuple[Array, Array]:
+    def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; caps do not move."""
         points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
         level = partial(self._capped if self.closed else self.field.level, theta)

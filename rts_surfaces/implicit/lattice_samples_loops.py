@@ -171,7 +171,22 @@ def _along(start, direction, t, out):
 
 @loop
 def deepest(
-    start, stop, values, isovalue, sign, capped, shape, low, step, origins, directions, depth, spread, points, params, there
+    start,
+    stop,
+    values,
+    isovalue,
+    sign,
+    capped,
+    shape,
+    low,
+    step,
+    origins,
+    directions,
+    depth,
+    spread,
+    points,
+    params,
+    there,
 ):
     """Fill pairs of samples beside the deepest points of rays [start, stop); see `casting.deepest`.
 
@@ -206,7 +221,7 @@ def deepest(
         # Steps that grow pass the deepest point.
         before, t, move = 0.0, 0.0, FIRST * reach
         value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, slope)
-        a, b = 0.0, 0.0
+        a, b, after = 0.0, 0.0, value
         for _ in range(MARCH):
             _along(first, unit, t + move, at)
             after, _, _ = _level(values, isovalue, sign, capped, shape, low, step, at, slope)
@@ -214,9 +229,9 @@ def deepest(
                 a, b = before, t + move
                 break
             before, t, move, value = t, t + move, GROWTH * move, after
-        if b == 0 or not np.isfinite(after):
+        if b == 0 or not np.isfinite(after):  # It falls all along, or leaves an open surface through its bounds.
             continue
-        for _ in range(HALVINGS):
+        for _ in range(HALVINGS // 2):
             middle = (a + b) / 2
             _along(first, unit, middle, at)
             _level(values, isovalue, sign, capped, shape, low, step, at, slope)

@@ -97,9 +97,7 @@ class Sdf(Implicit, RaySurface):
         """Positions, "normal" of unit length, outwards, and the attributes."""
         return self.at_hits(theta, samples)
 
-    def deepest(
-        self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array
-    ) -> tuple[Array, Array]:
+    def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; in θ's dtype."""
         points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
         level, xp = partial(self.field.level, theta), namespace(points)
