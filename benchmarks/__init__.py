@@ -1,4 +1,4 @@
-"""What this library is measured by: accuracy, speed, and one commit against another; see README.md."""
+"""Measurements of this library: accuracy, speed, and one commit against another; see README.md."""
 
 import os
 

@@ -249,7 +249,7 @@ def run(args: argparse.Namespace, rows: list[dict], path: Path) -> list[dict]:
 
 
 def order(row: dict) -> tuple:
-    """What rows are sorted by."""
+    """The key by which rows are sorted."""
     return list(METHODS).index(row["method"]), row["start"], row["mesh"], row["seed"]
 
 

@@ -72,7 +72,7 @@ def own(comparison: Mapping, mode: str) -> list[Mapping]:
 
 
 def summary(comparisons: Sequence[Mapping]) -> str:
-    """What to take: over all scenes, and for each of them."""
+    """The recommended settings: over all scenes, and for each of them."""
     modes = [mode for mode in MODES if any(mode in c["modes"] for c in comparisons)]
     header = ["mode", *(f"{level:.0%}" for level in LEVELS)]
     overall = table(header, [[mode, *(advice(comparisons, mode, level) for level in LEVELS)] for mode in modes])

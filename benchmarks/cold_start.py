@@ -1,4 +1,4 @@
-"""How long a newcomer waits: the first call of each kind where nothing has been compiled, the next, and the next day.
+"""A newcomer's waiting times: the first call of each kind where nothing has been compiled, the next, and the next day.
 
 Each is a process of its own with an empty folder for compiled loops, and then another that finds them there:
 
@@ -93,7 +93,7 @@ TASKS: dict[str, Callable[[], Callable[[], object]]] = {
 
 
 def seconds(task: str) -> list[float]:
-    """What the imports take, the first call and the second."""
+    """Seconds of the imports, the first call and the second."""
     times = [time.perf_counter()]
     call = TASKS[task]()
     times.append(time.perf_counter())

@@ -96,7 +96,7 @@ def fitted(scene: Callable, view: rts.Camera, goal: Any, start: Any, method: str
 
 
 def card_rows(method: str) -> list[dict]:
-    """Where the card is found, in terms of the sphere's diameter off."""
+    """The card's error of position, in diameters of the sphere."""
     view, rows = rts.Camera.orthographic((0, 0, 4), (0, 0, 0), height=2.2), []
     for start in track(CARD_STARTS, description=f"card, {method}", transient=True):
         for crossings in (False, True):
@@ -106,7 +106,7 @@ def card_rows(method: str) -> list[dict]:
 
 
 def hand_rows(method: str) -> list[dict]:
-    """How far off the pose of the hand ends: degrees, and share of its size; and the poses."""
+    """Errors of the hand's last poses: degrees, and share of its size; and the poses."""
     rows = []
     for seed in track(range(RUNS), description=f"hand, {method}", transient=True):
         rng = np.random.default_rng(seed)
@@ -121,7 +121,7 @@ def hand_rows(method: str) -> list[dict]:
 
 
 def off(pose: np.ndarray) -> dict[str, float]:
-    """How far a pose is from the hand's."""
+    """The distance of a pose from the hand's."""
     a, b = (np.asarray(rts.rigid(x))[:3, :3] for x in (pose, HAND_AT))
     cosine = (np.trace(a.T @ b) - 1) / 2
     shift = pose[3:] - HAND_AT[3:]

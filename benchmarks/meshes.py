@@ -1,4 +1,4 @@
-"""Where the meshes of the benchmarks come from: files of the test data, normalised and rotated, some subdivided.
+"""The meshes of the benchmarks: files of the test data, normalised and rotated, some subdivided.
 
 The files are in the folder that the variable RTS_DATA names, default ../shared/data beside the repository. Nothing here
 imports rts, since processes that use another commit of it need meshes too.

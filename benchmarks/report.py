@@ -1,4 +1,4 @@
-"""What reports share: tables in Markdown."""
+"""Tables in Markdown, for all reports."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def cage(file: str, rates: tuple[int, ...]) -> Scene:
 
 
 def placed(points: np.ndarray) -> np.ndarray:
-    """As all benchmarks have it: normalised, and turned."""
+    """A shape as all benchmarks have it: normalised, and turned."""
     return (normalised(points) @ rotation_xy(0.35, 0.5).T).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Where each method breaks: a table of ways to fail against methods, each cell an outcome with its figure.
+"""A table of ways to fail against methods; each cell is an outcome with its figure.
 
 The rows are those of `rts_compare.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
 the output are stability.md, stability.json and stability.png, and copies to benchmarks/results. A run that is

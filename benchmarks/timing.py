@@ -1,4 +1,4 @@
-"""How times are taken: the pose that iterations start from, their steps, and calls that take turns."""
+"""Timing: the pose that iterations start from, their steps, and calls that take turns."""
 
 from __future__ import annotations
 

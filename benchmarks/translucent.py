@@ -318,7 +318,7 @@ def tasks() -> dict[str, Task]:
 
 
 def off(task: Task, numbers: torch.Tensor) -> str:
-    """How far off the numbers of a task are, in pixels of its pictures."""
+    """The error of a task's numbers, in pixels of its pictures."""
     error = (numbers - task.goal).numpy()
     if error.ndim == 1:
         return f"place {np.linalg.norm(error[:2]) / 0.05:.2f} pixels, alpha {abs(error[2]):.3f} off"

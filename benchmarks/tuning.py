@@ -1,4 +1,4 @@
-"""Whether `rts.tune` finds the cheapest settings: beside an exhaustive search over all that it may choose from.
+"""`rts.tune` beside an exhaustive search over all settings that it may choose from: does it find the cheapest?
 
 On six scenes of different surfaces, 128², for two modes each. *Exhaustive*: the error of every setting, and the
 time of every one that is within the tolerance, with every sampler. Both then take turns once more: the ratio is that of

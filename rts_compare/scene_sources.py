@@ -1,4 +1,4 @@
-"""Where scenes come from: built-in names, model files, Python files and functions."""
+"""Sources of scenes: built-in names, model files, Python files and functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the ground truth itself can be trusted: its noise, and what differences over a step are off closed forms.
+"""The errors of the ground truth itself: its noise, and the error of differences over a step beside closed forms.
 
 Prints a line for each scene and step:
 

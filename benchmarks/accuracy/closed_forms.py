@@ -29,7 +29,7 @@ class ClosedForm:
         return (self.image(step / 2) - self.image(-step / 2)) / step
 
     def truth(self, step: float = 0.0) -> Truth:
-        """As a truth without noise: the derivative, or the difference over a step."""
+        """A truth without noise: the derivative, or the difference over a step."""
         derivative = self.difference(step) if step else self.derivative
         return Truth(derivative, 0.0, np.stack([derivative] * 2))
 

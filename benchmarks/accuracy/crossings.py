@@ -76,7 +76,7 @@ def crossing_lines(names: list[str], folder: Path, spp: int) -> list[list[str]]:
 
 
 def pictures(folder: Path, path: Path) -> None:
-    """What is left where lines of crossing fail, with one sample a pixel."""
+    """Pictures of the remaining errors at lines of crossing, with one sample a pixel."""
     from matplotlib.figure import Figure
 
     titles = "image", "derivative, truth", "as samples", "as depths", f"low-passed difference × {CONTRAST_LOW:g}"

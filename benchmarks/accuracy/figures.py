@@ -117,7 +117,7 @@ def error_vs_time(results: dict, path: Path) -> None:
 
 
 def _sampled(method: str) -> str:
-    """What a point is called beside its line; those at outlines stand in the legend."""
+    """The label of a point beside its line; points at outlines are labelled in the legend."""
     if method.startswith("Mitsuba"):
         return method.split(", ")[1]
     if method.endswith("outlines"):
@@ -126,7 +126,7 @@ def _sampled(method: str) -> str:
 
 
 def failures(images: dict, against: dict, path: Path) -> None:
-    """Where `visible` is wrong, and how."""
+    """Pictures of the places where `visible` is wrong, and of its errors there."""
     from matplotlib.figure import Figure
 
     chosen = [f for f in FAILURES if f[0] in against]

@@ -1,4 +1,4 @@
-"""What is compared on the scenes: this library's splatters and other renderers, each a name and two functions.
+"""The methods compared on the scenes: this library's splatters and other renderers, each a name and two functions.
 
 A method gives the derivative image by forward mode, and the slope of a scalar loss by reverse mode.
 """

@@ -1,4 +1,4 @@
-"""How right derivatives of images are: splatters, layers and samples a pixel, over all scenes, beside other renderers.
+"""Errors of derivatives of images: splatters, layers and samples a pixel, over all scenes, beside other renderers.
 
 Derivative images by forward mode are scored against differences of area-sampled renders over one pixel
 (`Scene.truth`), and after its low-pass against the derivative itself: a closed form, or a difference over a quarter of
@@ -37,7 +37,7 @@ ROUNDS, BUDGET = 5, 40.0
 
 
 class References(NamedTuple):
-    """What derivatives are compared with: differences over a pixel, and the derivative itself as nearly as known."""
+    """The truths of derivatives: differences over a pixel, and the derivative itself as nearly as known."""
 
     pixel: Truth
     exact: Truth
@@ -114,7 +114,7 @@ def options() -> argparse.Namespace:
 
 
 class Plan(NamedTuple):
-    """What is measured on a scene; times are taken of the three cases only."""
+    """The measurements on a scene; times are taken of the three cases only."""
 
     scene: scenes.Scene
     against: References

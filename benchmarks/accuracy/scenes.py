@@ -68,7 +68,7 @@ class Scene:
         )
 
     def truth(self, folder: Path, step: float = 1.0) -> Truth:
-        """How the image truly changes with t, by differences over a step; kept in a folder."""
+        """The image's true change with t, by differences over a step; kept in a folder."""
         return truth(self.moving, MOTION, 1.0, samples=SAMPLES, step=step, grids=grids, folder=folder)
 
     def image(self) -> np.ndarray:

@@ -197,7 +197,7 @@ def outlines(rows: Rows) -> str:
 
 
 def factor(points: list[tuple[float, float]], seconds: float, error: float) -> tuple[str, float]:
-    """How many times longer the points (error, seconds) of a renderer take to an error, by logarithms.
+    """The ratio of the seconds that the points (error, seconds) of two renderers take to an error, by logarithms.
 
     Beyond its ends the factor is that of the end, a bound: the first of the two says which.
     """
@@ -229,7 +229,7 @@ def times(rows: Rows) -> str:
 
 
 def summary(results: dict) -> str:
-    """What is printed at the end."""
+    """The text printed at the end."""
     rows = Rows(results)
     return "\n".join(part(rows) for part in (cases, failures, times))
 

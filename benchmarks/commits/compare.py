@@ -1,4 +1,4 @@
-"""Whether two commits give the same numbers, and which is faster.
+"""A comparison of two commits: their numbers, and their times.
 
 Each side is installed into a folder of its own, so that it finds its own plugins by its own entry points, and runs in
 processes of its own. A side is any revision that git knows, or "." for the working tree with what is not committed.

@@ -1,4 +1,4 @@
-"""How the arrays of two commits differ, and whether by no more than rounding."""
+"""Differences of the arrays of two commits, and limits for rounding."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Group(NamedTuple):
 
     @property
     def equal(self) -> int:
-        """How many are the same to the bit."""
+        """The number of arrays that are equal to the bit."""
         return sum(d.equal for d in self.found)
 
     @property
@@ -60,18 +60,18 @@ class Group(NamedTuple):
 
     @property
     def within(self) -> bool:
-        """Whether no difference is too large."""
+        """True if no difference is too large."""
         limit = TOLERANCES[self.kind if self.kind in TOLERANCES else self.kind.split(",")[0]]
         return all(d.equal or (limit is not None and d.size <= limit) for d in self.found)
 
     @property
     def good(self) -> bool:
-        """Whether the second side is as good as the first."""
+        """True if the second side is as good as the first."""
         return self.within and not self.missing
 
     @property
     def suspect(self) -> bool:
-        """Whether array code, which is to be equal, is not, though within limits."""
+        """True if arrays of array code, which are to be equal, differ within the limits."""
         return self.within and self.equal < len(self.found) and self.kind.endswith("array code")
 
     @property
@@ -99,7 +99,7 @@ def compare(before: Path, after: Path) -> tuple[list[Group], list[str]]:
 
 
 def left_out(before: Path, after: Path) -> dict[str, list[str]]:
-    """What has no arrays in two folders, by the reason."""
+    """The results without arrays in two folders, by the reason."""
     one, other = (json.loads((folder / "notes.json").read_text()) for folder in (before, after))
     reasons: dict[str, list[str]] = {}
     for key in one | other:

@@ -25,7 +25,7 @@ def named_arrays(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 class NumPy:
-    """What is needed of an engine: arrays, samples, and images with their gradients."""
+    """The functions needed of an engine: arrays, samples, and images with their gradients."""
 
     name, key = "numpy", "numpy"
 

@@ -140,7 +140,7 @@ def _mapping(finder: object) -> dict[str, str]:
 
 
 def _is_other(distribution: importlib.metadata.Distribution, site: Path) -> bool:
-    """Whether it brings what is installed of a commit, but from elsewhere."""
+    """True for a path that brings a package installed of a commit, but from elsewhere."""
     packages = (distribution.read_text("top_level.txt") or "").split()
     place = Path(str(distribution.locate_file(""))).resolve()
     return not PACKAGES.isdisjoint(packages) and not place.is_relative_to(site)

@@ -110,7 +110,7 @@ class Recorder:
             self.notes[key] = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
     def samples(self, config: Config, splatter: str | None) -> None:
-        """What `rts.sample` gives; with a splatter, only what it needs."""
+        """The samples of `rts.sample`; with a splatter, only those that it needs."""
         import rts
 
         config = config._replace(splatter=str(splatter))
@@ -135,7 +135,7 @@ class Recorder:
         self.take(config.key("samples"), record)
 
     def rigid(self, engine: NumPy) -> None:
-        """What is left out where poses are pinned."""
+        """The results that are left out where poses are pinned."""
         import rts
 
         def record() -> None:
@@ -188,7 +188,7 @@ class Recorder:
 
 
 def _has_time(config: Config) -> bool:
-    """Whether an image and its gradients are taken: in jax they take seconds, and not all is new there."""
+    """True if an image and its gradients are computed: in jax they take seconds, and not all is new there."""
     default, usual = config.splatter == DEFAULT, config.layers == USUAL
     if config.sampler in SLOW:
         return default and usual and config.engine.name != "jax"

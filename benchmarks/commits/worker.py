@@ -1,4 +1,4 @@
-"""What `compare` starts for each side: a process that uses one install, and leaves if it finds another.
+"""The process that `compare` starts for each side: it uses one install, and leaves if it finds another.
 
 Two tasks:
 

@@ -82,7 +82,7 @@ def camera() -> rts.Camera:
 
 
 def turns() -> list[float]:
-    """How far the views are turned; `setup.json` leaves their order open, and fits come nearer in this one."""
+    """The turns of the views; `setup.json` leaves their order open, and fits come nearer in this one."""
     return setup()["initial_pose_per_view"]["euler_y_rad"][::-1]
 
 
@@ -234,7 +234,7 @@ def deodr(steps: int) -> dict[str, Any]:
 
 
 def verdict(found: float, begun: float) -> str:
-    """What an error means beside that at the start of its seed."""
+    """The verdict on an error beside that at the start of its seed."""
     if not np.isfinite(found) or found > DIVERGED * begun:
         return "diverged"
     return "stalled" if found > STALLED * begun else "ok"

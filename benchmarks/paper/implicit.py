@@ -48,7 +48,7 @@ FIRST = 5
 
 
 class Task(NamedTuple):
-    """What is fitted.
+    """A surface to be fitted.
 
     Attributes:
         name: of the task.
@@ -83,7 +83,7 @@ class Task(NamedTuple):
 
 
 class Course(NamedTuple):
-    """How a fit went.
+    """The course of a fit.
 
     Attributes:
         trail: θ at the start, at some steps, and at the end.

@@ -91,7 +91,7 @@ def _image(part: Any, scene: Scene, camera: rts.Camera, size: Any, engine: str =
 
 
 class Settings(NamedTuple):
-    """How a surface light field is refined.
+    """Settings by which a surface light field is refined.
 
     Attributes:
         joint: whether the grid is refined, too.
@@ -277,7 +277,7 @@ def refine(
 
 
 def scores(images: Sequence[np.ndarray], shots: Sequence[Shot]) -> dict[str, list]:
-    """How near images are to photographs."""
+    """Scores of images beside photographs."""
     pairs = list(zip(images, shots, strict=True))
     return {
         "views": [shot.name for shot in shots],
@@ -409,7 +409,7 @@ def timed(scene: Scene, values: np.ndarray, weights: Any, frames: int = 5) -> di
 
 
 def tables(folder: Path) -> str:
-    """What was found, in Markdown."""
+    """The results, in Markdown."""
     found = {s: json.loads((folder / f"{s}.json").read_text()) for s in STAGES if (folder / f"{s}.json").is_file()}
     sides = list(dict.fromkeys(side for stage in found.values() for side in stage["sides"]))
     lines = []

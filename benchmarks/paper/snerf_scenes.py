@@ -1,4 +1,4 @@
-"""What radiance fields are refined on: pretrained networks, posed photographs, and the lattices of their surfaces."""
+"""Scenes for refining radiance fields: pretrained networks, posed photographs, and the lattices of their surfaces."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Shot(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What is refined, and by what.
+    """A radiance field to be refined, and its photographs.
 
     Attributes:
         field: the radiance field.

@@ -48,7 +48,7 @@ class Cage(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What is fitted, from where, to what.
+    """A fit: the surface, its start and its target.
 
     Attributes:
         name: of the task.
@@ -198,7 +198,7 @@ def difference(task: Task, vertices: np.ndarray, azimuth: float, side: int) -> f
 
 
 def measured(task: Task, vertices: np.ndarray, side: int) -> dict[str, Any]:
-    """How near vertices are to the truth: in the views that are fitted, then in the one that is kept back."""
+    """Scores of a fit beside the truth: in the views that are fitted, then in the one that is kept back."""
     azimuths = (*AZIMUTHS, HELD_BACK)
     overlaps = [
         overlap(

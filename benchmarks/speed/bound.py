@@ -1,4 +1,4 @@
-"""What a pose iteration's time is made of, and the least that the machine's memory would allow.
+"""The parts of a pose iteration's time, and the least time that the machine's memory would allow.
 
 An iteration with torch, K = 2: the milliseconds of its compiled loops, by what they are for, and of the rest, which is
 Python, torch and Adam; how many bytes the loops are handed; and how long two threads take to read so many.

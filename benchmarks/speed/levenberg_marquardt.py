@@ -1,4 +1,4 @@
-"""What a step of Levenberg–Marquardt takes, beside a loss with its gradient."""
+"""The time of a step of Levenberg–Marquardt, beside a loss with its gradient."""
 
 from __future__ import annotations
 

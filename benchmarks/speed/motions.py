@@ -1,4 +1,4 @@
-"""What it costs a pose iteration that outlines and lines of crossing have motions of their own.
+"""The cost, in a pose iteration, of motions of outlines and of lines of crossing.
 
 The default splatter with neither, with outlines alone and with both, in turns, with torch:
 

@@ -1,4 +1,4 @@
-"""How many Python functions a render calls: what each call costs is not much, but small images cost nothing else.
+"""The number of Python functions that a render calls: each costs little, but small images cost nothing else.
 
 Counts the calls of one torch render of a small silhouette, 48², with a pose that has a gradient, after a warm-up, and
 those of its backward pass; C functions do not count. Prints totals and the functions that are called most:

@@ -1,4 +1,4 @@
-"""How fast it is: iterations of a pose fit beside other renderers, stages, splatters, memory, pruning, second order.
+"""Times: iterations of a pose fit beside other renderers, stages, splatters, memory, pruning, second order.
 
 Methods that are compared take turns in one run, so that noise of the machine hits all alike. Writes tables (speed.md),
 all numbers (speed.json) and charts:
@@ -66,7 +66,7 @@ def pose_rows(tasks: Iterable[Task], args: argparse.Namespace, done: Callable[[]
 
 
 class Plan:
-    """What is measured: sections by name, each with its number of steps and the function that measures it.
+    """The measurements: sections by name, each with its number of steps and the function that measures it.
 
     Args:
         args: of the command line.
@@ -108,7 +108,7 @@ class Plan:
         }
 
     def chosen(self, names: Iterable[str]) -> list[str]:
-        """Those that were asked for."""
+        """The sections that were asked for."""
         return [name for name in names if name in self.args.meshes]
 
     def tasks(self, names: list[str], sizes: tuple[int, ...] | None = None) -> Iterator[Task]:
@@ -141,7 +141,7 @@ def options() -> argparse.Namespace:
 
 
 def write(results: dict, folder: Path) -> None:
-    """What is known so far."""
+    """Write the results so far."""
     (folder / "speed.json").write_text(json.dumps(results, indent=1))
     (folder / "speed.md").write_text(tables.document(results))
     for name, chart in CHARTS.items():

@@ -1,4 +1,4 @@
-"""What sampling costs: milliseconds to prepare and to sample, by faces, layers and size of the image.
+"""The cost of sampling: milliseconds to prepare and to sample, by faces, layers and size of the image.
 
 All samplers take turns in one run; beside them, embreex's own first-hit `run` of the same rays, and a bare K-buffer
 loop (ids only, one thread and float32) over the same triangles, projected beforehand. Writes a table and a log–log

@@ -1,4 +1,4 @@
-"""What a second layer costs a pose iteration, and what dropping its hidden samples saves."""
+"""The cost of a second layer in a pose iteration, and the saving by dropping its hidden samples."""
 
 from __future__ import annotations
 

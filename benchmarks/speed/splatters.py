@@ -1,4 +1,4 @@
-"""What a splatter takes by itself: image and gradients, the specification beside the compiled one."""
+"""The time of a splatter by itself: image and gradients, the specification beside the compiled one."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def torch_splat(splatter: Any, given: tuple[np.ndarray, ...], g: np.ndarray) -> 
 
 
 def jax_splat(splatter: Any, given: tuple[np.ndarray, ...], g: np.ndarray) -> Callable[[], object]:
-    """The same, compiled."""
+    """The image of splats in jax, compiled."""
     import jax
     import jax.numpy as jnp
 

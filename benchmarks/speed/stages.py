@@ -1,4 +1,4 @@
-"""What each stage of a pose iteration takes, with torch: real sampler, splatter and shader with clocks around them."""
+"""The time of each stage of a pose iteration with torch: real sampler, splatter and shader with clocks around them."""
 
 from __future__ import annotations
 

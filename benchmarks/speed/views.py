@@ -52,7 +52,7 @@ def images(parts: Any, side: int, together: bool) -> Any:
 
 
 def call_of(kind: str, part: rts.Part, side: int, together: bool) -> Callable[[], object]:
-    """What is timed: images, or the gradient of a weighted sum of them."""
+    """The timed function: images, or the gradient of a weighted sum of them."""
     weights = np.random.default_rng(0).normal(size=(VIEWS, side, side, 4)).astype(np.float32)
     engine, *what = kind.split()
     if engine == "numpy":

@@ -1,4 +1,4 @@
-"""Where each method breaks: a table of ways to fail, by experiment."""
+"""A table of methods and ways to fail, by experiment."""
 
 from __future__ import annotations
 
