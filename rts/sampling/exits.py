@@ -72,8 +72,8 @@ def with_pairs(
     listed: np.ndarray | None,
     size: tuple[int, int],
     specs: Mapping[str, ArraySpec],
-) -> Samples:
-    """Samples with further rows, the pairs of a surface's `refine_outlines`, which `exit` (2, H, W) names.
+) -> tuple[Samples, tuple[np.ndarray, np.ndarray] | None]:
+    """Samples whose `exit` (2, H, W) names the pairs of a surface's `refine_outlines`, which are not packed yet.
 
     Args:
         samples: refined samples on the host, a row for each covered cell.
@@ -83,6 +83,9 @@ def with_pairs(
         listed: (L, C), the cells of the samples; None for all. See `outline_cells`.
         size: (height, width) of the grid.
         specs: the result of the surface's `table_specs`.
+
+    Returns:
+        The samples, and ids (2 M, I) and params (2 M, P) of the pairs, as `repack` takes them; None without any.
     """
     exits = np.full((2, *samples.row.shape[1:]), -1, np.int32)
     cells = outline_cells(samples.row >= 0, samples.depth, listed, size)
@@ -91,13 +94,12 @@ def with_pairs(
     depth = samples.depth[0].reshape(-1)[cells]
     result = surface.refine_outlines(inputs, own, depth, samples.tables) if len(cells) else None
     if result is None or any(len(x) > specs[name].shape[0] for name, x in result[3].items()):
-        return samples.replace(exit=exits)
+        return samples.replace(exit=exits), None
     ids, params, there, tables = result
-    first = len(samples.ids) + 2 * np.arange(np.count_nonzero(there), dtype=np.int32)
-    exits.reshape(2, -1)[:, cells[there]] = first, first + 1
-    ids, params = (x[there].reshape(-1, x.shape[2]) for x in (ids, params))
-    ids, params = np.concatenate([samples.ids, ids]), np.concatenate([samples.params, params])
-    return samples.replace(ids=ids, params=params, exit=exits, tables=tables)
+    count = 2 * np.count_nonzero(there)
+    exits.reshape(2, -1)[:, cells[there]] = np.arange(count, dtype=np.int32).reshape(-1, 2).T
+    ids, params = (x[there].reshape(count, x.shape[2]) for x in (ids, params))
+    return samples.replace(exit=exits, tables=tables), (ids, params)
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:

@@ -68,39 +68,44 @@ def lift(
     return Samples(ids, params, Cells(row, depth, exit=exit_rows), np.asarray(max(0, total - len(ids)), np.int32))
 
 
-def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
-    """Samples of the cells that are kept, packed anew and numbered layer by layer; exits get the last rows.
-
-    Exits find room where rows are left, in pairs if there are two a cell.
+def repack(
+    samples: Samples,
+    kept: np.ndarray,
+    capacity: int | None,
+    pairs: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Samples:
+    """Samples of the cells that are kept, packed anew and numbered layer by layer; pairs at outlines get the last rows.
 
     Args:
         samples: on the host.
         kept: (K, H, W) bool; covered cells only.
         capacity: rows to allot, zeros where they are not used; None for as many as are kept, at least one.
+        pairs: ids (2 M, I) and params (2 M, P) of pairs, for the M cells that have an exit, in order. Those that find
+            no room are left out.
     """
     index = samples.row[kept]
     rows = max(1, len(index)) if capacity is None else capacity
     number = np.full(samples.row.shape, -1, np.int32)
     number[kept] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
     index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
-    exits = samples.exit
-    if exits is not None:
-        if capacity is None:
-            rows = min(rows + int(np.count_nonzero(exits >= 0)), max(1, samples.row.size))
-        cells = tuple(x[: (rows - len(index)) // len(exits)] for x in np.nonzero(exits[-1] >= 0))
-        first, index = len(index), np.concatenate([index, exits[:, *cells].T.reshape(-1)])
-        exits = np.full_like(exits, -1)
-        exits[:, *cells] = np.arange(first, len(index), dtype=np.int32).reshape(-1, len(exits)).T
+    exits, count, last = samples.exit, len(index), len(index)
+    if exits is not None and pairs is not None:
+        rows = min(rows + len(pairs[0]), max(1, samples.row.size)) if capacity is None else rows
+        cells = tuple(x[: (rows - count) // 2] for x in np.nonzero(exits[0] >= 0))
+        exits, last = np.full_like(exits, -1), count + 2 * len(cells[0])
+        exits[:, *cells] = np.arange(count, last, dtype=np.int32).reshape(-1, 2).T
 
-    def packed(x: np.ndarray) -> np.ndarray:
+    def packed(x: np.ndarray, further: np.ndarray | None = None) -> np.ndarray:
         rows_kept = np.zeros((rows, *x.shape[1:]), x.dtype)
-        rows_kept[: len(index)] = x[index]
+        rows_kept[:count] = x[index]
+        if further is not None:
+            rows_kept[count:last] = further[: last - count]
         return rows_kept
 
     return replace(
         samples,
-        ids=packed(samples.ids),
-        params=packed(samples.params),
+        ids=packed(samples.ids, pairs and pairs[0]),
+        params=packed(samples.params, pairs and pairs[1]),
         cells=replace(samples.cells, row=number, exit=exits, depth=np.where(number >= 0, samples.depth, np.float32(0))),
         overflow=overflow,
         tables={name: packed(x) if name in samples.by_sample else x for name, x in samples.tables.items()},

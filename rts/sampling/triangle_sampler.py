@@ -318,10 +318,11 @@ class _Search:
         samples, rays = refined(
             self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells
         )
+        further = None
         if pairs:
-            more = self.cells, self.shape.view, self.tables
-            samples = with_pairs(samples, self.surface, self.inputs, rays, *more)
-        return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
+            given = self.cells, self.shape.view, self.tables
+            samples, further = with_pairs(samples, self.surface, self.inputs, rays, *given)
+        return repack(samples, samples.row >= 0, self.shape.capacity, further).replace(facing=facing)
 
     def moved(self) -> Samples:
         """Samples that the surface moves off its triangles."""

@@ -26,7 +26,7 @@ FLATTEST = 1e-6
 """Least squared slope by which a level is divided to move points, as a share of the usual one; this bounds motion."""
 
 
-MARCH, FIRST, GROWTH = 16, 1 / 24, 1.5
+MARCH, FIRST, GROWTH = 10, 1 / 12, 2.0
 """Steps along a ray that seek its deepest point; the first, as a share of the reach; and their growth."""
 
 REACH = 3.0

@@ -113,54 +113,55 @@ def hand_on(start, stop, faces, ends, cells, caps, ids):
 
 
 @compiled
-def _level(values, isovalue, sign, capped, shape, low, step, at, slope):
-    """The level at a point, interpolated along each axis, and its gradient in `slope`; beyond the bounds see below.
+def _level(values, isovalue, sign, capped, shape, low, step, at, near, slope):
+    """The level at a point, interpolated along each axis.
 
-    Returns the level, the lowest corner of the cell, and True if a cap decides: if `capped`, the level is at least the
-    distance beyond the bounds. Otherwise the level is infinite there.
+    Fills `near`, the point's places in its cell, 0 to 1 along each axis, and the gradient `slope`. Beyond the bounds
+    the level is infinite; if `capped` it is at least the distance beyond them.
+
+    Returns:
+        The level, the number of the cell's lowest corner, and True if a cap decides.
     """
-    side, beyond = 0, -np.inf
+    side, beyond, base = 0, -np.inf, 0
     for i in range(3):
-        high = low[i] + step[i] * (shape[i] - 1)
-        for end in range(2):
-            over = at[i] - high if end else low[i] - at[i]
-            if over > beyond:
-                side, beyond = 2 * i + end, over
+        place = (at[i] - low[i]) / step[i]
+        over = max(-place, place - (shape[i] - 1)) * step[i]
+        if over > beyond:
+            side, beyond = i, over
+        cell = min(max(int(np.floor(place)), 0), shape[i] - 2)
+        base, near[i] = base * shape[i] + cell, min(max(place - cell, 0.0), 1.0)
     if beyond > 0 and not capped:
         return np.inf, 0, True
-    base = 0
-    for i in range(3):
-        cell = min(max(int(np.floor((at[i] - low[i]) / step[i])), 0), shape[i] - 2)
-        base = base * shape[i] + cell
-    x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
-    near_x = min(max((at[0] - low[0]) / step[0] - x, 0.0), 1.0)
-    near_y = min(max((at[1] - low[1]) / step[1] - y, 0.0), 1.0)
-    near_z = min(max((at[2] - low[2]) / step[2] - z, 0.0), 1.0)
-    level = 0.0
-    slope[:] = 0
-    for i in range(8):
-        a, b, c = i & 1, i >> 1 & 1, i >> 2 & 1
-        value = sign * (np.float64(values[base + (a * shape[1] + b) * shape[2] + c]) - isovalue)
-        along_x, along_y = (near_x if a else 1 - near_x), (near_y if b else 1 - near_y)
-        along_z = near_z if c else 1 - near_z
-        level += along_x * along_y * along_z * value
-        slope[0] += (2 * a - 1) * along_y * along_z * value / step[0]
-        slope[1] += (2 * b - 1) * along_x * along_z * value / step[1]
-        slope[2] += (2 * c - 1) * along_x * along_y * value / step[2]
+    x, y, z = near
+    # Along x, then along y, then along z.
+    a, b = base, base + shape[1] * shape[2]
+    i00, i01, i10, i11 = 0, 1, shape[2], shape[2] + 1
+    f00, f01, f10, f11 = (
+        np.float64(values[a + i00]),
+        np.float64(values[a + i01]),
+        np.float64(values[a + i10]),
+        np.float64(values[a + i11]),
+    )
+    d00, d01, d10, d11 = (
+        np.float64(values[b + i00]) - f00,
+        np.float64(values[b + i01]) - f01,
+        np.float64(values[b + i10]) - f10,
+        np.float64(values[b + i11]) - f11,
+    )
+    f0, f1 = f00 + x * d00, f01 + x * d01
+    e0, e1 = f10 + x * d10 - f0, f11 + x * d11 - f1
+    f0, f1 = f0 + y * e0, f1 + y * e1
+    level = sign * (f0 + z * (f1 - f0) - isovalue)
+    d0, d1 = d00 + y * (d10 - d00), d01 + y * (d11 - d01)
+    slope[0] = sign * (d0 + z * (d1 - d0)) / step[0]
+    slope[1] = sign * (e0 + z * (e1 - e0)) / step[1]
+    slope[2] = sign * (f1 - f0) / step[2]
     if capped and beyond > level:
-        slope[:] = 0
-        slope[side // 2] = 1 if side & 1 else -1
+        upper = at[side] > low[side]
+        slope[0], slope[1], slope[2] = 0.0, 0.0, 0.0
+        slope[side] = 1.0 if upper else -1.0
         return beyond, base, True
     return level, base, False
-
-
-@compiled
-def _rest(at, base, shape, low, step, out):
-    """Fill the places (3,) of a point in the cell with this lowest corner, 0 to 1 along each axis."""
-    x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
-    out[0] = min(max((at[0] - low[0]) / step[0] - x, 0.0), 1.0)
-    out[1] = min(max((at[1] - low[1]) / step[1] - y, 0.0), 1.0)
-    out[2] = min(max((at[2] - low[2]) / step[2] - z, 0.0), 1.0)
 
 
 @compiled
@@ -220,11 +221,11 @@ def deepest(
         apart = max(APART * reach, min(0.5 * min(step), reach / 6))
         # Steps that grow pass the deepest point.
         before, t, move = 0.0, 0.0, FIRST * reach
-        value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, slope)
+        value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, near, slope)
         a, b, after = 0.0, 0.0, value
         for _ in range(MARCH):
             _along(first, unit, t + move, at)
-            after, _, _ = _level(values, isovalue, sign, capped, shape, low, step, at, slope)
+            after, _, _ = _level(values, isovalue, sign, capped, shape, low, step, at, near, slope)
             if after > value:
                 a, b = before, t + move
                 break
@@ -234,7 +235,7 @@ def deepest(
         for _ in range(HALVINGS // 2):
             middle = (a + b) / 2
             _along(first, unit, middle, at)
-            _level(values, isovalue, sign, capped, shape, low, step, at, slope)
+            _level(values, isovalue, sign, capped, shape, low, step, at, near, slope)
             if slope[0] * unit[0] + slope[1] * unit[1] + slope[2] * unit[2] < 0:
                 a = middle
             else:
@@ -243,14 +244,14 @@ def deepest(
         falls, rises = 0.0, 0.0
         for k in range(2):
             _along(first, unit, b if k else a, at)
-            value, base, cap = _level(values, isovalue, sign, capped, shape, low, step, at, ends[k])
+            value, base, cap = _level(values, isovalue, sign, capped, shape, low, step, at, near, ends[k])
             rate = ends[k, 0] * unit[0] + ends[k, 1] * unit[1] + ends[k, 2] * unit[2]
             if k:
                 rises = max(rate, 0.0)
             else:
                 falls = max(-rate, 0.0)
             level += value / 2
-            _tetrahedron(values, isovalue, base, shape, low, step, at, near, points[n, k], params[n, k])
+            _tetrahedron(values, isovalue, base, shape, at, near, points[n, k], params[n, k])
             params[n, k, 15] = np.nan if cap else params[n, k, 15]
         share = rises / (falls + rises) if falls + rises > 0 else 0.5
         across, square = 0.0, 0.0
@@ -274,9 +275,11 @@ def deepest(
 
 
 @compiled
-def _tetrahedron(values, isovalue, base, shape, low, step, at, near, points, params):
-    """Fill the four lattice points, and their weights, that interpolate at a point; its place, and the level there."""
-    _rest(at, base, shape, low, step, near)
+def _tetrahedron(values, isovalue, base, shape, at, near, points, params):
+    """Fill the four lattice points that interpolate at a point, their weights, the point, and its level.
+
+    Changes `near`, the point's places in its cell.
+    """
     number, left, level = base, 1.0, 0.0
     for k in range(6):
         points[k], params[3 + k] = number, 0
