@@ -58,10 +58,10 @@ def outline_cells(
         marks = np.zeros(size[0] * size[1], np.bool_)
         marks[outline_cells(whole.reshape(layers, *size), deep.reshape(layers, *size))] = True
         return listed[marks[own]].astype(np.int32)
-    marks = np.zeros(covered.shape[1:], np.bool_)
-    arguments = read_only(covered), read_only(depth), marks
-    parallel(exits_loops.mark_ends, len(marks), *arguments, work=20 * covered.size)
-    return np.flatnonzero(marks).astype(np.int32)
+    near = beside_outlines(covered)[0]
+    ends = np.empty(len(near), np.bool_)
+    parallel(exits_loops.mark_ends, len(near), near, read_only(covered), read_only(depth), ends, work=40 * len(near))
+    return near[ends]
 
 
 def with_pairs(

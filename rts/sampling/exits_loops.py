@@ -35,13 +35,11 @@ def find(kept, cells):
 
 
 @loop
-def mark_ends(start, stop, covered, depth, marks):
-    """Mark cells of rows [start, stop) whose front ends towards a neighbour; see `exits.outline_cells`."""
+def mark_ends(start, stop, cells, covered, depth, ends):
+    """Mark covered cells [start, stop) of a list whose front ends towards a neighbour; see `exits.outline_cells`."""
     layers, height, width = covered.shape
-    for y in range(start, stop):
-        for x in range(width):
-            if covered[0, y, x]:
-                marks[y, x] = _ends(covered, depth, y, x, layers, height, width)
+    for i in range(start, stop):
+        ends[i] = _ends(covered, depth, cells[i] // width, cells[i] % width, layers, height, width)
 
 
 @compiled
