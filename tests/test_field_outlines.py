@@ -137,6 +137,7 @@ def test_fine_samples_at_outlines_have_pairs_too(way, name):
     np.testing.assert_allclose(found, expected(q), rtol=0.01, atol=0.01 * max(expected(q)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("way", ["sdf", "lattice"])
 def test_a_compiled_program_has_the_derivative_of_an_eager_one(way):
     jax = pytest.importorskip("jax")
@@ -157,7 +158,7 @@ def unit_rays(count, seed=0):
     return points, np.tile([0.0, 0.0, -2.0], (count, 1)), off
 
 
-@pytest.mark.parametrize("target", ["numpy", *TORCH, "jax"])
+@pytest.mark.parametrize("target", ["numpy", *TORCH, pytest.param("jax", marks=pytest.mark.thorough)])
 def test_the_deepest_point_of_a_ball_is_nearest_to_its_centre(target):
     points, directions, off = unit_rays(50)
     given = (arrays(target, x, np.float64) for x in (points, directions, np.full(50, 0.5)))
