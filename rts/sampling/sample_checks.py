@@ -1,4 +1,4 @@
-"""Checks of cameras, proxies, fragments, samples and refined samples, on the host. To refuse is an InputError."""
+"""Checks of cameras, proxies, fragments, samples and refined samples, on the host; "refused" means an InputError."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: 
 
 
 def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
-    """The result of a surface's `pieces`, refused where compiled code would read out of its bounds."""
+    """The result of a surface's `pieces`, refused unless it is int16 of (T,) or (1,)."""
     pieces = np.asarray(surface.pieces(proxy))
     if pieces.dtype != np.int16 or pieces.shape not in ((1,), (len(proxy.faces),)):
         raise InputError(
@@ -108,7 +108,7 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
     """A sampler's samples of a part, refused where their arrays do not fit the grid, or one another.
 
     Args:
-        samples: the samples; traced values are not checked.
+        samples: the samples; of traced ones only shapes and dtypes are checked.
         grid: (H, W) of the cells.
         sampler: the sampler.
     """
