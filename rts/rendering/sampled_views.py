@@ -195,9 +195,9 @@ def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tupl
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
-    """Leave out samples beyond the capacity of each view, deepest layers first. Returns their number.
+    """Set False what exceeds `capacity` in each view, deepest layers first. Returns the number of these samples in all.
 
-    `kept` (K, height, width) is changed in place.
+    `kept` (K, height, width) bool is of the whole picture, and is changed in place.
     """
     over = 0
     for lines, columns in picture.places():
