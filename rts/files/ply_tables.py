@@ -101,7 +101,11 @@ def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
 
 
 def written(path: Path, kind: str, mesh: Mesh) -> bytes:
-    """A binary PLY of triangles."""
+    """A binary PLY of a mesh, its polygons cut into triangles.
+
+    Raises:
+        InputError: a face has less than 3 corners, or refers to a missing vertex; colours are no colours.
+    """
 
     def fail(what: str) -> InputError:
         return unreadable(path, kind, what)
