@@ -1,4 +1,4 @@
-"""Checks of nodes and scenes of GLB and glTF files: nodes form a forest, and those that place meshes are sound."""
+"""Checks of nodes and scenes of GLB and glTF files: nodes form a forest, and transforms of meshes are sound."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
 
 
 def _in_scene(piece: Piece) -> Piece:
-    """The piece in the scene's coordinates, with colours times the material's (A, 4) in "colors", white if none."""
+    """The piece in the scene's coordinates; "colors" (A, 4) are its own, white if none, times its material's."""
     rows, table = piece.attributes.get("colors", (np.ones((len(piece.vertices), 3)), piece.faces))
     colors = np.ones((len(rows), 4))
     colors[:, : rows.shape[1]] = rows

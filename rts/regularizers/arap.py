@@ -43,7 +43,7 @@ class ARAP(OfRestShape):
         weights: (E,) float64, wᵢⱼ, at least 0.
 
     Raises:
-        InputError: an argument is of another kind or shape; vertices are traced; faces name others, or have no edge.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge.
     """
 
     def __init__(self, vertices: Any, faces: Any, weights: str = "cotangent"):

@@ -35,7 +35,7 @@ class NormalConsistency(Regularizer):
         pairs: (P, 2) int32 into faces.
 
     Raises:
-        InputError: an argument is of another kind or shape; vertices are traced; faces name others, or have no edge.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge.
     """
 
     def __init__(self, vertices: Any = None, faces: Any = None):

@@ -83,7 +83,7 @@ class OfRestShape(Regularizer):
         faces: (T, 3) integers into vertices; copied.
 
     Raises:
-        InputError: an argument is of another kind or shape; vertices are traced; faces name others.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing vertices.
     """
 
     def __init__(self, vertices: Any, faces: Any):

@@ -77,6 +77,7 @@ def render_views(
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
         EngineError: torch and jax arrays in one scene.
+        PluginError: a plugin cannot be imported, such as for want of a package.
 
     Warns:
         EmptyImageWarning: nothing is seen in a view; the warning says why.

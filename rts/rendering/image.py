@@ -74,6 +74,7 @@ def render(
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
         EngineError: torch and jax arrays in one scene.
+        PluginError: a plugin cannot be imported, such as for want of a package.
 
     Warns:
         EmptyImageWarning: nothing is seen; the warning says why.

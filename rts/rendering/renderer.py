@@ -65,6 +65,7 @@ def prepare(
 
     Raises:
         InputError: an argument is wrong or traced, or a surface's triangles depend on a view that is not given.
+        PluginError: the sampler cannot be imported, such as for want of a package.
     """
     return PreparedParts.of(parts, sampler, camera, size)
 

@@ -360,7 +360,10 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
-    """The number (B,) of samples of each view, which have one cell each; rows beyond all go to the first view."""
+    """The number (B,) of samples of each view, from `row` (K, height, width), in which each has one cell.
+
+    If there are more than these, `rows` in all, the others count as the first view's.
+    """
     from rts.sampling import packing_loops
 
     assert row is not None

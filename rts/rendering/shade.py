@@ -50,7 +50,7 @@ def _read(part: CheckedPart) -> dict[str, Tree]:
 
 
 def shaded_at_once(part: CheckedPart) -> bool:
-    """True if a part's shader takes the samples of several views in one call."""
+    """True if a part's shader takes the samples of several views in one call, or gives one colour."""
     # The footprint of a sample depends on the camera of its view.
     needs_no_footprint = part.reads is not None and FOOTPRINT not in part.reads
     return part.uniform or (part.takes_views and needs_no_footprint)
@@ -70,7 +70,7 @@ def add_footprint(
     grid: tuple[int, int],
     context: Context,
 ) -> None:
-    """Add a deferred "uv_footprint" to the G-buffer `local` of samples in one view, if it has "uv" alone.
+    """Add a deferred "uv_footprint" to the G-buffer `local` of samples in one view, if it has "uv" but no footprint.
 
     Arguments are as in `uv_footprint`; `own` is its camera.
     """

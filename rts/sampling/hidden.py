@@ -93,7 +93,7 @@ class HiddenBySplatter:
     settles: bool
 
     def unsized(self) -> HiddenBySplatter:
-        """The rule for depths in units of their own, for which `size` has no meaning."""
+        """The rule with `size` 0, for depths in units of their own."""
         return replace(self, size=0.0)
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
@@ -224,7 +224,9 @@ def _ran_out(sampled: Sampled) -> bool:
 
 
 def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> Sampled:
-    """The scene without the samples, and the single exits, that a decision does not need; one host call.
+    """The scene without the samples that a decision does not need, and without single exits away from outlines.
+
+    One host call.
 
     Raises:
         InputError: `row` or `exit` names a sample that does not exist.

@@ -29,7 +29,7 @@ def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any
 
 
 def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
-    """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
+    """The proxy with contiguous arrays of the right dtypes; wrong shapes, widths and indices are refused."""
     if not isinstance(proxy, Proxy):
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected a Proxy")
     vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
@@ -64,7 +64,7 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
 
 
 def check_faces(proxy: Proxy, surface: Any = None) -> None:
-    """Refuse triangles that name no vertex, before compiled code reads there."""
+    """Refuse faces with an index that is no vertex's, before compiled code reads there."""
     if not len(proxy.faces):
         return
     least, most = table_extent(proxy.faces)
@@ -160,7 +160,8 @@ WELL_CONDITIONED = 1e-6
 def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     """The camera of host matrices, refused where it makes no image.
 
-    They must be finite and invertible, the last row of the view 0, 0, 0, 1, and that of the projection 0, 0, c ≤ 0, d.
+    Its matrices must be finite and invertible. The last row of the view must be 0, 0, 0, 1, and that of the projection
+    0, 0, c ≤ 0, d.
 
     Args:
         camera: float64; its view is that of the camera times the part's transform.

@@ -148,7 +148,7 @@ def pairs_of(layers: Layers) -> dict[Steps, Array]:
 
 
 def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps, Array]:
-    """Pairs of cells between which lines of crossing run: by each step m of AROUND, (H, W) bool, the q of (q, q + m).
+    """Pairs of cells between which lines of crossing run: for each step m, (H, W) bool, true at q of pairs (q, q + m).
 
     Args:
         z0: depths of the first layer (H, W), finite.

@@ -94,7 +94,7 @@ class Kernel(Splatter):
 
     @abc.abstractmethod
     def plain(self, depths: Depths, margin: float) -> Array:
-        """Targets (H, W) bool that only front layers affect, for any rounding of depths within a margin."""
+        """Targets (H, W) bool that only fronts affect, even if rounding changes differences of depth by `margin`."""
 
     @functools.cached_property
     def gamma(self) -> float:

@@ -30,7 +30,7 @@ OFF = 0.02
 
 
 def claim_tessellated(part: Part, surface: TriangleSurface, sampler: Any) -> None:
-    """Fail unless `tessellate` gives sound meshes that come nearer to the surface, with more triangles, at more cuts.
+    """Fail unless `tessellate` gives sound meshes: at more cuts nearer to the surface, of more triangles or as many.
 
     Skipped for surfaces without a `tessellate` that refine samples or depend on the view.
     """

@@ -127,7 +127,7 @@ class _Case:
         return before
 
     def gained(self, before: _Error) -> float:
-        """The share of the whole error that the last experiment removed."""
+        """The share of the whole error, squared, that the last experiment removed; `before` is the error before it."""
         return (before.norm**2 - self.error.norm**2) / self.whole.norm**2
 
 
