@@ -258,7 +258,7 @@ class HiddenInStrips:
         return Decision(self._listed(kept, needed), numbers_of(amid), needed)
 
     def _listed(self, marks: np.ndarray, among: np.ndarray, kinds: np.ndarray | None = None) -> np.ndarray:
-        """Cells (K, L, LINE) bool of the list: true where `among` is, and `marks` (K, h, w) of the layout mark the cell.
+        """Cells (K, L, LINE) bool of the list: true where `among` is, and `marks` (K, h, w) of the layout mark it.
 
         With `kinds`, marks that are not near wanted cells are first cleared, in `marks` itself.
         """
