@@ -99,7 +99,7 @@ def time_label(milliseconds: float) -> str:
 
 
 def side_length(supersample: int | str) -> float:
-    """The side of a row's symbol, screen pixels; it grows with the samples along a pixel's side, up to 6."""
+    """The side of a row's symbol, screen pixels; it grows with samples along a pixel's side, up to 6 of these."""
     return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
 
 
@@ -122,7 +122,10 @@ def label(row: Row) -> str:
 
 
 def arguments(row: Row) -> str:
-    """A row's settings as keyword arguments of `rts.render` to copy; a comment names engine and rate, set elsewhere."""
+    """A row's settings as keyword arguments of `rts.render` to copy; a comment names engine and rate, set elsewhere.
+
+    For a row of another renderer, a comment alone.
+    """
     settings = row["settings"]
     if "peer" in row:
         return "# " + ", ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])

@@ -51,7 +51,7 @@ class Comparison:
             standard deviation 2 pixels), "gain" and "loss_error" (see `derivative_scores.scores`), "ms" (median,
             quartiles and number of calls, or None where only the error was measured) and "front", True if no row is
             both faster and more accurate. Rows of other renderers name theirs in "peer".
-        left_out: a line for each measurement that failed, with the reason.
+        left_out: lines on measurements that failed and options that were left out, with the reasons.
     """
 
     scene: Mapping[str, Any]
@@ -152,8 +152,8 @@ def compare(
 
     The error of a setting is that of the derivative image along each of some directions (modes), against differences of
     area-sampled renders. Settings are timed, in turns, unless a cheaper one is as accurate: a render, and the gradient
-    of a loss by the parameters that move. Every registered sampler and splatter takes part, and DEODR and Mitsuba where
-    the extra `bench` is installed.
+    of a loss by the parameters that move. By default every sampler and splatter that is installed takes part; and, with
+    the extra `bench`, DEODR and Mitsuba, if they can render the scene.
 
     Args:
         scene: the name of a built-in scene, the path of a model or of a Python file ("file.py:function"), or a
@@ -179,7 +179,8 @@ def compare(
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
-        InputError: there is no such scene, or an argument is wrong; before anything is measured.
+        InputError: there is no such scene, or an argument is wrong; before anything is measured. Or no sampler suits
+            the scene, or nothing in the image changes.
         PluginError: a named plugin cannot be loaded, or no engine with derivatives is installed.
     """
     found = scene_of(scene, parameters, directions, size, surface=surface)
@@ -236,7 +237,10 @@ def _unthinned() -> list[str]:
 
 
 def _earlier(folder: Path | None, scene: Scene, fresh: bool) -> KeptMeasurements:
-    """The store of measurements that earlier runs made of scenes of this name; without folder or if fresh, empty."""
+    """The store of measurements that earlier runs made of scenes of this name; empty without a folder.
+
+    `fresh` deletes these measurements.
+    """
     if folder is None:
         return KeptMeasurements()
     path = folder / f".{file_name(scene.name)}.jsonl"

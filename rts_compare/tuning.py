@@ -37,7 +37,8 @@ class Tuned(NamedTuple):
         parts: the scene's parts at the parameters, without derivatives, their surfaces at the rates that were chosen.
         settings: keyword arguments of `rts.render`: sampler, splatter, layers and supersample.
         rate: how the surfaces differ from the given ones, such as "tolerance=0.4"; "" if they do not.
-        reasons: a line for each choice: the error of a cheaper one, and the time of a dearer one.
+        reasons: a line for each choice: the error of a cheaper one, and the time of a dearer one; and lines on
+            failures: nothing accurate enough, too little time, a rough truth.
         scene: the function parameters → (parts, camera) with these rates, for a fit to render.
         error: the largest error of the derivatives along any mode: relative L2, smoothed by a Gaussian of standard
             deviation 2 pixels.
@@ -99,7 +100,9 @@ def tune(
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
-        InputError: there is no such scene, or an argument is wrong; before anything is measured.
+        InputError: there is no such scene, or an argument is wrong; before anything is measured. Or no sampler suits
+            the scene, nothing in the image changes, or nothing can be measured.
+        PluginError: a named plugin cannot be loaded, or no engine with derivatives is installed.
 
     Warns:
         ToleranceWarning: nothing is accurate enough; the most accurate is given.
@@ -143,7 +146,7 @@ def tune(
 
 
 def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase: Phase, finer: Sequence[int]) -> None:
-    """Make the truths; make rough ones anew with `finer` samples, while each such pass takes at most `seconds`."""
+    """Make the truths; then rough ones anew with `finer` samples, while a pass should take at most `seconds`."""
 
     def told(modes: Sequence[str], samples: int) -> Callable[[], None]:
         return phase(f"truth, {samples} × {samples}", 4 * samples**2 * len(modes))
