@@ -47,7 +47,7 @@ def _bernstein(t: Array) -> tuple[Array, Array]:
 
 
 def _sum(rows: Array, ids: Array, a: Array, b: Array) -> Array:
-    """Sums of the rows (N, 16), weighted by the products of weights along u (N, 4) and along v (N, 4)."""
+    """Sums (N, C) of rows (V, C) at ids (N, 16), weighted by products of the weights a (N, 4) along u, b along v."""
     return combine(rows, ids, namespace(a).reshape(a[:, :, None] * b[:, None, :], (-1, 16)))
 
 
