@@ -15,7 +15,7 @@ from rts.plugin_api.operations import Operation, combine, take
 from rts_surfaces.implicit.lattice import Lattice
 
 Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
-"""Shape, first point and step of a lattice."""
+"""Shape (X, Y, Z), first point and step of the lattice whose edges samples move along, as `Lattice.fixed`."""
 
 _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
 """Columns of a sample's parameters: the weights of the six values, its position, and its motion for a unit of level."""
