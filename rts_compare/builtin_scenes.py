@@ -125,7 +125,7 @@ def square_behind_bunny() -> Scene:
 
 
 def bunny_before_square() -> Scene:
-    """The bunny moves before the square: case C of the table of derivatives."""
+    """The bunny moves in front of the square: case C of the table of derivatives."""
     name = "bunny before square"
     return _scene(name, _bunny_and_square(name), moves=[0])
 
@@ -166,7 +166,7 @@ def crossing_spheres() -> Scene:
 
 
 def turned_box() -> Scene:
-    """A box that moves before a card."""
+    """A box that moves in front of a card."""
     return _scene("turned box", scene_shapes.turned_box(), moves=[0])
 
 

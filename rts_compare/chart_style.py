@@ -91,7 +91,7 @@ def drawn(row: Row) -> bool:
 
 
 def time_label(milliseconds: float) -> str:
-    """A time in three digits: "0.25 ms", "47.5 ms", "4.75 s", "475 s"."""
+    """The text of a time given in milliseconds, three digits or whole seconds: "0.25 ms", "47.5 ms", "4.75 s"."""
     if milliseconds < 999.5:
         return f"{milliseconds:.3g} ms"
     seconds = milliseconds / 1e3
@@ -112,7 +112,7 @@ def samples_label(supersample: int | str) -> str:
 
 
 def label(row: Row) -> str:
-    """A row's settings in few words, such as "visible K=2 2×2 raster torch tolerance=0.4"."""
+    """A row's settings in few words, such as "visible K=2 2×2 raster torch tolerance=0.4"; 1×1 is left out."""
     settings = row["settings"]
     if "peer" in row:
         return " ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])

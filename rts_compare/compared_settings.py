@@ -72,7 +72,7 @@ def finest(supersample: Any) -> Any:
 
 
 def in_python(supersample: int | str) -> str:
-    """Python code for a `supersample`, as a user writes it."""
+    """Python code for a `Setting.supersample`, as a user writes it: "2", or "rts.Adaptive(4)"."""
     if not isinstance(supersample, str):
         return str(supersample)
     _, side, *options = supersample.split(":")

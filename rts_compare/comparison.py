@@ -70,7 +70,11 @@ class Comparison:
         return best_within([r for r in self.rows if r["mode"] == mode and "peer" not in r], error)
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write NAME.json and, with the extra `plots` installed, NAME.png and NAME.html; return the files written."""
+        """Write NAME.json and, with the extra `plots` installed, NAME.png and NAME.html; return the files written.
+
+        Raises:
+            InputError: a file cannot be written.
+        """
         from rts_compare.html_page import write_page
         from rts_compare.png_chart import draw
 
@@ -174,7 +178,8 @@ def compare(
         surface: the name of the surface that reads a model, such as "mesh" or "bezier".
         output: a folder for the results and measurements, from which an interrupted run goes on; None to write nothing.
         truths: the folder of true derivatives; None for the folder of caches.
-        truth_samples: samples of true derivatives along each side of a pixel; fewer are faster and less exact.
+        truth_samples: the square root of the number of samples a pixel, on each of two grids, of true derivatives;
+            fewer are faster and less exact.
         fresh: whether to delete the measurements of earlier runs.
         progress: whether to show progress; None for where standard error is a terminal.
 

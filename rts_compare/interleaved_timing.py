@@ -102,7 +102,7 @@ class InterleavedTiming:
         return found
 
     def _most(self) -> float:
-        """The most seconds of a first call; a function whose first call takes longer is not called again."""
+        """The most seconds of a first call that other calls follow at once; infinity before any function has a time."""
         known = [float(np.median(times)) for times in self._times.values() if times]
         return max(WARM, self._hopeless * min(known)) if known else math.inf
 

@@ -87,7 +87,7 @@ class Measurements:
         return "surfaces rest" if is_constant(read) else "surfaces change"
 
     def group(self, mode: str) -> str:
-        """The name of the group that a mode is timed in: `TOGETHER`, or by whether the mode changes surfaces."""
+        """The name of the group that a mode is timed in: `TOGETHER`, or "surfaces change" or "surfaces rest"."""
         return self._groups[mode]
 
     def modes(self, group: str) -> list[str]:
@@ -195,7 +195,7 @@ class Measurements:
         return None if self.scene.separate else self.engine
 
     def state(self, mode: str) -> tuple[str, ...]:
-        """The key of a mode's measurements: hashes of the scene at both ends of `STEP`, the truth and the library."""
+        """The key of a mode's measurements: hashes of the scene at both ends of `STEP`, `truth_key`, `library_key`."""
         if mode not in self._states:
             step = STEP * self.pixel(mode)
             moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]

@@ -24,7 +24,7 @@ TURNS = 6
 MORE_WORK = 2.0
 """A setting of more than this many times the estimated cost of an accurate one is not tried, whatever its splatter."""
 SLOWER = 3.0
-"""A setting that takes more than this many times the fastest one's time is called only once."""
+"""A setting whose first call takes more than this many times the fastest one's time is called only once in a turn."""
 ENOUGH = 3
 """The fewest timed turns of the chosen setting."""
 NEARLY = 1.2
@@ -278,7 +278,11 @@ class Search:
         return {Setting(*s): ms["median"] / 1e3 for s, ms in timed.items()}
 
     def _fastest(self, settings: Sequence[Setting]) -> Setting:
-        """The fastest setting, by successive halving: all have a turn, the faster half another, and so on."""
+        """The fastest setting, by successive halving: all have a turn, the faster half another, and so on.
+
+        Raises:
+            InputError: none could be timed.
+        """
         turns, left = 1, list(settings)
         while True:
             times = self._timed(left, turns)

@@ -70,7 +70,7 @@ def lattice(samples: int) -> np.ndarray:
 
 
 def lattices(samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """The lattice, and the same with x and y exchanged."""
+    """Two grids of points (S, 2) of a pixel: `lattice`, and the same with x and y exchanged."""
     points = lattice(samples)
     return points, points[:, ::-1]
 

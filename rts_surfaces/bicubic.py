@@ -23,7 +23,7 @@ def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
     Args:
         rows: (V, C) float, control points or their attributes; differentiable.
         table: (n, 16) integers, the rows of each patch, first along u, then along v.
-        patch: (N,) integers.
+        patch: (N,) integers, the patch of each sample.
         params: (N, 2), u and v; of the dtype of the rows, constant.
     """
     return VALUES(rows, params, patch, table)

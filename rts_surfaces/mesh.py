@@ -132,7 +132,7 @@ class Mesh(TriangleSurface):
         return theta["vertices"]
 
     def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
-        """The mesh itself."""
+        """The mesh itself, its vertices in float32."""
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:

@@ -157,7 +157,7 @@ class Parametric(TriangleSurface):
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
-        """Samples where rays meet the patches, by Newton's method; samples whose rays miss are dropped."""
+        """Samples moved to where their rays meet the patches, by Newton's method; `row` is −1 where a ray misses."""
         return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:

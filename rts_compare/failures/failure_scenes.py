@@ -22,7 +22,7 @@ SIZE = (96, 96)
 SMALL = (64, 64)
 WHITE, RED, GREEN, BLUE = (0.95, 0.95, 0.95), (0.85, 0.25, 0.15), (0.2, 0.75, 0.3), (0.2, 0.4, 0.9)
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
-"""A rotation vector about the middle of what moves, and a translation."""
+"""Names of motions: the components of a rotation vector, about the middle of what moves, and of a translation."""
 ARM = 0.4
 """The distance from the middle at which a rotation of one unit moves by a pixel."""
 
@@ -104,7 +104,7 @@ def sphere(radius: float = 0.6, center: Any = (0, 0, 0), color: Any = GREEN, det
 
 
 def backdrop(depth: float = CARD_DEPTH + 1.0, color: Any = BLUE) -> Part:
-    """A card that fills the image."""
+    """A card that fills the image, at a camera depth."""
     return unlit(np.array([[-4, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0.0]]) + [0, 0, DISTANCE - depth], QUAD, color)
 
 
@@ -112,7 +112,7 @@ def backdrop(depth: float = CARD_DEPTH + 1.0, color: Any = BLUE) -> Part:
 
 
 def box_pose() -> Scene:
-    """A box with a colour a face, before a card with a pattern."""
+    """A box with a colour a face, in front of a card with a pattern."""
     return posed("box pose", scene_shapes.turned_box(), AXES, size=SMALL)
 
 
@@ -169,13 +169,13 @@ def facing_card() -> float:
 
 
 def stack(count: int) -> Scene:
-    """Cards one behind the other; the one in the middle moves."""
+    """`count` cards, at least 2, one behind the other; the one in the middle moves."""
     parts, depths = scene_shapes.cards(count)
     return posed(f"stack of {count}", parts, moves=[count // 2], depth=depths[count // 2])
 
 
 def shells() -> Scene:
-    """A closed sphere, both of its sides drawn, before a card that moves: the card is the third layer."""
+    """A closed sphere, both of its sides drawn, in front of a card that moves: the card is the third layer."""
     far = card((50, 46), (34, 24), CARD_DEPTH, RED, SIZE)
     return posed("card behind a shell", [sphere(0.45), far], moves=[1], depth=CARD_DEPTH)
 
@@ -207,12 +207,12 @@ def crossing() -> Scene:
 
 
 def wires(width: float) -> Scene:
-    """Seven slanted wires over black, some pixels wide."""
+    """Seven slanted wires over black, `width` pixels wide."""
     return posed("wires", scene_shapes.wires(SIZE[0], [width] * 7), ("tx",))
 
 
 def gap(width: float) -> Scene:
-    """Two cards with a slanted gap between them, before a card that shows through; the right one moves."""
+    """Two cards with a slanted gap of `width` pixels, in front of a card that shows through; the right one moves."""
     turn = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
 
     def half(left: float, right: float) -> Part:
@@ -262,7 +262,7 @@ def through_near() -> Scene:
 
 
 def past_camera() -> Scene:
-    """A band on the floor that goes on behind the camera."""
+    """A quadrilateral on the floor that goes on behind the camera."""
     points = np.array([[-0.18, -0.3, 6.0], [0.12, -0.3, 6.0], [0.2, -0.3, 0.0], [-0.25, -0.3, 0.0]])
     return posed("behind the camera", unlit(points, [(0, 1, 2), (0, 2, 3)], RED), depth=1.5)
 
@@ -300,7 +300,7 @@ def turning_ball() -> Scene:
 
 
 def plain() -> Scene:
-    """A sphere, culled, before a card."""
+    """A sphere, culled, that moves in front of a card."""
     return scaled(1.0)
 
 

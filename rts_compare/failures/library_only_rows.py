@@ -30,7 +30,7 @@ SIZE = (64, 64)
 
 
 def _points() -> np.ndarray:
-    """Lattice points (n, n, n, 3)."""
+    """The points (n, n, n, 3) of a lattice in [−1, 1]³, `COUNT` along each axis."""
     line = np.linspace(-1, 1, COUNT)
     return np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
 

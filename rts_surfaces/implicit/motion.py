@@ -84,7 +84,10 @@ def _by_crossings(
 
 
 def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """The place (N,) along an edge, 0 to 1, where the level is zero; derivatives are as if ends differed by `least`."""
+    """The place (N,) along an edge, 0 to 1, where the level is zero; 0 if both ends are equal.
+
+    Derivatives are as if the ends differed by `least` where they differ by less.
+    """
     engine = engine_of(f_a)
     xp, apart = engine.namespace, f_b - f_a
     same = apart == 0

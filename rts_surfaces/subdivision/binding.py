@@ -249,7 +249,7 @@ class Points:
         parallel(some, len(limit.kinds), work=10_000 * len(limit.kinds))
 
     def evaluate(self, faces: np.ndarray, params: np.ndarray, derivatives: int = 0) -> np.ndarray:
-        """Points and derivatives (N, 1, 3 or 6, 3) float64: the point; along u, v; along uu, uv, vv.
+        """Points and derivatives (N, D, 3) float64, D = 1, 3 or 6: the point; in u, v; in uu, uv, vv.
 
         Args:
             faces: (N,) integers.

@@ -180,7 +180,7 @@ def _sorted_edges(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """`Cage.twins` (H,), from the result of `_sorted_edges`; an error is raised if the cage is no oriented manifold."""
+    """`Cage.twins` (H,), from the result of `_sorted_edges`; an InputError if the cage is no oriented manifold."""
     same = keys[1:] == keys[:-1]
     thrice = np.flatnonzero(same[1:] & same[:-1])
     (a, b), owner = _ends(cage), cage.faces()
