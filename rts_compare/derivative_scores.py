@@ -49,7 +49,8 @@ def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
     Returns:
         relative_l2, cosine, gain: of the images as they are.
         low_relative_l2, low_cosine, low_gain: the same through the low-pass.
-        spurious: share of the sum of x² that is more than 3 pixels away from all pixels where `true` is not zero.
+        spurious: share of the sum of x² that lies more than 3 steps, along rows and columns, from all pixels where
+            `true` is not zero.
         loss_error: as of `scores`.
     """
     from scipy.ndimage import binary_dilation

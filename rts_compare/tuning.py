@@ -25,7 +25,7 @@ from rts_compare.true_derivatives import SAMPLES
 TRUTH_SAMPLES = (4, 8, SAMPLES)
 """`truth_samples` to choose from: the next number where the error of the true derivative itself is too large."""
 TRUE = 0.3
-"""The largest error of a true derivative, a share of the tolerance: it makes an error of the tolerance seem 5 % larger."""
+"""The largest error of a true derivative, a share of the tolerance: errors at it seem 5 % larger."""
 SAMPLED = 1.0
 """Seconds that a sampler may take for an image of at most 512² pixels; in proportion for more."""
 

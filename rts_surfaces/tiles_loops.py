@@ -102,7 +102,10 @@ def _set(faces, params, t, place, vertex, frame, x, y):
 
 @compiled
 def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
-    """Set corner `place` of triangle t to point k, from 0 to `cuts`, of a side of tile n."""
+    """Set corner `place` of triangle t to point k, from 0 to `cuts`, of a side of tile n.
+
+    `base` is the first of the vertices within the side's edge.
+    """
     width = corners.shape[1]
     if k == 0 or k == cuts:
         vertex = corners[n, side if k == 0 else (side + 1) % width]

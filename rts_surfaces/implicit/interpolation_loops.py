@@ -120,7 +120,7 @@ def _share_slopes(i, near, slopes, out):
 
 @loop
 def _push_points(start, stop, values, points, tangents, low, step, out):
-    """Add to `out` (N, 3) the derivatives of the differences along tangents (N, 3) of the points."""
+    """Add to `out` (N, 3) the derivatives of the differences along tangents (N, 3) of points; NaN as in `forward`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
     for n in range(start, stop):
