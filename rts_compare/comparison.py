@@ -174,7 +174,8 @@ def compare(
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
         supersample: samples along each side of a pixel, or `rts.Adaptive`; None for 1, 2, 4 and `rts.Adaptive(4)`.
         peers: whether other renderers take part.
-        quick: one mode, engine and sampler, and 1 and 2 layers, unless named; at most 40 settings; no other renderers.
+        quick: one mode, engine and sampler, and 1 and 2 layers, unless named; at most 40 settings, with surfaces as
+            they are given; no other renderers.
         surface: the name of the surface that reads a model, such as "mesh" or "bezier".
         output: a folder for the results and measurements, from which an interrupted run goes on; None to write nothing.
         truths: the folder of true derivatives; None for the folder of caches.

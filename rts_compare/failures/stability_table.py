@@ -111,6 +111,7 @@ def stability(
 
     Raises:
         InputError: there is no such row or method, or an argument is wrong; before anything is measured.
+        PluginError: torch is not installed.
     """
     if not isinstance(more, (list, tuple)) or not all(isinstance(row, Row) for row in more):
         raise InputError(f"more is {quoted(more)}; expected a list of rows")
