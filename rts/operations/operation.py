@@ -232,7 +232,7 @@ class Operation:
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
-        """True if `forward`, `push` and `pull` take operands of these dtypes; False while a specification is checked."""
+        """True if compiled code takes operands of these NumPy dtypes; never while a specification runs as a check."""
         first = dtypes[0]
         if _specifying.on or (first != np.float32 and first != np.float64):
             return False
