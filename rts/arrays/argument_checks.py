@@ -91,7 +91,7 @@ def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
 
 
 def check_planes(near: Any, far: Any, *, positive: bool) -> None:
-    """Refuse depths of planes unless both are finite numbers and near < far; if `positive`, also near ≤ 0.
+    """Refuse depths of planes unless both are finite numbers with near < far, and near > 0 if `positive`.
 
     Traced depths pass.
     """
@@ -118,7 +118,7 @@ ROTATION_TOLERANCE = 2e-3
 
 
 def is_invertible(matrix: np.ndarray) -> bool:
-    """True if a matrix is far from singular, by 1e-12, once its rows and then its columns are scaled to length one."""
+    """True if the singular values of a matrix, its rows and then columns scaled to length one, are within 1e12 : 1."""
     for axis in (1, 0):
         length = np.linalg.norm(matrix, axis=axis, keepdims=True)
         matrix = matrix / np.where(length > 0, length, 1)

@@ -25,7 +25,7 @@ class GBuffer(dict):
 
     @property
     def like(self) -> Any:
-        """An array (N, ·), a row for each sample, for its dtype and device: to read it computes no attribute."""
+        """An array (N, ·), a row for each sample, for its dtype and device, where no attribute is needed."""
         return self["position"] if self._like is None else self._like
 
     @like.setter

@@ -215,7 +215,7 @@ class Decision(NamedTuple):
 
 
 class Hidden(Protocol):
-    """A rule that tells which samples may be left out since they are hidden, from their depths. It keeps no state.
+    """A rule that tells which samples can reach the image, by their depths, and which are hidden. It keeps no state.
 
     Attributes:
         settles: whether decisions have `settled` (see `Cells.settled`).
@@ -247,9 +247,9 @@ class Request:
         capacity: number of packed rows to allot, or None for as many as there are samples.
         cells: (L, C) int32, the only cells of the grid to sample, in any layout, as flat indices, none twice, or −1 for
             none; an array of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
-        hidden: the rule that tells which samples to drop, once depths are known; None to keep all.
+        hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
-        exits: whether to compute `Cells.exit` of a part that is culled, at outlines and beside them.
+        exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
@@ -263,10 +263,10 @@ class Request:
 
 @record(static=("supersample", "apron", "flat"))
 class Fine(_OnCells):
-    """The fine samples of an adaptively sampled scene: of its active pixels, at outlines, and an apron around them.
+    """The fine samples of an adaptively sampled scene: of its active pixels and an apron around them.
 
-    The pixels are cut into strips, runs some lines high, which lie side by side in one picture of h × w cells, the
-    layout. Splatters treat it as any other. Cells of the layout outside of active pixels are no part of the image.
+    They lie in strips, runs of pixels a few lines high, side by side in one picture of h × w cells, the layout.
+    Splatters treat it as any other. Cells of the layout outside of active pixels are no part of the image.
 
     Attributes:
         samples: one `Samples` for each part; their cells are a list, not a grid.
@@ -314,7 +314,7 @@ class Sampled(_OnCells):
             `fine.overflow` is included. Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        fine: further samples at outlines (`rts.Adaptive`), or None.
+        fine: further samples, in pixels that `rts.Adaptive` makes active, or None.
     """
 
     samples: tuple[Samples, ...]

@@ -50,7 +50,7 @@ class Splatter(Plugin):
         """Splat packed samples; for direct calls, with arrays of any engine, lists and numbers.
 
         Args:
-            positions: (N, 3) pixel x, pixel y, linear depth.
+            positions: (N, 3) x and y in cells from the corner of the grid, border included, and linear depth.
             rgba: (N, 4) premultiplied.
             row: (K, H, W) int32, the index of the sample of each cell, front to back, or −1.
             border: cells at each side that splat into the image but are no part of it.
@@ -61,7 +61,7 @@ class Splatter(Plugin):
             (H − 2 border, W − 2 border, 4) premultiplied RGBA.
 
         Raises:
-            InputError: wrong shapes, or `row` holds no integers.
+            InputError: wrong shapes, or `row` holds no signed integers.
             EngineError: arrays of two engines.
         """
         return self.cropped(_checked_splats(positions, rgba, row, border).replace(opaque=opaque))

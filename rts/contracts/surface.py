@@ -292,7 +292,7 @@ class RaySurface(Surface):
         Args:
             theta: θ without derivatives.
             origins: (R, 3), local space.
-            directions: (R, 3), not of unit length; distances are in units of them.
+            directions: (R, 3), of any length, which is the unit of distances.
             layers: K.
         """
 

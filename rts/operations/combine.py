@@ -45,7 +45,7 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     """Interpolation c + w₀ (a − c) + w₁ (b − c), (N, C), of rows a, b, c, whose indices are three columns of `ids`.
 
-    This is `combine` of three rows, of which the last has one minus the other weights for its weight.
+    This is `combine` of a, b and c, where c has the weight 1 − w₀ − w₁.
 
     Args:
         rows: (V, C) float.

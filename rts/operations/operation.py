@@ -24,11 +24,11 @@ _SHAPE = attrgetter("shape")
 
 
 SMALL = 4096
-"""Count of numbers in operands and result, up to which the specification checks the shape of results without NaN."""
+"""Largest count of numbers in operands and result for which the specification checks a result without NaN."""
 
 
 class _Specifying(threading.local):
-    """`on` while a specification is checked. Operations inside it then run as array code, and compile nothing."""
+    """`on` while a specification runs as a check. Operations inside it then run as array code, and compile nothing."""
 
     on = False
 

@@ -15,9 +15,9 @@ from rts.operations.operation import Arrays, Operation, Some
 
 
 def projective_map(rows: Array, points: Array) -> Array:
-    """Points (N, 3) under four affine maps, the rows (4, 4): the first two values over the third, and the fourth.
+    """The first two values over the third, and the fourth, (N, 3), of four affine maps (4, 4) of points (N, 3).
 
-    They are (N, 3). A point whose third value is zero has no image; its result is finite.
+    A point whose third value is zero has no image; its result is finite.
     """
     if is_plain_product(rows, points):
         PROJECTION.check_ranks((rows, points))

@@ -227,7 +227,7 @@ def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
 def _lit(
     theta: Mapping[str, Tree], camera: Camera | RowCameras
 ) -> tuple[Array | float, list[tuple[Array, Array | float]]]:
-    """The ambient light, and for each light of θ the unit vector towards it, (3,) or (N, 3), and its colour."""
+    """The ambient light; for each other light the unit vector towards it, (3,) or (N, 3), and its colour."""
     light = theta.get("light", {})
     if not isinstance(light, Mapping):
         raise InputError(f"theta['light'] is a {type(light).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
