@@ -62,7 +62,7 @@ class Covers(NamedTuple):
         return covers
 
     def follow(self, vertices: np.ndarray, faces: np.ndarray, sphere: np.ndarray) -> bool:
-        """Cover the triangles of moved vertices, in place; False if they need more covers than there are."""
+        """Cover the triangles of moved vertices, in place; False, with no change, if they need more covers than exist."""
         wanted = np.empty(len(faces), np.uint8)
         parallel(_count, len(faces), vertices, faces, sphere, wanted, work=60 * len(faces))
         if len(faces) + int(wanted.sum(dtype=np.int64)) > len(self.faces):
@@ -109,6 +109,10 @@ def _count(start, stop, vertices, faces, sphere, wanted):
 
 @loop
 def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners, margins):
+    """Fill the corners, owners and margins of the covers of triangles [start, stop), see `Covers`.
+
+    `places` (T,) are the indices of the first further covers.
+    """
     points, along, side, across = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for t in range(start, stop):
         a, b, c, area = _shape(vertices, faces, t, sphere, points)
@@ -173,7 +177,10 @@ def _perpendicular(points, p, s, along, height, side):
 
 @compiled
 def _ribbon(corners, start, along, side, length, height):
-    """Fill `corners` with a long triangle around a segment; at the segment's end it is half as wide as at its start."""
+    """Fill `corners` (3, 3) with a long triangle around a segment, in the plane of `along` and `side`.
+
+    At the segment's end it is about half as wide as at its start.
+    """
     wide = 2 * (height + 2 * LEAST)
     for r in range(3):
         corners[0, r] = start[r] - 2 * LEAST * along[r] - wide * side[r]

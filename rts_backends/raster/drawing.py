@@ -245,7 +245,7 @@ def _insert(hits, met, drawn, layered):
 
 @compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill `depths` (n,) of hits, their first two barycentrics `within` (2, n), and `sure`: False if `_covers` is needed."""
+    """Fill in each hit's depth (n,) and first two barycentrics `within` (2, n); and `sure`, True if it needs no `_covers`."""
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
