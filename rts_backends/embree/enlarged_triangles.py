@@ -62,7 +62,7 @@ class Covers(NamedTuple):
         return covers
 
     def follow(self, vertices: np.ndarray, faces: np.ndarray, sphere: np.ndarray) -> bool:
-        """Cover the triangles of moved vertices, in place; False, with no change, if they need more covers than exist."""
+        """Cover the triangles of moved vertices, in place; False, with no change, if they need more covers."""
         wanted = np.empty(len(faces), np.uint8)
         parallel(_count, len(faces), vertices, faces, sphere, wanted, work=60 * len(faces))
         if len(faces) + int(wanted.sum(dtype=np.int64)) > len(self.faces):

@@ -245,7 +245,10 @@ def _insert(hits, met, drawn, layered):
 
 @compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill in each hit's depth (n,) and first two barycentrics `within` (2, n); and `sure`, True if it needs no `_covers`."""
+    """Fill each hit's depth (n,) and first two barycentrics `within` (2, n), and `sure`: True if it needs no test.
+
+    The test is `_covers`, for hits on an edge or of triangles that may need clipping.
+    """
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5

@@ -155,7 +155,7 @@ class TorchEngine(Engine):
         return tangent_alike(x) if torch_internals.forward_level() >= 0 else x
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
-        """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for a `foreign` tensor."""
+        """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
         if torch.compiler.is_compiling() or foreign(x):
             return None
         if not torch_internals.transforms_active():

@@ -39,7 +39,7 @@ _loaded: list[bool] = []
 
 
 def quiet_forward_mode() -> None:
-    """Have torch load the modules of its forward mode, once, without the warning of `torch.jit.script` that this gives."""
+    """Have torch load the modules of its forward mode, once, and hide its warning of `torch.jit.script`."""
     if not _loaded:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)

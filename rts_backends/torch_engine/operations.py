@@ -47,7 +47,7 @@ _specifying = _Specifying()
 
 
 def _fits(operands: Sequence[Tensor]) -> bool:
-    """True if compiled code takes these operands: on the host, all floats float32 or all float64, others integers or bool."""
+    """True if compiled code takes these operands: on the host, floats all float32 or all float64, the rest integers."""
     real = operands[0].dtype
     if real not in _DTYPES:
         return False
