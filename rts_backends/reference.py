@@ -101,7 +101,7 @@ def _hits(triangle, x, y, corners, depth, size):
     triangle, x, y, c = triangle[hit], x[hit], y[hit], c[hit]
     b = edges[hit] / total[hit, None]
     near, far = (b * (c[..., 2] + c[..., 3])).sum(1) >= 0, (b * (c[..., 3] - c[..., 2])).sum(1) >= 0
-    # Σ bᵢ wᵢ > 0 tells a point before the viewer from one behind that projects to the same pixel.
+    # Σ bᵢ wᵢ > 0 tells a point in front of the viewer from one behind that projects to the same pixel.
     seen = near & far & ((b * c[..., 3]).sum(1) > 0)
     z = (b * depth[triangle]).sum(axis=1)
     return triangle[seen], (y * width + x)[seen], b[seen, :2], z[seen]

@@ -22,7 +22,7 @@ from rts_backends.triangles import facing, pixel_matrix
 STEP = 1e-6
 """Distance from a hit to the next ray's start, a share of the object's radius; float32 resolves a tenth of it."""
 REACH = 1.01
-"""Square of the radius of the sphere that rays start on, in units of the object's."""
+"""Square of the radius of the sphere that rays start on, in units of the object's sphere."""
 
 
 class Scene:

@@ -31,6 +31,8 @@ NEVER = 255
 class Covers(NamedTuple):
     """M covers of a proxy's T triangles: first one for each, then further ones for thin and small triangles.
 
+    Further covers that are not needed, once vertices have moved, are points.
+
     Attributes:
         corners: (3 M + 1, 3) float32, three for each cover; the last row is padding, since Embree reads 16 bytes each.
         faces: (M, 3) int32: 0, 1, 2; 3, 4, 5; and so on.

@@ -204,7 +204,8 @@ def cast(
         row: (4,) coefficients of linear depth, see `depth_of`.
         ray_space: (8, 4): the camera's projection, and the inverse of its view.
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
-        planes: (4,) depths: nothing is seen before the first or beyond the second; between the others no plane clips.
+        planes: (4,) depths: nothing nearer than the first or beyond the second is seen; between the others no plane
+            clips.
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         left_out: 1 to leave out triangles seen from behind, −1 from the front, 0 for none.
         vertices: (V, 3) of the proxy.

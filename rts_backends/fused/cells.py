@@ -159,7 +159,7 @@ class Cells:
 
     @cached_property
     def _shows_several(self) -> bool:
-        """True if settled targets show the colours of other samples than that of row 0."""
+        """True if some settled target shows the colour of another sample than sample 0."""
         return self._settled.max(initial=-1) > 0
 
     def _paint(self, colors: np.ndarray, images: np.ndarray) -> None:
@@ -178,22 +178,22 @@ class Cells:
 
     @property
     def _plain_work(self) -> int:
-        """Nanoseconds that the stencil takes at least."""
+        """About how many nanoseconds the stencil takes at least."""
         return 4 * self.row.shape[1] * self.row.shape[2]
 
     @property
     def _layers_work(self) -> int:
-        """Nanoseconds that stencils of all layers take at least."""
+        """About how many nanoseconds stencils of all layers take at least."""
         return len(self.row) * self._plain_work
 
     @property
     def _mixed_work(self) -> int:
-        """Nanoseconds that the mixed targets take: nine sources of several numbers each."""
+        """About how many nanoseconds the mixed targets take: nine sources of several numbers each."""
         return 160 * len(self.choices.columns)
 
     @property
     def mixed_arguments(self) -> tuple:
-        """Arguments of the loops of mixed targets."""
+        """The grid, and `offsets`, `columns` and `ranges` of `Choices`: arguments of the loops of mixed targets."""
         choices = self.choices
         return self.grid, choices.offsets, choices.columns, choices.ranges
 
@@ -203,7 +203,7 @@ class Cells:
 
     @cached_property
     def choices(self) -> Choices:
-        """The choices for each target, made on first use."""
+        """The states of all targets, and the layers that mixed ones take: computed on first use, unless given."""
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
         # EMPTY for targets that are not settled, SETTLED for those that are.
@@ -354,7 +354,7 @@ class Cells:
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
                 )
-            if self._shows_several:  # Targets without a sample of their own show that of row 0 so far.
+            if self._shows_several:  # Targets without a sample of their own show sample 0 so far.
                 self._paint(self.rgba[None], out[None])
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
@@ -504,7 +504,7 @@ class Cells:
 
 
 def _check_grids(shape: tuple[int, ...], **given: np.ndarray | None) -> None:
-    """Refuse arrays of another shape than the grid's; None, or an empty array, stands for an absent one."""
+    """Raise an InputError for arrays of another shape than the grid's; None, or an empty array, is absent."""
     for name, x in given.items():
         if x is not None and len(x) and x.shape != shape:
             raise InputError(f"{name} has shape {x.shape}; expected {shape}, as row says")

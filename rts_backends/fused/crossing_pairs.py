@@ -37,7 +37,7 @@ class Rules(NamedTuple):
 
     @classmethod
     def of(cls, extent: Any) -> Rules:
-        """The rules for an extent of the fronts' depths, in its dtype; it includes the camera's 0."""
+        """The rules, in the dtype of `extent`: largest less least depth of the fronts, the camera's 0 included."""
         kind = type(extent)
         least, (*numbers, slack, _) = kind(Visible.TIE) * extent, Visible.CROSSINGS
         return cls(least, *map(kind, numbers), slack=kind(slack) * least)
@@ -199,7 +199,10 @@ def _any(flags):
 
 @compiled
 def _find(start, stop, z, gap, most, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, whose first cell lies in rows [start, stop), in a window of rows."""
+    """Mark pairs, or `candidates`, whose first cell lies in rows [start, stop), in `bits`, and their rows in `some`.
+
+    `z` and `gap` are a window that begins BORDER rows before `start`; `most` is working memory.
+    """
     width = z.shape[2]
     rows, marks = stop - start + 2 * BORDER, np.empty(width, np.uint8)
     for y in range(BORDER - 2, rows - BORDER + 2):
@@ -219,7 +222,7 @@ def _find(start, stop, z, gap, most, rules, candidates, bits, some):
 
 @compiled
 def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, of which one cell is (y, x) of a window of rows."""
+    """Mark pairs, or `candidates`, of which one cell is (y, x) of a window that begins BORDER rows before `start`."""
     rows, width = z.shape[1:]
     for n in range(8):
         u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]

@@ -190,7 +190,10 @@ def opposite_sides(hidden, front, behind):
 
 @compiled
 def _continues(positions, row, y, x, n, fronts, limit):
-    """True if one of two fronts lies within a limit of where the other's line leads: the source's or the target's."""
+    """True if a front, of source n or of the target, continues the other's line within a limit.
+
+    The line leads through the other front and that of the cell beyond it.
+    """
     _, height, width = row.shape
     v, u = n // 3 - 1, n % 3 - 1
     for steps, end, start in ((-1, fronts[n], fronts[4]), (2, fronts[4], fronts[n])):
@@ -232,7 +235,7 @@ def _choose_visible(choice, shift, z, row, y, x, target):
 
 @compiled
 def _ends_before_others(choice, row, y, x):
-    """Directions in which neighbours of a target are covered, and not paired front to front, as bits."""
+    """Directions in which neighbours of a target are covered, and not paired front to front, as bits of DIRECTIONS."""
     _, height, width = row.shape
     bits = 0
     for n in range(9):

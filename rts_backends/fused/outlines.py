@@ -69,7 +69,7 @@ class Outlines(NamedTuple):
 
 
 DIRECTIONS = LISTED - 1
-"""Bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends, in the `ends` of `survey`."""
+"""Mask of bits 3 (v + 1) + (u + 1), of directions (u, v) in which a front ends, in the `ends` of `survey`."""
 
 BESIDE = LISTED << 1
 """Mark in `ends` of targets that are not LISTED, but whose outline affects LISTED ones beside them."""
@@ -370,7 +370,7 @@ def _part(gives, d, part, ends, y, x):
 
 @compiled
 def _outline(t_positions, row, beta, partner, second, y, x, axis):
-    """The motion v̂ of the outline beside a cell, along an axis."""
+    """The motion v̂ of the outline beside a cell along an axis, 0 or 1, if samples move as `t_positions` (N, 3)."""
     b, own = beta[y, x], t_positions[row[0, y, x], axis]
     if b == 0:
         return own
@@ -382,7 +382,7 @@ def _outline(t_positions, row, beta, partner, second, y, x, axis):
 
 @compiled
 def gain(d, t_positions, row, outlines, y):
-    """The growth of a target's coverage by moving outlines along a tangent, in front and at the surface."""
+    """The growth of target d's coverage by moving outlines along a tangent (N, 3): in front, and at the surface."""
     front, surface = outlines.slopes.dtype.type(0), outlines.slopes.dtype.type(0)
     x, rule = outlines.columns[d], (outlines.beta, outlines.partner, outlines.second)
     for n in range(9):
@@ -456,7 +456,7 @@ def _pull_rows(
 
 @compiled
 def _pull_target(g_positions, row, beta, partner, second, gives, slopes, d, y, x, front, surface):
-    """`pull` of a target, from the gradients of the coverage of its buffers in front and at the surface."""
+    """`pull` of target d, from the gradients `front` and `surface` of its buffers' coverage."""
     zero = g_positions.dtype.type(0)
     joined_x, joined_y = zero, zero
     for n in range(9):

@@ -299,7 +299,8 @@ def _under(sums, images, coverage, d, t, c):
 def recolor(start, stop, own, listed, offsets, columns, stacks, changes):
     """Fill `outlines.Outlines.changes` (L, 2, 4) of listed targets: how colours change with coverage.
 
-    `own` (H + 1,) and `listed` (L,) are rows and columns of these targets, `offsets` and `columns` those of stacks.
+    `own` (H + 1,) tells where the listed targets of each row begin, `listed` (L,) their columns; `offsets` and
+    `columns` tell so of targets with plans. Listed targets without a plan get zeros.
     """
     sums, images, one = stacks.sums, stacks.images, changes.dtype.type(1)
     for y in range(start, stop):

@@ -165,7 +165,7 @@ def _store(image, marks, left, planes, count):
 
 @loop
 def forward(start, stop, grid, straight, border, image):
-    """Fill the straight targets (H, W) of rows [start, stop) of the image (H, W, 4)."""
+    """Fill the straight targets of rows [start, stop) of the image (H, W, 4), which lacks the border of `straight`."""
     layers, width = len(grid.row), image.shape[1]
     sources, loaded = np.empty(3 * layers * SOURCE, image.dtype), np.empty(3, np.int64)
     total, images = np.empty(layers * SUM, image.dtype), np.empty((layers + 1) * IMAGE, image.dtype)

@@ -1,4 +1,4 @@
-"""Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
+"""Rasterizer for the CPU: the K nearest triangles of each pixel, drawn at once, on all cores (numba).
 
 Most triangles of a large mesh cover no pixel's centre. A first pass reads only rounded positions of their corners on
 screen, and lists the triangles that may cover a centre. In a large mesh that stays (`rts.prepare`) this pass skips
@@ -379,7 +379,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 @compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
-    """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on.
+    """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on; count their bands.
 
     Left out are triangles that touch no requested cell, and clipped ones that cover no centre. Returns the next free
     row.
