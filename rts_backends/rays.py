@@ -100,7 +100,7 @@ def _with_deepest(
     listed: Array | None,
     view: tuple[int, int],
 ) -> Samples:
-    """Samples with two further rows for each cell at an outline, beside the deepest point of its ray; see `Cells.exit`.
+    """Samples with two further rows for cells at outlines, beside the deepest points of their rays; see `Cells.exit`.
 
     Args:
         samples: the samples.

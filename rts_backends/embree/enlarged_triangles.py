@@ -83,9 +83,9 @@ class Covers(NamedTuple):
 
 @compiled
 def _shape(vertices, faces, t, sphere, points):
-    """Fill `points` (3, 3) with the corners, in units of the sphere.
+    """Fill `points` (3, 3) with the corners of triangle t, in units of the sphere and about its centre.
 
-    Returns the lengths of the edges opposite them, and twice the triangle's area.
+    Returns the lengths of the edges, each opposite its corner, and twice the triangle's area: four numbers.
     """
     for c in range(3):
         for r in range(3):

@@ -323,10 +323,10 @@ def _pixels(tile, across, width, height, cells, at, columns, lines):
 
 @compiled
 def _aim(space, sphere, planes, x, y, ray, state):
-    """Write the ray through an NDC position to `ray`, its depth at the start to `state`.
+    """Write the ray through an NDC position to `ray`, its depth at the start to `state`; False if there is none.
 
-    The ray is the part within the object's sphere and between `planes`; False if there is none. From such a start, and
-    in units of the object, float32 is fine enough however far off the camera or the origin.
+    The ray is the part within the object's sphere and between `planes`. From such a start, and in units of the object,
+    float32 is fine enough however far off the camera or the origin.
     """
     # See Camera.rays: the camera-space point at depth z is (start + z step, −z). Rows 0–3 are the projection, 4–6
     # those of the inverse view. (No slices here: each would cost an atomic count of references.)

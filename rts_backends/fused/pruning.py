@@ -187,7 +187,10 @@ def _near(z, r, x, margin):
 
 @compiled
 def _continued(z, r, x, beyond, margin, continued):
-    """True if every source that is not nearest front to front continues the target's front along a line."""
+    """True if every source's front that does not pair with the target's by depth alone lies on a line with it.
+
+    Sources without a sample do not count. Depths `z` are a window of rows; `r` is the target's row in it.
+    """
     layers, rows, width = z.shape
     target = z[0, r, x + 1]
     for n in range(9):

@@ -181,7 +181,7 @@ def normalised_sums(total, sources, layers, y, count):
 
 @compiled
 def composite(total, layers, count):
-    """Composite the surface over the buffer behind, in place of the surface's colours."""
+    """Composite the surface over the buffer behind, in `total`, in place of the surface's colours."""
     one = total.dtype.type(1)
     if layers > 1:
         for j in range(count):

@@ -274,7 +274,8 @@ def _minor(rows, i, j, k):
 def _test(boxes, cones, planes, towards, rows, sides):
     """Fill `sides` with the bits FRONTS and BACKS of each cluster; no bits if it is out of view.
 
-    `towards` is (q, s) of `_find`, times `keep`; `rows` (3, 4) are absolute values.
+    `towards` are q (three numbers) and s, times `keep`: a triangle's determinant is n · (q + s a), for its corner a and
+    normal n. `rows` (3, 4) are absolute values.
     """
     qx, qy, qz, s = towards
     for cluster in range(len(sides)):

@@ -16,9 +16,9 @@ from rts_backends.torch_engine import torch_internals
 
 
 def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
-    """Call `function.apply(*args)`, with all arguments given.
+    """The result of `function.apply(*args)`, with all arguments given.
 
-    Outside of transforms it spares torch's search for defaults, which takes longer than a small loop.
+    Outside of transforms this spares torch's search for defaults, which takes longer than a small loop.
     """
     if torch_internals.transforms_active():
         return function.apply(*args)
