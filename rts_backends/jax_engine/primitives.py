@@ -106,7 +106,7 @@ class HostPrimitive:
             self._host(item, [x[b, ...] for x in results], **params)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
-        """The host call in a program for the CPU; an operand in `even` whose rows are all equal is passed as one row."""
+        """The host call in a program for the CPU; an operand in `even` of equal rows is passed as one row."""
         shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
         values, avals = list(operands), list(ctx.avals_in)
         for i in self._even:
