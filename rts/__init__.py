@@ -1,6 +1,6 @@
 """rts: differentiable surface rendering by rasterize-then-splat.
 
-Find where camera rays meet a surface with any ordinary renderer; evaluate the surface there, shade it and splat it;
+With any ordinary renderer, find where camera rays meet a surface; evaluate it there, shade it and splat it;
 differentiate only that.
 
 Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`.

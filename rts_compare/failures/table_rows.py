@@ -146,7 +146,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "silhouette leaves the image",
-        f"On three sides. {ERROR}",
+        f"On two sides. {ERROR}",
         Derivative(failure_scenes.leaving),
         f"{NO_EDGES} {COARSE}",
     ),
@@ -234,8 +234,8 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "lattice ties",
-        "An isosurface through lattice points, values exactly 0 and −0. Figure: the largest gradient over that of "
-        "values half a cell off. Degraded above 3, failed above 30, or where one is not finite.",
+        "An isosurface through lattice points, values exactly −0. Figure: the largest gradient over that of "
+        "values a fifth of a cell off. Degraded above 3, failed above 30, or where one is not finite.",
         library_only_rows.lattice_ties,
     ),
     Row(

@@ -40,7 +40,7 @@ class Deodr(Peer):
         from deodr.differentiable_renderer import Camera, Scene3D
 
         if any((-p.vertices[:, 2] < given.planes[0]).any() for p in given.parts):
-            raise Unsuited("it clips no triangles, and some reach before the near plane")
+            raise Unsuited("it clips no triangles, and some are nearer than the near plane")
         self.given, self.settings = given, {}
         self.vertices = np.concatenate([p.vertices for p in given.parts])
         self.colors = np.concatenate([p.colors for p in given.parts])
