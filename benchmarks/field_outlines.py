@@ -1,7 +1,8 @@
 """Outlines of fields: derivatives of silhouettes against an independent marcher, field by field and way by way.
 
-Truths are central differences of coverages, which rays find by steps along them; both are low-passed. Relative L2 error
-/ gain:
+Truths are central differences of coverages, which rays find by steps along them. Surfaces on a lattice are compared
+with the outline of the lattice's own triangles, too, since it differs from the field's. All are low-passed. Relative L2
+error / gain:
 
     python -m benchmarks.field_outlines
     python -m benchmarks.field_outlines --fields "rounded box" --ways rays
@@ -32,6 +33,8 @@ BOUNDS, SHAPE = ((-1.35, -1.35, -1.35), (1.35, 1.35, 1.35)), (112, 112, 112)
 RADIUS = 1.5
 RAYS, REACH = 6, np.linspace(2.4, 5.6, 801)
 """The truth's rays along each side of a pixel, and its places along each ray."""
+OWN_RAYS = 12
+"""Rays along each side of a pixel through the triangles of a lattice."""
 
 
 # -------------------------------------------------------------------------------------------------------- fields
@@ -140,18 +143,30 @@ def depths(f: Callable, q: np.ndarray, xy: np.ndarray) -> np.ndarray:
 
 
 def coverage(f: Callable, q: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(H, W) shares of pixels that are covered, of the marked ones."""
+    """(2, H, W) shares of pixels that are covered, of the marked ones, by each half of the rays."""
     offsets = (np.arange(RAYS) + 0.5) / RAYS
     places = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-    image = np.zeros((SIZE, SIZE))
+    halves, image = np.indices((RAYS, RAYS)).sum(axis=0).reshape(-1) % 2, np.zeros((2, SIZE, SIZE))
     y, x = np.nonzero(pixels)
     xy = np.stack([x, y], axis=-1)[:, None] + places
-    image[pixels] = (depths(f, q, xy.reshape(-1, 2)).reshape(len(x), -1) < 0).mean(axis=1)
+    hit = depths(f, q, xy.reshape(-1, 2)).reshape(len(x), -1) < 0
+    for half in range(2):
+        image[half][pixels] = hit[:, halves == half].mean(axis=1)
     return image
 
 
-def truth(f: Callable, q: tuple[float, float], index: int) -> np.ndarray:
-    """(H, W), the derivative of coverage by a parameter; a difference over half a pixel or so."""
+def difference(q: tuple[float, float], index: int, image: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The central difference of an image by a parameter, over a pixel or so."""
+    step = np.zeros(2)
+    step[index] = PIXEL / 2
+    return (image(np.array(q) + step) - image(np.array(q) - step)) / PIXEL
+
+
+def truth(f: Callable, q: tuple[float, float], index: int) -> tuple[np.ndarray, float]:
+    """(H, W), the derivative of coverage by a parameter; and an estimate of its relative error, low-passed.
+
+    The error is half of the difference between the results of either half of the rays.
+    """
     grid = np.arange(SIZE) + 0.5
     centres = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     hit = (depths(f, np.array(q), centres) < 0).reshape(SIZE, SIZE)
@@ -159,10 +174,22 @@ def truth(f: Callable, q: tuple[float, float], index: int) -> np.ndarray:
     for v in range(-3, 4):
         for u in range(-3, 4):
             near |= np.roll(hit, (v, u), axis=(0, 1)) != hit
-    step = np.zeros(2)
-    step[index] = PIXEL / 2
-    ends = [coverage(f, np.array(q) + s * step, near) for s in (-1, 1)]
-    return (ends[1] - ends[0]) / PIXEL
+    halves = difference(q, index, lambda q: coverage(f, q, near))
+    mean, apart = (low_pass(x[..., None]) for x in (halves.mean(axis=0), (halves[1] - halves[0]) / 2))
+    return halves.mean(axis=0), float(np.linalg.norm(apart) / np.linalg.norm(mean))
+
+
+def own_truth(f: Callable, q: tuple[float, float], index: int) -> np.ndarray:
+    """(H, W), the like for the triangles that marching cubes make of the field's values on the lattice."""
+
+    def triangles(q: np.ndarray) -> np.ndarray:
+        part = rts.Part(isosurface(f=f, shape=SHAPE), {"q": torch.tensor(q)}, "silhouette")
+        row = rts.sample(part, CAMERA, (OWN_RAYS * SIZE,) * 2, layers=1).row[0] >= 0
+        border = (len(row) - OWN_RAYS * SIZE) // 2
+        hit = row.numpy()[border:-border, border:-border] if border else row.numpy()
+        return hit.reshape(SIZE, OWN_RAYS, SIZE, OWN_RAYS).mean(axis=(1, 3))
+
+    return difference(q, index, triangles)
 
 
 # ---------------------------------------------------------------------------------------------------------- ways
@@ -175,11 +202,13 @@ class Way(NamedTuple):
         surface: f → the surface.
         sampler: its sampler.
         lattice: whether θ has values on a lattice.
+        own: whether the surface is that of a lattice's triangles.
     """
 
     surface: Callable[[Callable], Any]
     sampler: str = "auto"
     lattice: bool = False
+    own: bool = False
 
 
 def isosurface(*args: Any, **options: Any) -> Any:
@@ -187,10 +216,10 @@ def isosurface(*args: Any, **options: Any) -> Any:
 
 
 WAYS: dict[str, Way] = {
-    "lattice": Way(lambda f: isosurface(), lattice=True),
-    "lattice, edge": Way(lambda f: isosurface(motion="edge"), lattice=True),
-    "function": Way(lambda f: isosurface(f=f, shape=SHAPE)),
-    "band": Way(lambda f: isosurface(f=f, shape=SHAPE, band=NarrowBand())),
+    "lattice": Way(lambda f: isosurface(), lattice=True, own=True),
+    "lattice, edge": Way(lambda f: isosurface(motion="edge"), lattice=True, own=True),
+    "function": Way(lambda f: isosurface(f=f, shape=SHAPE), own=True),
+    "band": Way(lambda f: isosurface(f=f, shape=SHAPE, band=NarrowBand()), own=True),
     "rays": Way(lambda f: isosurface(f=f, shape=SHAPE), sampler="rays"),
     "sdf": Way(lambda f: rts.plugin("surfaces", "sdf")(f, RADIUS, lipschitz=None)),
 }
@@ -219,10 +248,22 @@ def score(found: np.ndarray, true: np.ndarray) -> str:
 
 
 def rows(fields: list[str], ways: list[str], options: dict[str, Any]) -> Iterator[list[str]]:
+    """Lines of the table; see `head`."""
     for name in fields:
         for index in range(2):
-            true = truth(*FIELDS[name], index)
-            yield [name, str(index), *(score(derivative(name, WAYS[way], index, **options), true) for way in ways)]
+            (true, error), line = truth(*FIELDS[name], index), [name, str(index)]
+            own = own_truth(*FIELDS[name], index)
+            line += [f"{error:.3f}", score(own, true)]
+            for way in ways:
+                found = derivative(name, WAYS[way], index, **options)
+                line += [score(found, x) for x in ([true, own] if WAYS[way].own else [true])]
+            yield line
+
+
+def head(ways: list[str]) -> list[str]:
+    """The columns: the truth's error, the outline of the lattice's triangles against it, and each way against both."""
+    columns = [[way, f"{way}, against its triangles"] if WAYS[way].own else [way] for way in ways]
+    return ["field", "parameter", "error of the truth", "triangles", *sum(columns, [])]
 
 
 def main() -> None:
@@ -237,7 +278,7 @@ def main() -> None:
         print(*line, sep=" | ", flush=True)
         lines.append(line)
     args.output.parent.mkdir(parents=True, exist_ok=True)
-    args.output.write_text(table(["field", "parameter", *args.ways], lines))
+    args.output.write_text(table(head(args.ways), lines))
 
 
 if __name__ == "__main__":
