@@ -37,6 +37,7 @@ from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
+from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
 from rts.rendering.batched import render_views
 from rts.rendering.image import render, render_samples
@@ -47,6 +48,7 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
+from rts.scene.view import View
 
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "
@@ -112,6 +114,8 @@ __all__ = [
     "Surface",
     "TriangleSampler",
     "TriangleSurface",
+    "View",
+    "ViewResiduals",
     "check_gradient",
     "engine_of",
     "errors",

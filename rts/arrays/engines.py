@@ -88,8 +88,23 @@ class Engine(Plugin):
         """
         raise self._no_derivatives()
 
-    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """A step function `(parameters, gradient) -> parameters` of "adam" or "sgd", with its own state."""
+    def optimizer(
+        self, method: Any, learning_rate: float | Sequence[float], parameters: Tree, given: Tree = None
+    ) -> Callable[[Tree, Tree], Tree]:
+        """A step function `(parameters, gradient) -> parameters` with its own state.
+
+        To be kept in checkpoints, the function is an object with two more methods: `state() -> bytes`, and
+        `restore(state, parameters)`, which goes on from there.
+
+        Args:
+            method: "adam", "sgd", or an optimiser object of the framework.
+            learning_rate: the rate, or a list of one for each array of the parameters; for a method by name.
+            parameters: where to start; never changed in place.
+            given: a tree like `parameters` whose arrays an optimiser object may hold; None for `parameters`.
+
+        Raises:
+            InputError: another method.
+        """
         raise self._no_derivatives()
 
     def traced(self, x: Array) -> bool:

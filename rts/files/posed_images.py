@@ -21,6 +21,7 @@ from rts.files.damaged_files import contents, gathered
 from rts.files.images import load_image, read_image
 from rts.files.paths import as_path, inside
 from rts.scene.camera import Camera
+from rts.scene.view import View
 
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -34,43 +35,6 @@ OFF_CENTRE = 1e-3
 """Largest difference, in widths of the image, of two statements of a file about one lens."""
 HEADER, ROW = 5, 17
 """Columns of the matrix (3, 5) of an LLFF pose, and numbers in a row of poses_bounds.npy."""
-
-
-class View:
-    """A picture, and the camera that took it.
-
-    Args:
-        camera: the camera, float64 NumPy.
-        size: (height, width) of the image, pixels.
-        image: (H, W, 3 or 4) float32, or a function that returns the image, called at each use.
-        name: the picture's name in its file.
-        near: the depth at which the scene begins, in the units of the camera; None where that is not known.
-        far: the depth at which it ends, or None.
-    """
-
-    def __init__(
-        self,
-        camera: Camera,
-        size: tuple[int, int],
-        image: np.ndarray | Callable[[], np.ndarray],
-        name: str = "",
-        near: float | None = None,
-        far: float | None = None,
-    ):
-        self.camera, self.size, self.name, self.near, self.far = camera, size, name, near, far
-        self._image = image
-
-    def __repr__(self) -> str:
-        return f"View({self.name!r}, {self.size[1]} × {self.size[0]})"
-
-    @property
-    def image(self) -> np.ndarray:
-        """(H, W, 4) float32 premultiplied, or (H, W, 3) on the background; read now, if it is not kept.
-
-        Raises:
-            InputError: the picture is gone, damaged, or was exchanged for one of another size.
-        """
-        return self._image() if callable(self._image) else self._image
 
 
 def load_views(
@@ -207,7 +171,7 @@ def _view(
     if pixel_center != 0.5:
         shift: Any = pixel_center - 0.5  # A window may lie between pixels.
         camera = camera.window(size, (shift, shift), size)
-    return View(camera, size, image, pose.path.name, pose.near, pose.far)
+    return View(camera, image, size, name=pose.path.name, near=pose.near, far=pose.far)
 
 
 def _read(path: Path, size: tuple[int, int], n: int, *, linear: bool, behind: np.ndarray | None) -> np.ndarray:
