@@ -92,4 +92,4 @@ class Processes:
             raise RtsError(
                 f"process {self.rank} of {self.count} waited for the others, and one has ended "
                 f"({one_line(str(error), 100)}); its own message says why"
-            ) from error
+            ) from None
