@@ -88,13 +88,17 @@ def descend(
         return [value, *gradients, *wrong, *mattered]
 
     term = engine.jit(term) if jit else term
+
+    def at(p: Tree, key: Any) -> list[Array]:
+        return term(p, terms.load(key))
+
     judge = None if validation is None else _judge(validation, engine, run, jit)
     step = method.start(engine, parameters)
     parameters = saving.resumed(parameters, step.restore) if saving.resumes else parameters
     while True:
         saving.note(parameters, lambda: step.state())
         start, number = run.fresh, len(run.history)
-        value, *rest = terms.mean(lambda data, p=parameters: run.attempt(engine, term, p, data), number)
+        value, *rest = terms.mean(lambda key, p=parameters: run.attempt(engine, at, p, key), number)
         count = len(rest) // 3
         gradients, wrong, mattered = rest[:count], rest[count : 2 * count], rest[2 * count :]
         require(math.isfinite(value), f"the loss is {float(value)}", start)
@@ -125,8 +129,11 @@ def _judge(validation: Validation, engine: Engine, run: Run, jit: bool) -> Calla
 
     term = engine.jit(term) if jit else term
 
+    def at(p: Tree, key: Any) -> list[Array]:
+        return term(p, terms.load(key))
+
     def judge(parameters: Tree) -> float:
-        (value,) = terms.mean(lambda data: run.attempt(engine, term, parameters, data), None)
+        (value,) = terms.mean(lambda key: run.attempt(engine, at, parameters, key), None)
         require(math.isfinite(value), f"the validation's loss is {float(value)}", run.fresh)
         return float(value)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from rts.arrays.array_functions import from_numbers, shape_of
-from rts.arrays.engines import namespace
+from rts.arrays.engines import constants, engine_of, exemplar, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checks import check_shader
 from rts.contracts.gbuffer import GBuffer
@@ -69,7 +69,8 @@ def exposed(parts: Any, exposure: Any, view: Array, count: int) -> list[Part]:
         shape = shape_of(value)
         if shape[:1] != (count,) or len(shape) > 2:
             raise InputError(f"exposure gave a {name} of shape {shape}; expected ({count},) or ({count}, 3)")
-        entry[name] = namespace(value).take(value, view, axis=0) if shape else value
+        value, number = constants((value, view), engine_of(value, view), exemplar((value, view)))
+        entry[name] = value[number, ...]
     listed = list(parts) if isinstance(parts, (tuple, list)) else [parts]
     if not all(isinstance(part, Part) for part in listed):
         raise InputError("scene gave prepared parts; with an exposure it has to give rts.Part, or several")

@@ -277,7 +277,7 @@ def _least_squares(
         equations, value_at = engine.jit(equations), engine.jit(value_at)
 
     def mean(compute: Callable, v: Array) -> list[Array]:
-        return terms.mean(lambda data: run.attempt(engine, compute, v, data), None)
+        return terms.mean(lambda key: run.attempt(engine, lambda: compute(v, terms.load(key))), None)
 
     def linearize(v: Array) -> _Linear:
         value, *rest = mean(equations, v)

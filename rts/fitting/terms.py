@@ -50,7 +50,7 @@ class Terms:
 
     def first(self) -> Tree:
         """The data of a term of the first step."""
-        return self._loaded(self.drawn(0)[0])
+        return self.load(self.drawn(0)[0])
 
     @property
     def whole(self) -> bool:
@@ -66,32 +66,33 @@ class Terms:
             raise InputError(f"residuals drew no term at step {step}; expected at least one")
         return keys
 
-    def mean(self, compute: Callable[[Tree], Sequence[Array]], step: int | None) -> list[Array]:
+    def mean(self, compute: Callable[[Any], Sequence[Array]], step: int | None) -> list[Array]:
         """Means over the terms of a step.
 
         Terms are added in the order in which they were drawn, so that the number of processes makes no difference but
         for rounding.
 
         Args:
-            compute: data of a term → arrays, of equal shapes for all terms.
+            compute: key of a term → arrays, of equal shapes for all terms.
             step: see `drawn`.
         """
         keys = self.drawn(step)
         if self._processes is None:
-            return self._added((compute(self._loaded(key)) for key in keys), len(keys))
+            return self._added((compute(key) for key in keys), len(keys))
         vectors, like, failure = [], None, None
         try:
             for key in self._processes.share(keys):
-                like = compute(self._loaded(key))
+                like = compute(key)
                 vectors.append(_flat([self._engine.to_numpy(x) for x in like]))
         except Exception as error:
             failure = error
         gathered = self._processes.in_order(vectors, len(keys), failure)
         if like is None:  # There are more processes than terms. The first term tells shapes and dtypes.
-            like = compute(self._loaded(keys[0]))
+            like = compute(keys[0])
         return self._added((self._split(row, like) for row in gathered), len(keys))
 
-    def _loaded(self, key: Any) -> Tree:
+    def load(self, key: Any) -> Tree:
+        """The data of a term."""
         return self.residuals.load(key) if self.several else None
 
     def _added(self, terms: Iterable[Sequence[Array]], count: int) -> list[Array]:

@@ -29,8 +29,8 @@ Key = tuple[int, tuple[int, int] | None]
 
 MEMORY = 2**31
 """Bytes of pictures that are kept, unless told otherwise."""
-INVERTED = 0.95
-"""An alpha that is 1 in this share of the border, and less within, is probably inverted."""
+INVERTED, HOLE = 0.95, 0.005
+"""An alpha that is 1 in this share of the border, and 0 in this share of the picture, is probably inverted."""
 
 
 class ViewResiduals(Residuals):
@@ -48,7 +48,7 @@ class ViewResiduals(Residuals):
         seed: of the shuffles and places. The same seed and step give the same.
         cameras: `cameras(parameters, camera, view)` → camera, to fit cameras: from the view's own `camera` and the
             view's number, an integer array that may be traced. None for the views' own cameras. For example
-            `lambda p, camera, i: camera.replace(view=rts.rigid(p["pose"][i]) @ camera.view)`.
+            `lambda p, camera, i: camera.within(rts.rigid(p["poses"][i]))`, where the world moves before the camera.
         exposure: `exposure(parameters)` → gain and offset, each (B,) or (B, 3) for the B views, or None. Colours are
             multiplied by the gain, and the offset times alpha is added. The background stays as it is.
         weights: (B,) factors on the differences of each view; None for ones. A view's own mask is a factor, too.
@@ -255,11 +255,11 @@ class ViewResiduals(Residuals):
         if alpha is None or self._warned or min(alpha.shape) < 3:
             return
         rim = np.concatenate([alpha[0], alpha[-1], alpha[1:-1, 0], alpha[1:-1, -1]])
-        if rim.mean() > INVERTED > alpha.mean() + 0.05:
+        if rim.mean() > INVERTED and (alpha < 0.5).mean() > HOLE:
             self._warned = True
             warn(
-                f"view {number} ({self.views[number].name}) has an alpha of 1 along its border and less within; is the "
-                f"mask inverted? The object has 1, its background 0",
+                f"view {number} ({self.views[number].name}) has an alpha of 1 along its border, and of 0 within; is "
+                f"the mask inverted? The object has 1, its background 0",
                 InputWarning,
             )
 
