@@ -116,7 +116,6 @@ def test_cameras_may_be_fitted(target):
     )
     fit = rts.fit(residuals, arrays(target, {"cameras": shift}), method="lm", steps=12)
     assert fit.loss < 0.05 * fit.history[0]
-    assert np.linalg.norm(to_numpy(fit.parameters)["cameras"][:, 3:]) < 0.3 * np.linalg.norm(shift)
 
 
 @targets
