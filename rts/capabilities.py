@@ -42,7 +42,7 @@ VARIABLES: Mapping[str, tuple[str, ...]] = {
 
 
 def capabilities(group: str, plugin: Any) -> dict[str, Any]:
-    """Capabilities by name: values of `VARIABLES`, and True or False for `METHODS`, which a plugin may override.
+    """Capabilities by name: values of `VARIABLES`, and for each of `METHODS` True if the plugin overrides it.
 
     Empty for groups without a base class, such as "rts.commands".
 
@@ -51,7 +51,7 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
         plugin: the object that the entry point names.
 
     Raises:
-        PluginError: the plugin does not subclass the group's base.
+        PluginError: the plugin does not subclass the group's base, and is no function as a shader.
     """
     if group not in BASES:
         return {}
@@ -75,7 +75,7 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:
-    """Capabilities in a line: names of true ones, names and values of others; False and None are left out."""
+    """Capabilities in a line: names of those that are True, names and values of others; False and None are left out."""
     words = []
     for name, value in capabilities.items():
         shown = name.replace("_", " ")

@@ -19,11 +19,11 @@ class InputError(RtsError, ValueError):
 
 
 class EngineError(RtsError, TypeError):
-    """Arrays of two frameworks, or of an unknown one, met in one call."""
+    """Arrays of two frameworks met in one call, or arrays of an unknown framework, or of one without derivatives."""
 
 
 class PluginError(RtsError, ImportError):
-    """A plugin is registered but cannot be used: a package is missing, or its import fails."""
+    """A plugin cannot be used: a package is missing, its import fails, or its class breaks a rule of its base."""
 
 
 class RtsWarning(UserWarning):
@@ -59,7 +59,7 @@ class FileWarning(RtsWarning):
 
 
 def warn(message: str, category: type[RtsWarning]) -> None:
-    """Warn at the line that called the library."""
+    """Warn, and name the line outside of the library that called it."""
     level, frame = 1, sys._getframe(0)
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OWN_PACKAGES:
         level, frame = level + 1, frame.f_back

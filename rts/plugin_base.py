@@ -40,7 +40,8 @@ def promised(plugin: Any, name: str) -> Any:
     """The value of a promise that holds for a plugin, or for a class of plugins.
 
     A promise holds for the class that states it. If a subclass overrides a method listed in `PROMISES`, the value is
-    the default of the base. If the class itself defines no such method, the promise holds for its subclasses, too.
+    the default of the base. If the class itself defines no such method, the promise holds for its subclasses, too. A
+    value set on the object itself always holds.
     """
     holds, default = _holds(plugin if isinstance(plugin, type) else type(plugin), name)
     return getattr(plugin, name) if holds or name in getattr(plugin, "__dict__", ()) else default
@@ -48,7 +49,7 @@ def promised(plugin: Any, name: str) -> Any:
 
 @functools.lru_cache(maxsize=4096)
 def _holds(kind: type, name: str) -> tuple[bool, Any]:
-    """True if a promise holds for a class; also the default value, that of its base."""
+    """True if a promise `name` holds for a class; also the default value, that of the base class."""
     stated = [c for c in kind.__mro__ if name in vars(c)]
     own, base = stated[0], stated[-1]
     there = {m for c in own.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}
@@ -59,10 +60,11 @@ def _holds(kind: type, name: str) -> tuple[bool, Any]:
 def check_members(kind: type[Plugin]) -> None:
     """Refuse a class that overrides a final method, or has a function named almost like an optional method.
 
-    Names count as almost alike if one letter differs. Optional methods belong to the library's abstract classes.
+    Names are almost alike if one letter is added, left out or exchanged; functions of bases in other packages may have
+    such names. Optional methods belong to the library's abstract classes. Each class is checked once.
 
     Raises:
-        PluginError: the class has such a function. The check runs once for each class.
+        PluginError: the class has such a function.
     """
     bases = [c for c in kind.__mro__ if inspect.isabstract(c) and c.__module__.partition(".")[0] == "rts"]
     members = {n: f for c in reversed(bases) for n, f in vars(c).items() if isinstance(f, FunctionType) and n[0] != "_"}

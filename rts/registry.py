@@ -2,7 +2,7 @@
 
 Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines; rts.commands, the subcommands of `rts`;
 and rts.functions, of which the library's own are attributes of `rts`. The library registers its own plugins in its
-`pyproject.toml`, in the same way as anyone's. Only the plugin asked for is imported.
+`pyproject.toml`, in the same way as anyone's. Only plugins that are asked for are imported.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def plugins(group: str, *, details: bool = False) -> list[str] | list[PluginInfo
             This imports every plugin of the group.
 
     Raises:
-        InputError: no such group.
+        InputError: no such group, or `details` is no bool.
     """
     group = _group(group)
     if not isinstance(details, bool):
@@ -133,8 +133,12 @@ def check_name(group: str, name: str) -> None:
     """Refuse a name that no plugin of a group has, or several have, without importing any.
 
     Args:
-        group: such as "rts.shaders".
+        group: such as "rts.shaders", in full.
         name: the name.
+
+    Raises:
+        InputError: no plugin has the name.
+        PluginError: several distributions claim it.
     """
     if len(_entries(group).get(name, ())) != 1:
         _entry(group, name)
@@ -214,7 +218,7 @@ def attribute(name: str, known: Iterable[str]) -> Any:
 def instance(group: str, chosen: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
-    A name or a class gives one shared instance with default settings; an object is returned as it is.
+    A name or a class gives one instance with default settings, shared by all calls; an object is returned as it is.
     """
     if not isinstance(chosen, (str, type)):
         return chosen

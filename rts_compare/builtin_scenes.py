@@ -92,7 +92,7 @@ def _with_exact(part: Part) -> tuple[Part, Part]:
 
 
 def _upright(points: np.ndarray, ax: float, ay: float) -> np.ndarray:
-    """Points (V, 3) float64 of an object upright along z: normalised, made upright along y, and turned."""
+    """Points (V, 3) float64 of an object upright along z: made upright along y, `normalised`, and turned."""
     return normalised(np.asarray(points, np.float64)[:, [0, 2, 1]] * [1, 1, -1]) @ rotation_xy(ax, ay).T
 
 
@@ -125,7 +125,7 @@ def square_behind_bunny() -> Scene:
 
 
 def bunny_before_square() -> Scene:
-    """The bunny moves before the square: case C of the table of derivatives."""
+    """The bunny moves in front of the square: case C of the table of derivatives."""
     name = "bunny before square"
     return _scene(name, _bunny_and_square(name), moves=[0])
 
@@ -145,7 +145,7 @@ def nefertiti() -> Scene:
 
 
 def thin_wires() -> Scene:
-    """Wires one pixel wide, or half a pixel."""
+    """Seven wires, one pixel or half a pixel wide."""
     return _scene("thin wires", scene_shapes.wires(SIZE[0], [1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 1.0]))
 
 
@@ -166,7 +166,7 @@ def crossing_spheres() -> Scene:
 
 
 def turned_box() -> Scene:
-    """A box that moves before a card."""
+    """A box that moves in front of a card."""
     return _scene("turned box", scene_shapes.turned_box(), moves=[0])
 
 
@@ -234,7 +234,7 @@ def _torus_by_ray() -> Part:
 
 
 def torus_by_lattice() -> Scene:
-    """A torus of values on a lattice with steps of 0.05; its truth is made of the exact field, by rays."""
+    """A torus of values on a lattice with steps of 0.05; its true derivative is that of the exact field, by rays."""
     bounds = (-1.0, -0.4, -1.0), (1.0, 0.4, 1.0)
     surface = plugin("rts.surfaces", "isosurface")(bounds, f=torus, shape=(41, 17, 41), lipschitz=1.0, reads=("radii",))
     return _scene("torus by lattice", _torus(surface), exact=_torus_by_ray())

@@ -91,7 +91,7 @@ def drawn(row: Row) -> bool:
 
 
 def time_label(milliseconds: float) -> str:
-    """A time in three digits: "0.25 ms", "47.5 ms", "4.75 s", "475 s"."""
+    """The text of a time given in milliseconds, three digits or whole seconds: "0.25 ms", "47.5 ms", "4.75 s"."""
     if milliseconds < 999.5:
         return f"{milliseconds:.3g} ms"
     seconds = milliseconds / 1e3
@@ -99,7 +99,7 @@ def time_label(milliseconds: float) -> str:
 
 
 def side_length(supersample: int | str) -> float:
-    """The side of a row's symbol, screen pixels; it grows with the samples along a pixel's side, up to 6."""
+    """The side of a row's symbol, screen pixels; it grows with samples along a pixel's side, up to 6 of these."""
     return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
 
 
@@ -112,7 +112,7 @@ def samples_label(supersample: int | str) -> str:
 
 
 def label(row: Row) -> str:
-    """A row's settings in few words, such as "visible K=2 2×2 raster torch tolerance=0.4"."""
+    """A row's settings in few words, such as "visible K=2 2×2 raster torch tolerance=0.4"; 1×1 is left out."""
     settings = row["settings"]
     if "peer" in row:
         return " ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
@@ -122,7 +122,10 @@ def label(row: Row) -> str:
 
 
 def arguments(row: Row) -> str:
-    """A row's settings as keyword arguments of `rts.render` to copy; a comment names engine and rate, set elsewhere."""
+    """A row's settings as keyword arguments of `rts.render` to copy; a comment names engine and rate, set elsewhere.
+
+    For a row of another renderer, a comment alone.
+    """
     settings = row["settings"]
     if "peer" in row:
         return "# " + ", ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])

@@ -158,7 +158,7 @@ def _missing_charts() -> str | None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """(height, width) of a text: "256" for a square, or "480x640"."""
+    """(height, width) of a text: "256" for a square, or "480x640"; typer.BadParameter for any other text."""
     parts = text.lower().split("x")
     if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
         raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")

@@ -31,7 +31,7 @@ class Setting(NamedTuple):
         layers: K, or "auto".
         supersample: samples along each side of a pixel; or `as_text` of an `rts.Adaptive`, such as "adaptive:4".
         rate: how finely surfaces are sampled, such as "tolerance=0.4" (`Surface.rates`); "" for surfaces as given.
-        sampler: its name; "" in settings whose errors alone are measured.
+        sampler: its name; in settings whose errors alone are measured "", unless errors differ from the usual ones.
         engine: its name; "" in settings whose errors alone are measured.
     """
 
@@ -44,7 +44,7 @@ class Setting(NamedTuple):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `rts.render`."""
+        """Keyword arguments of `rts.render`: splatter, layers, supersample, and the sampler unless it is ""."""
         found = {"splatter": self.splatter, "layers": self.layers, "supersample": samples_of(self.supersample)}
         return {"sampler": self.sampler, **found} if self.sampler else found
 
@@ -67,12 +67,12 @@ def as_text(supersample: Adaptive) -> str:
 
 
 def finest(supersample: Any) -> Any:
-    """The most samples along a side of a pixel, of a number or an `rts.Adaptive`; other values are returned as is."""
+    """Samples along a side of a pixel: of an `rts.Adaptive` those where they are finest; all else is returned as is."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 
 
 def in_python(supersample: int | str) -> str:
-    """Python code for a `supersample`, as a user writes it."""
+    """Python code for a `Setting.supersample`, as a user writes it: "2", or "rts.Adaptive(4)"."""
     if not isinstance(supersample, str):
         return str(supersample)
     _, side, *options = supersample.split(":")
@@ -87,7 +87,7 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
         chosen: names; None for all but "auto".
 
     Raises:
-        InputError: `chosen` is no list of names.
+        InputError: `chosen` is empty, no list, or has a name that is unknown.
         PluginError: a chosen plugin cannot be loaded.
     """
     found: dict[str, Any] = {}
@@ -110,7 +110,15 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
 
 
 def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
-    """Engines with derivatives, first the one that measures errors; and a line on each other, with the reason."""
+    """Engines with derivatives, that which measures errors first; and lines on those that fail or are chosen in vain.
+
+    Args:
+        chosen: names, the one that measures errors first; None for all that are installed, `FIRST` first.
+
+    Raises:
+        InputError: `chosen` is empty, no list of known names, or names no engine with derivatives.
+        PluginError: a chosen engine cannot be loaded, or no engine with derivatives is installed.
+    """
     names, left_out = usable("rts.engines", chosen)
     loaded = [engine_named(name) for name in names]
     found = [engine for engine in loaded if engine.differentiates]
@@ -130,11 +138,11 @@ def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str
 
 
 def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tuple[float, ...]]) -> list[Setting]:
-    """The settings worth timing: no setting chosen before costs as little in all respects and is as accurate.
+    """The settings worth timing: all but those beside which a chosen one costs no more and is no worse, see `ALIKE`.
 
     Args:
         errors: setting → error.
-        work: setting → its costs, several numbers; the settings are looked at from the least on.
+        work: setting → its costs, several numbers; settings of lesser costs are looked at, and chosen, first.
     """
     found: list[Setting] = []
     for setting in sorted(errors, key=lambda s: (work(s), errors[s])):

@@ -51,7 +51,7 @@ class Comparison:
             standard deviation 2 pixels), "gain" and "loss_error" (see `derivative_scores.scores`), "ms" (median,
             quartiles and number of calls, or None where only the error was measured) and "front", True if no row is
             both faster and more accurate. Rows of other renderers name theirs in "peer".
-        left_out: a line for each measurement that failed, with the reason.
+        left_out: lines on measurements that failed and options that were left out, with the reasons.
     """
 
     scene: Mapping[str, Any]
@@ -70,7 +70,11 @@ class Comparison:
         return best_within([r for r in self.rows if r["mode"] == mode and "peer" not in r], error)
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write NAME.json and, with the extra `plots` installed, NAME.png and NAME.html; return the files written."""
+        """Write NAME.json and, with the extra `plots` installed, NAME.png and NAME.html; return the files written.
+
+        Raises:
+            InputError: a file cannot be written.
+        """
         from rts_compare.html_page import write_page
         from rts_compare.png_chart import draw
 
@@ -152,8 +156,8 @@ def compare(
 
     The error of a setting is that of the derivative image along each of some directions (modes), against differences of
     area-sampled renders. Settings are timed, in turns, unless a cheaper one is as accurate: a render, and the gradient
-    of a loss by the parameters that move. Every registered sampler and splatter takes part, and DEODR and Mitsuba where
-    the extra `bench` is installed.
+    of a loss by the parameters that move. By default every sampler and splatter that is installed takes part; and, with
+    the extra `bench`, DEODR and Mitsuba, if they can render the scene.
 
     Args:
         scene: the name of a built-in scene, the path of a model or of a Python file ("file.py:function"), or a
@@ -170,16 +174,19 @@ def compare(
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
         supersample: samples along each side of a pixel, or `rts.Adaptive`; None for 1, 2, 4 and `rts.Adaptive(4)`.
         peers: whether other renderers take part.
-        quick: one mode, engine and sampler, and 1 and 2 layers, unless named; at most 40 settings; no other renderers.
+        quick: one mode, engine and sampler, and 1 and 2 layers, unless named; at most 40 settings, with surfaces as
+            they are given; no other renderers.
         surface: the name of the surface that reads a model, such as "mesh" or "bezier".
         output: a folder for the results and measurements, from which an interrupted run goes on; None to write nothing.
         truths: the folder of true derivatives; None for the folder of caches.
-        truth_samples: samples of true derivatives along each side of a pixel; fewer are faster and less exact.
+        truth_samples: the square root of the number of samples a pixel, on each of two grids, of true derivatives;
+            fewer are faster and less exact.
         fresh: whether to delete the measurements of earlier runs.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
-        InputError: there is no such scene, or an argument is wrong; before anything is measured.
+        InputError: there is no such scene, or an argument is wrong; before anything is measured. Or no sampler suits
+            the scene, or nothing in the image changes.
         PluginError: a named plugin cannot be loaded, or no engine with derivatives is installed.
     """
     found = scene_of(scene, parameters, directions, size, surface=surface)
@@ -236,7 +243,10 @@ def _unthinned() -> list[str]:
 
 
 def _earlier(folder: Path | None, scene: Scene, fresh: bool) -> KeptMeasurements:
-    """The store of measurements that earlier runs made of scenes of this name; without folder or if fresh, empty."""
+    """The store of measurements that earlier runs made of scenes of this name; empty without a folder.
+
+    `fresh` deletes these measurements.
+    """
     if folder is None:
         return KeptMeasurements()
     path = folder / f".{file_name(scene.name)}.jsonl"

@@ -34,7 +34,7 @@ def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
     Returns:
         error: relative L2 through the low-pass (Gaussian, standard deviation 2 pixels); the error in charts.
-        gain: ⟨x, truth⟩ / ⟨truth, truth⟩, through the low-pass: 1 where the derivative is neither too
+        gain: ⟨x, true⟩ / ⟨true, true⟩, both through the low-pass: 1 where the derivative is neither too
             large nor too small as a whole.
         loss_error: over the random losses L, RMS of the error of dL/dt relative to the RMS of dL/dt; t is the
             parameter of the derivative.
@@ -49,7 +49,8 @@ def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
     Returns:
         relative_l2, cosine, gain: of the images as they are.
         low_relative_l2, low_cosine, low_gain: the same through the low-pass.
-        spurious: share of the derivative's energy farther than 3 pixels from all pixels where the truth is not zero.
+        spurious: share of the sum of x² that lies more than 3 steps, along rows and columns, from all pixels where
+            `true` is not zero.
         loss_error: as of `scores`.
     """
     from scipy.ndimage import binary_dilation

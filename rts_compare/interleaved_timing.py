@@ -59,7 +59,8 @@ class InterleavedTiming:
             rounds: turns of each function, kept turns of earlier runs included.
             done: called for each turn, also a skipped one.
             late: returns True to skip all further turns; ignored until one function has a time.
-            hopeless: a function that takes more than this many times the fastest one's time is called only once.
+            hopeless: a function whose first call takes longer than `WARM`, and than this many times the fastest one's
+                median, is called only once in that turn.
 
         Returns:
             Name in `calls` that could be timed → "median", quartiles "low" and "high" (ms); number of "calls".
@@ -88,7 +89,7 @@ class InterleavedTiming:
         times.extend(kept)
 
     def timed(self, name: tuple) -> list[float]:
-        """Seconds of consecutive calls after one to warm up; of one call if it is slow, or if the first is hopeless."""
+        """Seconds of `CONSECUTIVE` calls after one to warm up; of a single call if it is slow or the first hopeless."""
         with limited(LONGEST):
             if name not in self._made:
                 self._made[name] = self.calls[name]()
@@ -101,7 +102,7 @@ class InterleavedTiming:
         return found
 
     def _most(self) -> float:
-        """The most seconds of a first call; a function whose first call takes longer is not called again."""
+        """The most seconds of a first call that other calls follow at once; infinity before any function has a time."""
         known = [float(np.median(times)) for times in self._times.values() if times]
         return max(WARM, self._hopeless * min(known)) if known else math.inf
 

@@ -29,7 +29,7 @@ def layers_of(parts: list[Part], camera: Camera) -> int:
 
 
 def state_key(parts: list[Part], camera: Camera, size: tuple[int, int]) -> str:
-    """A hash of θ, transforms, camera, size and kinds of surfaces, and of the depths and colours of a hard image."""
+    """A hash of θ, transforms, culling, camera, size, classes of surfaces, and depths and colours of a hard image."""
     arrays = [*leaves([p.theta for p in parts]), *leaves([p.transform for p in parts]), *leaves(camera.for_size(size))]
     layers = layers_of(parts, camera)
     image = render(parts, camera, size, splatter="none", layers=layers)
@@ -41,7 +41,7 @@ def state_key(parts: list[Part], camera: Camera, size: tuple[int, int]) -> str:
 
 @cache
 def library_key() -> str:
-    """A hash of the library's source."""
+    """A hash of the library's source files on which measurements depend."""
     digest = hashlib.sha256()
     for package in PACKAGES:
         spec = find_spec(package)
@@ -53,7 +53,7 @@ def library_key() -> str:
 
 
 def plugin_key(group: str, name: str) -> str:
-    """A hash of the source file of a plugin that is not the library's; "" for the library's, or without a file."""
+    """A hash of a foreign plugin's source file; "" for the library's own, without a file, or for the name ""."""
     if not name:
         return ""
     loaded = plugin(group, name)

@@ -45,7 +45,8 @@ class Measurements:
         kept: the store of measurements.
         engines: engines with derivatives; errors are measured with the first.
         truths: the folder of true derivatives; None for the folder of caches.
-        samples: samples of the truth along each side of a pixel, until `refine_truths` takes another number.
+        samples: the square root of the number of points a pixel on each grid of true derivatives; `refine_truths` may
+            take another number.
         together: whether the parameters of all modes are differentiated at once.
         count_at: the `supersample` with which layers are counted, once for each splatter and sampler; None to count
             them for each setting with its own.
@@ -86,7 +87,7 @@ class Measurements:
         return "surfaces rest" if is_constant(read) else "surfaces change"
 
     def group(self, mode: str) -> str:
-        """The name of the group that a mode is timed in: `TOGETHER`, or by whether the mode changes surfaces."""
+        """The name of the group that a mode is timed in: `TOGETHER`, or "surfaces change" or "surfaces rest"."""
         return self._groups[mode]
 
     def modes(self, group: str) -> list[str]:
@@ -123,7 +124,7 @@ class Measurements:
         self._keep(self.pixel)
 
     def truths(self, done: Done) -> None:
-        """Make the truths, and drop the modes in which the image does not change.
+        """Make the true derivatives, and drop the modes along which the image does not change.
 
         Args:
             done: called 4 `samples`² times for each mode.
@@ -139,11 +140,17 @@ class Measurements:
         self._keep(changes)
 
     def rough(self, error: float) -> list[str]:
-        """The modes whose truth has an estimated error larger than `error`."""
+        """The modes whose true derivative has an estimated error larger than `error`."""
         return [mode for mode in self.scene.directions if self.truth(mode).error > error]
 
     def refine_truths(self, modes: Sequence[str], samples: int, done: Done) -> None:
-        """Make the truths of some modes anew, of `samples`² points a pixel."""
+        """Make the true derivatives of some modes anew, of `samples`² points a pixel on each of two grids.
+
+        Args:
+            modes: of the scene.
+            samples: the square root of the number of points.
+            done: called 4 `samples`² times for each mode.
+        """
         for mode in modes:
             self._truth_samples[mode] = samples
             self._truths.pop(mode, None)
@@ -188,7 +195,7 @@ class Measurements:
         return None if self.scene.separate else self.engine
 
     def state(self, mode: str) -> tuple[str, ...]:
-        """The key of a mode's measurements: hashes of the scene at the ends of the truth's step, truth and library."""
+        """The key of a mode's measurements: hashes of the scene at both ends of `STEP`, `truth_key`, `library_key`."""
         if mode not in self._states:
             step = STEP * self.pixel(mode)
             moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]
@@ -207,7 +214,10 @@ class Measurements:
     # -------------------------------------------------------------------------------------------------- samplers
 
     def samplers(self, names: Iterable[str]) -> list[str]:
-        """Samplers that can sample all parts: the choices of "auto", then "auto" if it makes several, then others."""
+        """Samplers that can sample all parts: choices of "auto", then "auto" if it chose several, then others.
+
+        Choices and others are taken from `names`; each that does not suit is a line of `left_out`.
+        """
         found = self.scene.at(self.start(self.group(next(iter(self.scene.directions)))))
         parts = parts_of(found)
         auto = {choice.sampler for choice in explain(parts, found[1])}
@@ -238,7 +248,10 @@ class Measurements:
         return found
 
     def _agrees(self, name: str, usual: str, group: str) -> bool:
-        """True if a sampler's derivatives along a group's modes agree with the usual one's, up to `ALIKE`."""
+        """True if a sampler's derivatives along a group's modes agree with the usual one's, up to `ALIKE`.
+
+        False if either fails.
+        """
         for mode in self.modes(group):
             setting = Setting("auto", 2, 1)
             try:
@@ -375,7 +388,10 @@ class Measurements:
     # ----------------------------------------------------------------------------------------------------- times
 
     def work(self, group: str, setting: Setting) -> tuple[float, ...]:
-        """Costs of a setting, known before it is timed: layers, samples along a pixel's side, work of its rate."""
+        """Costs of a setting, known before it is timed: layers, samples along a pixel's side, work of its rate.
+
+        "auto" counts as half a layer more than it takes.
+        """
         layers = self.counting(group, setting) or 0
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),

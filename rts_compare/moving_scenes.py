@@ -33,7 +33,7 @@ class Scene:
         directions: mode → a tree like `parameters`, the direction along which the image is differentiated.
         size: (height, width) of images.
         note: what moves, and what is hard about it.
-        exact: as `at`, with exact surfaces where `at` has approximations; the truth is made of it. None for `at`.
+        exact: as `at`, with exact surfaces where `at` has approximations, for the true derivative. None for `at`.
         separate: whether `at` also takes NumPy arrays for parameters that a mode does not change.
     """
 
@@ -109,14 +109,15 @@ def moving(
         parts: NumPy parts.
         camera: the camera.
         size: (height, width).
-        moves: the indices of the parts that translations, rotations and shapes move; None for all.
+        moves: the indices of the parts that translation, rotation and shape move; None for all. Colours of all parts
+            change.
         modes: names from `MODES`. Modes that change nothing are left out.
         note: what is hard about the scene.
         exact: the same parts as exact surfaces, with the same transforms. Modes that change entries of θ which exact
             parts lack, or have in another shape, are left out.
 
     Raises:
-        InputError: not as many exact parts as parts, an unknown mode, or an index out of range.
+        InputError: not as many exact parts as parts, an unknown mode, or `moves` is empty or out of range.
     """
     parts = [parts] if isinstance(parts, Part) else list(parts)
     true = parts if exact is None else [exact] if isinstance(exact, Part) else list(exact)

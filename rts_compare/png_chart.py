@@ -187,7 +187,7 @@ NUMBER_SIZE = (12, 9)
 
 
 def _number(figure: Figure, axes: Axes, rows: Sequence[Row]) -> None:
-    """Number the rows on the Pareto front, below and left of their points, as near as numbers do not overlap."""
+    """Number these rows, below and left of their points, as near as possible without overlap of numbers."""
     from matplotlib.patheffects import withStroke
 
     taken = np.empty((0, 2))

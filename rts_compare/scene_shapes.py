@@ -32,13 +32,13 @@ def pixel(depth: float, size: int) -> float:
 
 
 def on_screen(xy: np.ndarray, depth: float, size: int) -> np.ndarray:
-    """World points (N, 3) at a camera depth that are seen at pixels (N, 2): y down, the top left corner (0, 0)."""
+    """World points (N, 3) at a camera depth, seen at pixel coordinates (N, 2): y down, the top left corner (0, 0)."""
     xy = (np.asarray(xy, float) - size / 2) * pixel(depth, size)
     return np.column_stack([xy[:, 0], -xy[:, 1], np.full(len(xy), DISTANCE - depth)])
 
 
 def normalised(points: np.ndarray) -> np.ndarray:
-    """Points about the centre of their bounding box, the farthest at distance 1."""
+    """Points (V, 3) moved and scaled: the centre of their box is the origin, and the farthest is at distance 1."""
     points = points - (points.min(0) + points.max(0)) / 2
     return points / np.linalg.norm(points, axis=1).max()
 
@@ -121,7 +121,7 @@ def turned_box() -> tuple[Part, Part]:
 
 
 def cards(count: int) -> tuple[list[Part], list[float]]:
-    """Open cards one behind the other, tilted and turned at random, the first the nearest; and their depths."""
+    """At least 2 cards one behind the other, tilted and turned at random, the nearest first; and their depths."""
     random = np.random.default_rng(count)  # A fixed seed.
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     parts, depths = [], []

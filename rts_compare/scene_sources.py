@@ -43,17 +43,19 @@ def scene_of(
 
     Args:
         scene: a `Scene`; the name of a built-in one; the path of a model; the path of a Python file, perhaps with
-            ":name" of a function in it, "scene" by default; or a function: () or parameters → (parts, camera).
+            ":name" of a function or `Scene` in it, "scene" by default; or a function: () or parameters →
+            (parts, camera).
         parameters: of the function: an array, or nested dicts and lists of them. A Python file may have them under
             the name "parameters". None for a function without arguments, whose parts move in the
-            modes of `moving`.
+            modes of `moving`. A `Scene` has its own: `parameters` and `directions` are then ignored.
         directions: mode → direction of the parameters; None for one mode for each number of small arrays, and one
             random direction for each larger array.
         size: (height, width); None for the scene's own, 256² where it has none.
         surface: the name of the surface that reads a model, such as "mesh" or "bezier".
 
     Raises:
-        InputError: there is no such scene, or it does not give parts and a camera.
+        InputError: there is no such scene, its code fails, or an argument or a direction does not suit. A function of
+            parameters is not called here: `engines_for` checks its result.
     """
     if size is not None:
         if not (isinstance(size, (tuple, list)) and len(size) == 2 and all(map(is_count, size))):
@@ -81,7 +83,7 @@ def some_modes(scene: Scene, modes: Sequence[str] | None) -> Scene:
     """The scene with the modes of these names; None for all.
 
     Raises:
-        InputError: the scene lacks one of them.
+        InputError: the scene lacks one of them, or `modes` is empty or no list of names.
     """
     if modes is None:
         return scene
@@ -143,7 +145,7 @@ def _module(path: Path) -> Any:
 
 @contextlib.contextmanager
 def _told(what: str) -> Iterator[None]:
-    """Turn errors in the block, a user's code, into an InputError of one line."""
+    """Turn errors in the block, a user's code, into an InputError of one line; errors of the library pass as is."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -176,7 +178,11 @@ def _of_function(f: Callable, name: str, parameters: Tree, directions: Mapping[s
 
 
 def _float_array(x: Any) -> Any:
-    """A leaf of parameters: NumPy's and Python's numbers become float32, as the engines take them."""
+    """A leaf of parameters: NumPy's and Python's real numbers as float32, floating arrays of engines detached.
+
+    Raises:
+        InputError: the leaf is something else.
+    """
     if is_constant(x) and np.asarray(x).dtype.kind in "biuf":
         return np.asarray(x, np.float32)
     dtype = getattr(x, "dtype", None)
@@ -186,14 +192,15 @@ def _float_array(x: Any) -> Any:
 
 
 def engines_for(scene: Scene, chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
-    """The engines that can compute a scene, first the one that measures errors; and a line on each engine that cannot.
+    """The engines that can compute a scene, first the one that measures errors; and lines on engines that cannot.
 
     Args:
-        scene: the scene; where its parameters are arrays of an engine, no other one can.
-        chosen: names; None for all that are installed.
+        scene: the scene.
+        chosen: names; None for the engine whose arrays the parameters are or, for NumPy's, all that are installed.
 
     Raises:
-        InputError: the scene gives something else than parts and a camera, in all engines.
+        InputError: no engine can compute the scene, or as for `engines`.
+        PluginError: as for `engines`.
     """
     own = engine_of(scene.parameters)
     found, left_out = engines([own.name] if own.differentiates and chosen is None else chosen)
@@ -214,7 +221,7 @@ def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
     """The parts and the camera that a function gave.
 
     Raises:
-        InputError: it gave something else, or colours of other than three channels.
+        InputError: it gave something else, parts that cannot be drawn, or colours of other than three channels.
     """
     if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera)):
         raise InputError(f"{name} gave {quoted(found)}; expected (parts, camera)")

@@ -16,7 +16,7 @@ from rts_compare.measurements import TOGETHER, Measurements
 LAYERS = (1, 2, 4, 8)
 SUPERSAMPLE = (1, 2, "adaptive:4", 3, 4)
 HOPELESS = 2.0
-"""A splatter is tried further if its error is at most this many times the best splatter's."""
+"""A splatter is tried further if its error is within the tolerance, or at most this many times the best one's."""
 ALIKE = 0.9
 """The share of another setting's time below which a setting counts as faster."""
 TURNS = 6
@@ -24,7 +24,7 @@ TURNS = 6
 MORE_WORK = 2.0
 """A setting of more than this many times the estimated cost of an accurate one is not tried, whatever its splatter."""
 SLOWER = 3.0
-"""A setting that takes more than this many times the fastest one's time is called only once."""
+"""A setting whose first call takes more than this many times the fastest one's time is called only once in a turn."""
 ENOUGH = 3
 """The fewest timed turns of the chosen setting."""
 NEARLY = 1.2
@@ -39,8 +39,8 @@ class Found(NamedTuple):
 
     Attributes:
         setting: sampler, splatter, layers, samples, rate and engine.
-        reasons: a line for each of these but the engine, and for failures.
-        error: the largest error of the derivative along any mode, relative L2.
+        reasons: a line for each of these, but the engine, for which another choice was looked at; and on failures.
+        error: the largest error of the derivative along any mode, see `derivative_scores.scores`.
         seconds: median time of a render and gradient.
     """
 
@@ -77,7 +77,14 @@ class Search:
         self.late = False
 
     def run(self, splatters: Sequence[str]) -> Found:
-        """The fastest setting within the tolerance that is found in time; if there is none, the most accurate one."""
+        """The fastest setting within the tolerance that is found in time; if there is none, the most accurate one.
+
+        Raises:
+            InputError: nothing could be measured or timed.
+
+        Warns:
+            ToleranceWarning: no setting within the tolerance was found.
+        """
         cells: list[Setting] = []
         within: list[Setting] = []
         for kind in dict.fromkeys(self.samplers.values()):
@@ -121,7 +128,7 @@ class Search:
         return sorted(settings, key=lambda s: math.prod(self._work(s)))
 
     def _promising(self, splatters: Sequence[str], kind: str) -> list[str]:
-        """Splatters that are accurate enough with one or two layers and one sample, or nearly as good as the best."""
+        """Splatters that `HOPELESS` allows, by errors with one or two layers and one sample; and untried ones."""
         known: dict[str, float] = {}
         for setting in self._cells(splatters, kind, LAYERS[:2], SUPERSAMPLE[:1], rates=False):
             if not self._over():
@@ -218,7 +225,11 @@ class Search:
         return self.bounds.get(self._cell(best), 0.0) > NEARLY * self.tolerance
 
     def _best(self, cells: Sequence[Setting]) -> Setting:
-        """The tried setting with the least error; if none was tried, the first of `cells`."""
+        """The tried setting with the least error; if none has an error, the first of `cells`.
+
+        Raises:
+            InputError: there are no `cells` either.
+        """
         least, best = math.inf, cells[0] if cells else None
         for setting in sorted(self.bounds, key=lambda s: self.bounds[s]):
             if self.bounds[setting] >= least:
@@ -231,7 +242,7 @@ class Search:
         return best
 
     def _bound(self, setting: Setting) -> float:
-        """The largest of a setting's errors along the modes, or the first of them beyond the tolerance."""
+        """The largest of a setting's errors along the modes, or the first beyond the tolerance; kept in `bounds`."""
         worst = 0.0
         for mode in self.modes:
             error = self._along(mode, setting)
@@ -245,7 +256,7 @@ class Search:
         return worst
 
     def _error(self, setting: Setting) -> float:
-        """The largest of a setting's errors along the modes."""
+        """The largest of a setting's errors along all modes; kept in `bounds`."""
         worst = max(self._along(mode, setting) for mode in self.modes)
         self.bounds[self._cell(setting)] = worst
         return worst
@@ -267,7 +278,11 @@ class Search:
         return {Setting(*s): ms["median"] / 1e3 for s, ms in timed.items()}
 
     def _fastest(self, settings: Sequence[Setting]) -> Setting:
-        """The fastest setting, by successive halving: all have a turn, the faster half another, and so on."""
+        """The fastest setting, by successive halving: all have a turn, the faster half another, and so on.
+
+        Raises:
+            InputError: none could be timed.
+        """
         turns, left = 1, list(settings)
         while True:
             times = self._timed(left, turns)
@@ -283,7 +298,10 @@ class Search:
     def _reasons(
         self, chosen: Setting, cells: Sequence[Setting], splatters: Sequence[str]
     ) -> tuple[list[str], Setting | None]:
-        """Lines on each choice: the cheaper one's error, the dearer one's time; and a faster accurate setting."""
+        """Lines on each choice: the cheaper one's error, the dearer one's time; and a setting to prefer, or None.
+
+        That is the fastest accurate one of those compared, if it takes less than `ALIKE` of the chosen one's time.
+        """
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),

@@ -27,7 +27,8 @@ class SceneAtRate(NamedTuple):
 def scenes_at_rates(at: SceneFunction, parts: Sequence[Part]) -> dict[str, SceneAtRate]:
     """Name of a rate, such as "tolerance=0.4" → the scene at this rate; "" → the scene as it is given.
 
-    Surfaces of one kind are changed together, each to the first rate that it offers, to its second, and so on.
+    Surfaces of one class are changed together: in one scene each to the first rate that it offers, in the next to its
+    second, and so on.
 
     Args:
         at: parameters → (parts, camera).

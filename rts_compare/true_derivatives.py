@@ -1,7 +1,7 @@
 """The true derivative of an image, by differences of area-sampled renders without splatting.
 
-The differences are central, over a quarter of a pixel, on two grids of points in the pixel that have nothing in
-common: their disagreement measures the error. Derivatives are kept on disk by a key of the scene.
+The differences are central, over a quarter of a pixel. They are taken on two grids of points in the pixel: the
+disagreement of both results measures the error. Derivatives are kept on disk by a key of the scene.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Grids = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
 class Truth(NamedTuple):
-    """The change of an image along one mode.
+    """The true derivative of an image along one mode.
 
     Attributes:
         derivative: (H, W, 3), change of colour per pixel of motion, the mean over both grids.
-        error: estimated error of `derivative`, relative L2 through the low-pass of `scores`: half the difference of
-            the grids, as if both erred equally and independently.
+        error: estimated error of `derivative`, relative L2 through `low_pass`: half the difference of the grids, as if
+            both erred equally and independently.
         grids: (2, H, W, 3) the derivative on each of the grids.
     """
 
@@ -53,7 +53,7 @@ class Truth(NamedTuple):
 
     @property
     def noise(self) -> dict[str, float]:
-        """Relative L2 of the difference of the grids' derivatives: as they are, and through the low-pass."""
+        """Relative L2 of the difference of the grids' derivatives: as they are, and through `low_pass`."""
         return {
             "relative_l2": relative_l2(self.grids[0], self.grids[1], self.derivative),
             "low_relative_l2": 2 * self.error,
@@ -70,7 +70,7 @@ def lattice(samples: int) -> np.ndarray:
 
 
 def lattices(samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """The lattice, and the same with x and y exchanged."""
+    """Two grids of points (S, 2) of a pixel: `lattice`, and the same with x and y exchanged."""
     points = lattice(samples)
     return points, points[:, ::-1]
 
@@ -89,7 +89,7 @@ def area_image(
         camera: the camera.
         size: (height, width).
         points: offsets from the pixel's centre, x right and y down, pixels.
-        done: called after each point.
+        done: called once for each point.
     """
     total, layers, seen = np.zeros((*size, 4)), layers_of(parts, camera), camera.for_size(size)
     projection = np.asarray(engine_of(seen.projection).to_numpy(seen.projection), np.float64)
@@ -112,7 +112,16 @@ def area_image(
 def truth_key(
     scene: Scene, mode: str, step: float, samples: int, engine: Engine | None, grids: Grids = lattices
 ) -> str:
-    """A hash of everything that determines the truth: the exact scene at the ends of `step`, and the grids."""
+    """A hash of the exact scene at both ends of a step, `samples` and the grids; the library's code is not in it.
+
+    Args:
+        scene: the scene.
+        mode: a mode of the scene.
+        step: length of the central difference, a factor of the mode's direction.
+        samples: as in `truth`.
+        engine: as in `shown`.
+        grids: as in `truth`.
+    """
     states = [state_key(*shown(scene, mode, by, engine), scene.size) for by in (-step / 2, step / 2)]
     points = () if grids is lattices else (fingerprint(grids(samples)),)
     return hashlib.sha256(repr((samples, states, *points)).encode()).hexdigest()[:20]
@@ -153,8 +162,8 @@ def truth(
         step: length of the central difference, pixels of motion.
         grids: `samples` → two grids of points (S, 2) of a pixel.
         engine: as in `shown`.
-        folder: where truths are kept; None for the folder of caches.
-        done: called 4 `samples`² times, also where the truth is read from disk.
+        folder: the result is kept in its folder "truths"; None for the folder of caches.
+        done: called once for each point of four images, also where they are read from disk: 4 `samples`² times.
     """
     length = step * pixel
     folder = (kept_folder() if folder is None else folder) / "truths"
@@ -186,7 +195,7 @@ def _kept_image(
     path: Path,
     done: Callable[[], None],
 ) -> np.ndarray:
-    """One of the four images of a difference, kept on disk so that an interrupted run can go on."""
+    """One of the four images (H, W, 3) of the differences, kept on disk so that an interrupted run can go on."""
     kept = _read(path)
     if kept is not None:
         for _ in points:

@@ -23,9 +23,9 @@ from rts_compare.settings_search import SUPERSAMPLE, Search
 from rts_compare.true_derivatives import SAMPLES
 
 TRUTH_SAMPLES = (4, 8, SAMPLES)
-"""Samples of truths along each side of a pixel: the next number where the truth's own error is too large."""
+"""`truth_samples` to choose from: the next number where the error of the true derivative itself is too large."""
 TRUE = 0.3
-"""The largest error of a truth, as a share of the tolerance; it makes an error of the tolerance seem 5 % larger."""
+"""The largest error of a true derivative, a share of the tolerance: errors at it seem 5 % larger."""
 SAMPLED = 1.0
 """Seconds that a sampler may take for an image of at most 512² pixels; in proportion for more."""
 
@@ -37,7 +37,8 @@ class Tuned(NamedTuple):
         parts: the scene's parts at the parameters, without derivatives, their surfaces at the rates that were chosen.
         settings: keyword arguments of `rts.render`: sampler, splatter, layers and supersample.
         rate: how the surfaces differ from the given ones, such as "tolerance=0.4"; "" if they do not.
-        reasons: a line for each choice: the error of a cheaper one, and the time of a dearer one.
+        reasons: a line for each choice: the error of a cheaper one, and the time of a dearer one; and lines on
+            failures: nothing accurate enough, too little time, a rough truth.
         scene: the function parameters → (parts, camera) with these rates, for a fit to render.
         error: the largest error of the derivatives along any mode: relative L2, smoothed by a Gaussian of standard
             deviation 2 pixels.
@@ -93,13 +94,16 @@ def tune(
         splatters: names; None for all.
         surface: the name of the surface that reads a model, such as "mesh" or "bezier".
         truths: the folder of true derivatives; None for the folder of caches.
-        truth_samples: samples of true derivatives along each side of a pixel; fewer are faster and less exact. None for
-            4, 8 or 16: for each mode the fewest that make the truth's estimated error less than 0.3 of the tolerance.
-            Where that takes too long, or 16 do not suffice, a reason says so.
+        truth_samples: the square root of the number of samples a pixel, on each of two grids, of true derivatives;
+            fewer are faster and less exact. None for 4, 8 or 16: for each mode the fewest that make the true
+            derivative's estimated error at most 0.3 of the tolerance. Where that takes too long, or 16 do not suffice,
+            a reason says so.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
-        InputError: there is no such scene, or an argument is wrong; before anything is measured.
+        InputError: there is no such scene, or an argument is wrong; before anything is measured. Or no sampler suits
+            the scene, nothing in the image changes, or nothing can be measured.
+        PluginError: a named plugin cannot be loaded, or no engine with derivatives is installed.
 
     Warns:
         ToleranceWarning: nothing is accurate enough; the most accurate is given.
@@ -143,7 +147,7 @@ def tune(
 
 
 def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase: Phase, finer: Sequence[int]) -> None:
-    """Make the truths; make rough ones anew with `finer` samples, while each such pass takes at most `seconds`."""
+    """Make true derivatives; then rough ones anew with `finer` samples, while a pass should take at most `seconds`."""
 
     def told(modes: Sequence[str], samples: int) -> Callable[[], None]:
         return phase(f"truth, {samples} × {samples}", 4 * samples**2 * len(modes))
@@ -161,7 +165,7 @@ def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase
 
 
 def _told_of_truths(measured: Measurements, tolerance: float) -> list[str]:
-    """A list of one line on the modes whose truth is too rough for the tolerance; empty if there are none."""
+    """A list of one line on the modes whose true derivative is too rough for the tolerance; empty if there are none."""
     rough = measured.rough(TRUE * tolerance)
     if not rough:
         return []

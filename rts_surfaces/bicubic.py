@@ -23,7 +23,7 @@ def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
     Args:
         rows: (V, C) float, control points or their attributes; differentiable.
         table: (n, 16) integers, the rows of each patch, first along u, then along v.
-        patch: (N,) integers.
+        patch: (N,) integers, the patch of each sample.
         params: (N, 2), u and v; of the dtype of the rows, constant.
     """
     return VALUES(rows, params, patch, table)
@@ -47,7 +47,7 @@ def _bernstein(t: Array) -> tuple[Array, Array]:
 
 
 def _sum(rows: Array, ids: Array, a: Array, b: Array) -> Array:
-    """Sums of the rows (N, 16), weighted by the products of weights along u (N, 4) and along v (N, 4)."""
+    """Sums (N, C) of rows (V, C) at ids (N, 16), weighted by products of the weights a (N, 4) along u, b along v."""
     return combine(rows, ids, namespace(a).reshape(a[:, :, None] * b[:, None, :], (-1, 16)))
 
 

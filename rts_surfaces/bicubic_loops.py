@@ -41,7 +41,7 @@ def _slope(a, t):
 
 @compiled
 def first(p, u, v):
-    """A coordinate of a patch with powers `p` (4, 4), and its derivatives along u and v."""
+    """A coordinate of a patch with powers `p` (4, 4), and its derivatives in u and in v, at (u, v)."""
     a, b, c, d = _cubic(p[0], v), _cubic(p[1], v), _cubic(p[2], v), _cubic(p[3], v)
     along_v = _slope(p[0], v) + u * (_slope(p[1], v) + u * (_slope(p[2], v) + u * _slope(p[3], v)))
     return a + u * (b + u * (c + u * d)), b + u * (2 * c + 3 * u * d), along_v
@@ -49,7 +49,7 @@ def first(p, u, v):
 
 @compiled
 def _second(p, u, v):
-    """The second derivatives of a coordinate of a patch: in u, in u and v, in v."""
+    """The second derivatives at (u, v) of a coordinate with powers `p` (4, 4): in u, in u and v, in v."""
     uu = 2 * _cubic(p[2], v) + 6 * u * _cubic(p[3], v)
     uv = _slope(p[1], v) + u * (2 * _slope(p[2], v) + 3 * u * _slope(p[3], v))
     a, b, c, d = 2 * p[0, 2], 2 * p[1, 2], 2 * p[2, 2], 2 * p[3, 2]
@@ -79,19 +79,19 @@ def expansions(start, stop, powers, patch, params, out):
 
 
 def values(rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (N, C) with patches of control points (V, C) at samples."""
+    """Fill `out` (N, C) with points of patches (N,) at params (N, 2); control points are `table` (n, 16) of `rows`."""
     parallel(_sum_values, len(out), _nets(rows, table), patch, params, out, work=30 * len(out))
 
 
 def push_values(_: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray) -> None:
-    """Fill the last array (N, C) with the tangent of the values; the array before it is that of the control points."""
+    """Fill the second of `moved` (N, C) with the tangents of the values; the first (V, C) are those of the rows."""
     values(moved[0], params, patch, table, moved[1])
 
 
 def pull_values(
     _: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, g: np.ndarray, result: np.ndarray
 ) -> None:
-    """Add to `result` (V, C), the gradient of the control points, from g (N, C), the gradient of the values."""
+    """Add to `result` (V, C), the gradient of the rows, from g (N, C), the gradient of the values."""
     found = np.zeros((SHARES, len(table), 16, g.shape[1]), g.dtype)
     parallel(_pull_shares, SHARES, patch, params, g, found, work=30 * len(g))
     _scatter(table, found, result)
@@ -100,7 +100,10 @@ def pull_values(
 def normals(
     collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray
 ) -> None:
-    """Fill `out` (N, 3) with unit normals; a tangent below the share `collapsed` of the other counts as zero."""
+    """Fill `out` (N, 3) with unit normals; a tangent below the share `collapsed` of the other counts as zero.
+
+    A normal that does not exist is zero.
+    """
     given = _nets(rows, table), patch, params, rows.dtype.type(collapsed)
     parallel(_fill_normals, len(out), *given, out, work=60 * len(out))
 
@@ -108,7 +111,7 @@ def normals(
 def push_normals(
     collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray
 ) -> None:
-    """Fill the last array (N, 3) with the tangent of the normals; the array before it is that of the control points."""
+    """Fill the second of `moved` (N, 3) with the tangents of the normals; the first (V, 3) are those of the rows."""
     tangents, out = moved
     given = _nets(rows, table), _nets(tangents, table), patch, params, rows.dtype.type(collapsed)
     parallel(_move_normals, len(out), *given, out, work=120 * len(out))
@@ -123,7 +126,7 @@ def pull_normals(
     g: np.ndarray,
     result: np.ndarray,
 ) -> None:
-    """Add to `result` (V, 3), the gradient of the control points, from g (N, 3), the gradient of the normals."""
+    """Add to `result` (V, 3), the gradient of the rows, from g (N, 3), the gradient of the normals."""
     nets = _nets(rows, table)
     found = np.zeros((SHARES, *nets.shape), nets.dtype)
     given = nets, patch, params, rows.dtype.type(collapsed), g, found
@@ -219,9 +222,14 @@ def _pull_values(start, stop, patch, params, g, found):
 def _tangents(net, u, v, collapsed, work):
     """Fill `work` (7, 4): weights along u, their derivatives; the same along v; tangents along u and v; mixed slope.
 
+    `net` (16, 3) are the control points. The last three rows of `work` are vectors in its first three columns.
+
     Where one side of a patch is a single point, one tangent is zero, and beside it mostly rounding. The mixed slope,
     the second derivative in u and v, has the direction in which that tangent grows. It replaces the tangent, times a
-    sign. Returned are the signs for both tangents; 0 for a tangent that stays.
+    sign.
+
+    Returns:
+        The signs for the tangents along u and along v; 0 for a tangent that stays.
     """
     a, da, b, db = work[0], work[1], work[2], work[3]
     _bernstein(u, a, da)

@@ -34,7 +34,8 @@ class Mesh(TriangleSurface):
         indices: attribute name → (T, 3) integers into θ[name], or None for one row a vertex; copied.
 
     Raises:
-        InputError: tables of another shape, of no integers, or traced: topology is known while Python runs.
+        InputError: tables of another shape, of no integers, or traced: topology is known while Python runs; or a name
+            in `indices` that is reserved, such as "normal".
     """
 
     proxy_is_cheap = True
@@ -105,7 +106,10 @@ class Mesh(TriangleSurface):
         return self._reads[names]
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Meshes of fewer faces, by `rts_surfaces.decimation`; none for torch or jax vertices, normals, uv, tables."""
+        """Meshes of fewer faces, by `rts_surfaces.decimation`.
+
+        None if the vertices are of torch or jax, if θ has normals or uv, or if an attribute has a table of its own.
+        """
         from rts_surfaces.decimation import fewer_faces
 
         plain = len(self._tables) == 1 and "normals" not in theta and "uv" not in theta
@@ -128,11 +132,11 @@ class Mesh(TriangleSurface):
         return theta["vertices"]
 
     def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
-        """The mesh itself."""
+        """The mesh itself, its vertices in float32."""
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """The number of the consistently oriented piece of each face, see `TriangleSurface.pieces`; computed once."""
+        """For each face the number (T,) int16 of its piece of one orientation, see `TriangleSurface.pieces`; kept."""
         if self._pieces is None:
             self._pieces = pieces(self.faces)
         return self._pieces
@@ -151,7 +155,10 @@ class Mesh(TriangleSurface):
         return interpolate(rows, samples.ids, column, samples.params)
 
     def vertex_normals(self, vertices: Array) -> Array:
-        """Unit normals (V, 3), the area-weighted mean of those of the faces around each vertex; zero without faces."""
+        """Unit normals (V, 3): directions of the area-weighted sums over the faces around each vertex, or zero.
+
+        Those of NumPy vertices are kept until the vertices change.
+        """
         if exemplar(vertices) is not None:
             return self._vertex_normals(vertices)
         key, kept = fingerprint(vertices), self._normals

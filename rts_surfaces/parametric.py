@@ -40,14 +40,14 @@ class Geometry(abc.ABC):
 
     @abc.abstractmethod
     def meet(self, samples: Samples, rays: Rays) -> Samples:
-        """Samples on their rays, by Newton's method with `LIMITS`.
+        """Samples moved onto their rays, by Newton's method with `LIMITS`; they may change patch.
 
         Args:
             samples: ids (N, 1), params (N, 2), row and depth (K, H, W), from which the method starts.
             rays: the ray of each row, float64.
 
         Returns:
-            Samples whose `row` is −1, and whose params are zero, where a ray does not meet the surface.
+            The samples. Where a ray does not meet the surface, `row` is −1, and the sample's params are zero.
         """
 
 
@@ -85,7 +85,7 @@ class Parametric(TriangleSurface):
                     array.flags.writeable = False
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """The surface at other tolerances."""
+        """The surface at each of `TOLERANCES` but its own."""
         rates = []
         for tolerance in TOLERANCES:
             if tolerance != self.tolerance:
@@ -115,7 +115,7 @@ class Parametric(TriangleSurface):
         return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
-        """Triangles that are off the surface by less than `tolerance` pixels near outlines, and coarse elsewhere."""
+        """Triangles that are off the surface by about `tolerance` pixels at most near outlines; `coarse` elsewhere."""
         points = self.finite(inputs)
         geometry, center = self.geometry(points), self._center(points)
         tile_shapes = self.shapes(geometry)
@@ -132,14 +132,16 @@ class Parametric(TriangleSurface):
 
         Args:
             theta: θ, not traced.
-            rate: a whole number of pieces into which each side of a patch is cut, at most `tiles.MOST`; or a float, the
-                largest distance of triangles from the surface, in the units of θ.
+            rate: an integer, the number of pieces into which each side of a patch is cut, at most `tiles.MOST`: more
+                count as that; or a float, the largest distance of triangles from the surface, in the units of θ.
 
         Returns:
             Vertices (V, 3) float32 and faces (T, 3) int32, without cracks between patches that share control points.
+            Faces of no area are left out.
 
         Raises:
-            InputError: a rate of zero or less, or θ of another shape.
+            InputError: a rate of zero or less, θ of another shape, control points that are not finite, or too many
+                triangles.
         """
         self.check(theta)
         points = self.control_points(theta)
@@ -155,11 +157,11 @@ class Parametric(TriangleSurface):
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
-        """Samples where rays meet the patches, by Newton's method; samples whose rays miss are dropped."""
+        """Samples moved to where their rays meet the patches, by Newton's method; `row` is −1 where a ray misses."""
         return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:
-        """The control points in float64; an error is raised if one is NaN or infinite."""
+        """The control points in float64; an InputError if one is NaN or infinite."""
         points = np.asarray(inputs, np.float64)
         if not np.isfinite(points).all():
             bad = np.argwhere(~np.isfinite(points).all(axis=-1))

@@ -1,4 +1,4 @@
-"""Surfaces of bicubic patches, in Bézier form: 16 control points each, rows of a table that is linear in θ."""
+"""Surfaces of bicubic patches, in Bézier form: 16 control points each, named by a table, and linear in θ."""
 
 from __future__ import annotations
 
@@ -88,14 +88,14 @@ class Patches(Parametric):
 
     @abc.abstractmethod
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """The shape expected of an entry of θ without its last axis, in words; None if it is right."""
+        """The expected shape of an entry of θ, in words; None if `shape`, its own without the last axis, is right."""
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
         """The control points, as `bezier_rows` takes them."""
         return theta["points"]
 
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
-        """The shape expected of an entry of θ, in words; None if it is right."""
+        """The expected shape of the entry `name` of θ, in words; None if `shape` is right."""
         wrong = self.control_shape(shape[:-1]) if shape else "an array"
         if wrong is None and shape[-1] not in WIDTHS[name]:
             return f"a last axis of {' or '.join(map(str, WIDTHS[name]))}"
@@ -142,8 +142,8 @@ class Patches(Parametric):
 def across(sides: np.ndarray) -> np.ndarray:
     """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
 
-    Where m > 2 sides share an edge, in order of their numbers, each leads to the one m / 2 after it, cyclically. So a
-    side that is a single point leads to the patch on the other side of the point.
+    Where m > 2 sides share an edge, in order of their numbers, each leads to the one ⌊m / 2⌋ after it, cyclically. So
+    a side that is a single point leads to the patch on the other side of the point.
 
     Args:
         sides: (n, 4), the edge of each side, as in `Tiles`.

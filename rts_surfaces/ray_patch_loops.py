@@ -12,7 +12,10 @@ from rts_surfaces.bicubic_loops import compiled, first, loop
 
 @loop
 def bounds(nets, out):
-    """Fill `out` (n, 3) with upper bounds of the lengths of patches' second derivatives: in u, in u and v, in v."""
+    """Fill `out` (n, 3) with upper bounds of the lengths of second derivatives: in u, in u and v, in v.
+
+    `nets` (n, 4, 4, 3) are the patches' control points.
+    """
     for n in range(len(nets)):
         out[n] = 0
         for i in range(4):
@@ -25,7 +28,10 @@ def bounds(nets, out):
 
 @compiled
 def _differences(net, i, j):
-    """Squared lengths of the second differences that begin at control point (i, j): in u, in u and v, in v; else 0."""
+    """Squared lengths of second differences that begin at control point (i, j): in u, in u and v, in v.
+
+    0 for a difference that would leave the net.
+    """
     uu, uv, vv = 0.0, 0.0, 0.0
     for c in range(3):
         if i < 2:
@@ -84,7 +90,7 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
         across: (n, 4) int32, see `rts_surfaces.patches.across`.
         flips: (n, 4) bool, as in `rts_surfaces.tiles.Tiles`.
         ids: (N, 1) int32, the patch of each sample; changed.
-        params: (N, 2) float32, the samples' start; changed.
+        params: (N, 2) float32, the samples' start; changed, to 0 without a hit.
         row: (L, W) int32, the sample in each cell; becomes −1 where the sample's ray does not meet the surface.
         depth: (L, W) float32, to be filled with the depth of each hit; 0 without one.
         origins: (N, 3) float64.

@@ -25,7 +25,7 @@ def _dot(a, b):
 
 @compiled
 def _slopes(found, frame, slopes):
-    """Fill `slopes` (2, 3) with derivatives along s and t, from `found` (6, 3), those in the patch's parameters."""
+    """Fill `slopes` (2, 3) with derivatives in s and in t, from `found` (6, 3), a point and derivatives in (u, v)."""
     for k in range(2):
         for c in range(3):
             slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
@@ -33,13 +33,16 @@ def _slopes(found, frame, slopes):
 
 @compiled
 def _second(found, a, b, c):
-    """The component c of the second derivative along a (2,) and b (2,), directions in parameters of the patch."""
+    """The component c of the second derivative along a (2,) and b (2,), directions in (u, v), from `found` (6, 3)."""
     return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
 
 
 @compiled
 def _normal(slopes, out):
-    """Fill `out` (3,) with the unit normal and return True; if there is none, fill zeros and return False."""
+    """Fill `out` (3,) with the unit normal to `slopes` (2, 3). If there is none, see `COLLAPSED`, fill zeros.
+
+    Returns True if there is one.
+    """
     for c in range(3):
         x, y = (c + 1) % 3, (c + 2) % 3
         out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
@@ -61,8 +64,9 @@ def shapes(start, stop, found, frames, normals, places, bends):
         frames: (n, 3, 2) float64.
         normals: (n, G, G, 3), of unit length, or zero.
         places: (n, G, G, 3), the points of the grid.
-        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; without a normal, their
-            lengths. Triangles leave the surface by these components alone; the others move points within it.
+        bends: (n, 3), the largest absolute second derivatives along the normal: in s, in s and t, in t; where there is
+            no normal, their lengths. Triangles leave the surface by these components alone; the others move points
+            within it.
     """
     grid, slopes = normals.shape[1], np.empty((2, 3))
     for n in range(start, stop):
@@ -85,7 +89,7 @@ def shapes(start, stop, found, frames, normals, places, bends):
 
 @loop
 def curves(start, stop, found, frames, along, out):
-    """Fill out (E,), the largest second derivatives of edges at right angles to the edge.
+    """Fill `out` (E,): of second derivatives along edges, the largest length of the part at right angles to the edge.
 
     Args:
         start: first edge.
@@ -117,14 +121,16 @@ def curves(start, stop, found, frames, along, out):
 def outlines(
     start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
 ):
-    """Fill the allowed distances of tiles' triangles from the surface, in units of space; infinity out of view.
+    """Fill `chord`, `edge` and `facing`: allowed distances of triangles from the surface, in units of space.
+
+    Distances are infinite out of view.
 
     Args:
         start: first tile.
         stop: one after the last.
         places: (n, G, G, 3), points on a grid of each tile.
         normals: (n, G, G, 3), unit normals at these points, or zero.
-        bends: (n, 3), the largest second derivatives along the normal.
+        bends: (n, 3), the result of `shapes`.
         eye: (3,), or the direction towards the viewer if `parallel`.
         toward: (3,) unit, from the middle of the surface to the eye.
         parallel: True if rays are parallel.

@@ -1,7 +1,8 @@
 """Tiles of patches, and their triangles, which meet without cracks at any rates.
 
 A tile is a quadrilateral or a triangle, with local coordinates (s, t): the unit square, or the triangle (0, 0), (1, 0),
-(0, 1). Its rates are the numbers of pieces into which it is cut. Tiles that share an edge share its points.
+(0, 1). Rates are numbers of pieces: those into which a tile is cut along s and along t, and those into which an edge
+is cut. Tiles that share an edge share its points.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ AT_ONCE = 2048
 GRID = {4: 3, 3: 5}
 """Number of sides → points along each side of a tile, at which its shape is measured."""
 ENOUGH, FINEST = 500, 4
-"""If patches are fewer than `ENOUGH`, each is split into smaller tiles, at most `FINEST` along a side. So only tiles at
-outlines need to be fine."""
+"""Each of n quadrilateral patches is split into k × k tiles, with k = √(`ENOUGH` / n) rounded down, at least 1 and at
+most `FINEST`. So only tiles at outlines need to be fine."""
 
 Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 """(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or, for order 2,
@@ -63,7 +64,7 @@ class Tiles(NamedTuple):
     def of(
         cls, patch: np.ndarray, frames: np.ndarray, corners: np.ndarray, sides: np.ndarray, flips: np.ndarray
     ) -> Tiles:
-        """Tiles from tables whose corners and sides are named by any integers, equal for those that tiles share."""
+        """Tiles from tables whose corners and edges have any integers as names, equal where tiles share them."""
         corners, corner_tiles = _numbered(corners)
         sides, edge_tiles = _numbered(sides)
         patch, frames, flips = patch.astype(np.int32), frames.astype(np.float64), np.array(flips, bool)
@@ -76,13 +77,15 @@ class Tiles(NamedTuple):
 
 
 class Shapes(NamedTuple):
-    """Shapes of tiles, float64, from which the distances between their triangles and the surface follow.
+    """Shapes of tiles, float64, by which the distances between their triangles and the surface are estimated.
 
     Attributes:
         normals: (n, G, G, 3) normals of unit length, or zero, at a grid of G points a side.
         places: (n, G, G, 3), the points of the grid.
-        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t.
-        curves: (E,), the largest second derivatives of edges at right angles to the edge.
+        bends: (n, 3), absolute values of second derivatives along the normal: in s, in s and t, in t; each the largest
+            over the grid.
+        curves: (E,), lengths of second derivatives along edges, their parts at right angles to the edge; each the
+            largest over G points of the edge.
     """
 
     normals: np.ndarray
@@ -99,7 +102,7 @@ def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def split(tiles: Tiles) -> Tiles:
-    """Tiles cut into smaller ones, all alike, if they are quadrilaterals and fewer than `ENOUGH`; else unchanged."""
+    """Tiles cut into smaller ones, all alike, as `ENOUGH` says; triangles and many tiles are returned unchanged."""
     count, width = tiles.corners.shape
     cuts = int(np.clip(np.sqrt(ENOUGH / count), 1, FINEST))
     if width == 3 or cuts == 1:
@@ -181,7 +184,7 @@ def _slices(count: int) -> list[slice]:
 
 
 def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """Points and derivatives (n, P, 6, 3) of tiles (n,) at local coordinates (n or 1, P, 2)."""
+    """Points and derivatives (n, P, 6, 3), see `Points`, of tiles (n,) at local coordinates (n or 1, P, 2)."""
     frames, width = tiles.frames[tile][:, None], local.shape[1]
     params = frames[:, :, 0] + local[..., :1] * frames[:, :, 1] + local[..., 1:] * frames[:, :, 2]
     derivatives = points(np.repeat(tiles.patch[tile], width), params.reshape(-1, 2), 2)
@@ -228,7 +231,7 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
 
 
 def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, at which triangles keep the allowed distances."""
+    """Rates of edges (E,) and of tiles (n, 2), int32, at which triangles keep allowed distances; at most `MOST`."""
     from rts_surfaces import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
@@ -256,7 +259,7 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
         points: the surface.
         edges: (E,) int32, into how many pieces each edge is cut.
         inner: (n, 2) int32, into how many pieces each tile is cut along s and t; triangular tiles use the first alone.
-            Where a tile or an edge of it is cut at all, each number used is at least `LEAST` for its number of sides.
+            Where a tile or an edge of it is cut at all, the tile's numbers are at least `LEAST` of its number of sides.
 
     Returns:
         Vertices and faces; ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2), (u, v) in that patch.

@@ -39,7 +39,7 @@ def _put(frame, s, t, out):
 
 @loop
 def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within tiles; t changes fastest."""
+    """Fill `patch` (V,) and `params` (V, 2) at points within tiles; t changes fastest. See `quadrilaterals`."""
     for n in range(len(inner)):
         v, rs, rt = inner_first[n], inner[n, 0], inner[n, 1]
         for i in range(1, rs):
@@ -51,7 +51,7 @@ def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
 
 @loop
 def within_triangles(owner, frames, inner, inner_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within triangular tiles; s changes fastest."""
+    """Fill `patch` (V,) and `params` (V, 2) at points within triangular tiles; s changes fastest. See `triangles`."""
     for n in range(len(inner)):
         v, r = inner_first[n], inner[n, 0]
         for j in range(1, r):
@@ -63,7 +63,7 @@ def within_triangles(owner, frames, inner, inner_first, patch, params):
 
 @compiled
 def _count(rates, sides, edges):
-    """The number of triangles of a tile with these rates (2,) and sides (k,)."""
+    """The number of triangles of a tile with these rates (2,) and sides (k,); `edges` (E,) are the rates of edges."""
     width, rs, rt = len(sides), rates[0], rates[1]
     if rs == 1:
         return width - 2
@@ -75,7 +75,7 @@ def _count(rates, sides, edges):
 
 @loop
 def counted(inner, sides, edges):
-    """The number of triangles of all tiles."""
+    """The number of triangles of all tiles, from rates `inner` (n, 2) and `edges` (E,)."""
     total = 0
     for n in range(len(inner)):
         total += _count(inner[n], sides[n], edges)
@@ -84,7 +84,7 @@ def counted(inner, sides, edges):
 
 @loop
 def counts(inner, sides, edges, first):
-    """Fill first (n + 1,): the index of the first triangle of each tile, and last the number of all triangles."""
+    """Fill `first` (n + 1,): the index of the first triangle of each tile, and last the number of all triangles."""
     first[0] = 0
     for n in range(len(inner)):
         first[n + 1] = first[n] + _count(inner[n], sides[n], edges)
@@ -102,7 +102,10 @@ def _set(faces, params, t, place, vertex, frame, x, y):
 
 @compiled
 def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
-    """Set corner `place` of triangle t to point k, from 0 to `cuts`, of a side of tile n."""
+    """Set corner `place` of triangle t to point k, from 0 to `cuts`, of a side of tile n.
+
+    `base` is the first of the vertices within the side's edge.
+    """
     width = corners.shape[1]
     if k == 0 or k == cuts:
         vertex = corners[n, side if k == 0 else (side + 1) % width]
@@ -123,7 +126,10 @@ def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
 
 @compiled
 def _square(faces, params, t, i, j, rs, rt, frame, base):
-    """Set both triangles, t and t + 1, of the cell at (i, j) of a tile's inner grid. Returns t + 2."""
+    """Set both triangles, t and t + 1, of a cell between points within a tile. Returns t + 2.
+
+    The cell's lowest point is (i, j), counted along s and t from (1, 1); border points of the tile have 0, rs or rt.
+    """
     for half in range(2):
         for k in range(3):
             # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
@@ -135,7 +141,7 @@ def _square(faces, params, t, i, j, rs, rt, frame, base):
 
 @compiled
 def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
-    """Set corner `place` of triangle t to point m, from 1 on, of the ring within a tile, along a side."""
+    """Set corner `place` of triangle t to point m, from 1 on, of the points within a tile that are next to a side."""
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
     j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
     _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
@@ -201,7 +207,7 @@ def _triangle_point(faces, params, t, place, i, j, r, frame, base):
 
 @compiled
 def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
-    """Set corner `place` of triangle t to point m, from 1 on, of the ring within a triangular tile, along a side."""
+    """As `_square_ring`, of a triangular tile."""
     i = m if side == 0 else r - 1 - m if side == 1 else 1
     j = 1 if side == 0 else m if side == 1 else r - 1 - m
     _triangle_point(faces, params, t, place, i, j, r, frame, base)
@@ -209,7 +215,10 @@ def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
 
 @loop
 def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
-    """Fill the triangles of triangular tiles; arguments as for `quadrilaterals`, with three sides."""
+    """Fill the triangles of triangular tiles; arguments as for `quadrilaterals`, but (n, 3) corners, sides, flips.
+
+    Of `inner` the first column alone is used.
+    """
     faces, ids, params = out
     for n in range(start, stop):
         r, t, base, frame = inner[n, 0], first[n], inner_first[n], frames[n]

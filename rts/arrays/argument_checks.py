@@ -16,7 +16,10 @@ Shape = tuple[int, ...]
 
 
 def quoted(value: Any) -> str:
-    """A value for an error message, in one line of at most 60 characters."""
+    """A value for an error message, in one line: its repr, cut to 60 characters, or the name of a function.
+
+    An array of several axes, or of more than 4 numbers, is told by its type and shape instead.
+    """
     shape = shape_of(value)
     if len(shape) > 1 or max(shape, default=0) > 4:
         return kind_of(value)
@@ -27,13 +30,15 @@ def quoted(value: Any) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """The message of a foreign error, in one line of at most 120 characters."""
+    """The message of a foreign error, or its type if it has none, in one line of at most 120 characters."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 120 else f"{text[:117]}..."
 
 
 def check_numbers(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
-    """Refuse anything but a finite real array, or list of numbers, of one of these shapes.
+    """Raise an `InputError` unless a value is a finite real array, or list of numbers, of one of these shapes.
+
+    The shape () is that of a number. Of traced values only shape and dtype are checked.
 
     Returns:
         The value as NumPy; None if it is traced, or batched by `vmap`.
@@ -70,13 +75,13 @@ def _shape_and_dtype(value: Any) -> tuple[Shape, Any]:
 
 
 def check_flag(name: str, value: Any) -> None:
-    """Refuse anything but True and False."""
+    """Refuse anything but True and False, Python's or NumPy's."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{name} is {quoted(value)}; expected True or False")
 
 
 def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
-    """`check_numbers` that also refuses numbers of zero or less; without shapes, one number is expected."""
+    """`check_numbers` that also refuses numbers of zero or less; without shapes, a single number is expected."""
     array = check_numbers(name, value, *(shapes or ((),)))
     if array is not None and not (array > 0).all():
         raise InputError(
@@ -86,7 +91,10 @@ def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
 
 
 def check_planes(near: Any, far: Any, *, positive: bool) -> None:
-    """Refuse near and far planes in the wrong order, if their values are known."""
+    """Refuse depths of planes unless both are finite numbers with near < far, and near > 0 if `positive`.
+
+    Traced depths pass.
+    """
     a, b = check_numbers("near", near, ()), check_numbers("far", far, ())
     if a is not None and b is not None and not a < b:
         raise InputError(f"near is {quoted(near)} and far is {quoted(far)}; expected finite numbers with near < far")
@@ -95,7 +103,7 @@ def check_planes(near: Any, far: Any, *, positive: bool) -> None:
 
 
 def check_rotation(name: str, matrix: Any) -> None:
-    """Refuse anything but a (3, 3) rotation, to about three digits."""
+    """Refuse anything but a (3, 3) rotation, within `ROTATION_TOLERANCE`; traced (3, 3) matrices pass."""
     rotation = check_numbers(name, matrix, (3, 3))
     if rotation is None:
         return
@@ -106,11 +114,11 @@ def check_rotation(name: str, matrix: Any) -> None:
 
 
 ROTATION_TOLERANCE = 2e-3
-"""Largest accepted difference of R Rᵀ from the identity: rotations written with three digits pass."""
+"""Largest accepted difference of an entry of R Rᵀ from the identity's: rotations written with three digits pass."""
 
 
 def is_invertible(matrix: np.ndarray) -> bool:
-    """True if a matrix has an inverse, once its rows and columns are scaled to length one."""
+    """True if the singular values of a matrix, its rows and then columns scaled to length one, are within 1e12 : 1."""
     for axis in (1, 0):
         length = np.linalg.norm(matrix, axis=axis, keepdims=True)
         matrix = matrix / np.where(length > 0, length, 1)
@@ -119,7 +127,7 @@ def is_invertible(matrix: np.ndarray) -> bool:
 
 
 def check_pixels(size: Any) -> tuple[int, int]:
-    """The size (height, width) as integers; anything but two positive ones is refused."""
+    """The size (height, width) as Python integers; refused unless it holds two positive whole numbers."""
     if type(size) is tuple and len(size) == 2 and type(size[0]) is int is type(size[1]) and min(size) > 0:
         return size
     try:

@@ -14,17 +14,19 @@ from rts.errors import EngineError, InputError
 
 
 def from_numbers(tree: Tree, name: str = "an array") -> Tree:
-    """A copy of a tree whose leaves are arrays or numbers that the library can work with.
+    """The tree with leaves that the library can work with: arrays, Python's numbers, and None.
 
-    Every list or tuple that holds only numbers, nested or not, becomes a float32 array. NumPy arrays of foreign byte
-    order, of half and of extended precision become ordinary ones.
+    A list or tuple of Python's numbers, nested or not, becomes a float32 array, unless it is empty or a named tuple.
+    NumPy arrays of foreign byte order become native ones; half precision becomes float32, extended precision float64.
+    Other arrays are not copied.
 
     Args:
         tree: nested dicts, lists, tuples and records.
         name: the name in error messages.
 
     Raises:
-        InputError: a leaf is no array, is complex, or cannot be used, such as a sparse tensor.
+        InputError: a leaf is no array, is complex, or cannot be used, such as a sparse tensor; a list has rows of
+            different lengths; or a key is no string.
         EngineError: a leaf is an array of an unknown framework.
     """
     kind = type(tree)
@@ -80,7 +82,7 @@ _ORDINARY = frozenset(np.dtype(t) for t in "? b h i l q B H I L Q f d".split())
 
 
 def _ordinary(array: np.ndarray, name: str) -> np.ndarray:
-    """A copy of an array in an ordinary dtype."""
+    """A copy of an array in a dtype of `_ORDINARY`; refused if it holds no real numbers."""
     dtype = array.dtype.newbyteorder("=")
     if dtype.kind == "f" and dtype not in _ORDINARY:
         dtype = np.dtype(np.float32 if dtype.itemsize < 4 else np.float64)
@@ -104,7 +106,7 @@ def described(x: Any) -> str:
 
 
 def kind_of(x: Any) -> str:
-    """The kind of a value for error messages: "a torch.Tensor of shape (2, 3)", "a str", "None"."""
+    """The type of a value, and an array's shape, for messages: "a torch.Tensor of shape (2, 3)", "a str", "None"."""
     if x is None:
         return "None"
     kind, shape = type(x), shape_of(x)
@@ -113,9 +115,10 @@ def kind_of(x: Any) -> str:
 
 
 def promote(*values: Any) -> tuple[Any, list[Array]]:
-    """The array-API namespace of the arguments, and the arguments as floating arrays of one engine.
+    """The array-API namespace of the arguments, and the arguments as arrays of one engine.
 
-    Numbers and lists become arrays. If all arguments are NumPy arrays or numbers, the result is float64.
+    NumPy arrays, numbers and lists of numbers become float64 if all arguments are such. Beside torch or jax arrays
+    they become floating constants like the widest of those, which stay as they are. A list of scalar arrays is stacked.
     """
     owner = OWNERS.get(type(values[0]))
     if owner is not None:
@@ -146,7 +149,7 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
 
 
 def unit(x: Array) -> Array:
-    """Vectors scaled to length one; a zero vector stays zero, with zero derivative."""
+    """Vectors scaled to length one; a zero vector stays zero, and has the identity for derivative."""
     xp = namespace(x)
     square = dot(x, x)
     safe = xp.where(square > 0, square, xp.ones_like(square))
@@ -154,7 +157,7 @@ def unit(x: Array) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Scalar products (…, 1) of vectors (…, C) of a few numbers."""
+    """Scalar products (…, 1) of short vectors (…, C)."""
     engine, products = engine_of(a, b), a * b
     if engine.differentiates:
         return engine.namespace.sum(products, axis=-1, keepdims=True)

@@ -20,8 +20,8 @@ from rts.plugin_base import Plugin, check_members
 class Engine(Plugin):
     """An array framework, chosen by the type of the arrays, never a global setting.
 
-    The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the user
-    has imported that module.
+    The entry point's name must be the name of the framework's top-level module: only engines whose module has been
+    imported are asked whether they own an array.
 
     Attributes:
         name: the name of its entry point.
@@ -41,15 +41,18 @@ class Engine(Plugin):
 
     @abc.abstractmethod
     def constant(self, value: Any, like: Array | None = None) -> Array:
-        """An array with no derivative on the device of `like`; floats take the dtype of `like`, or are float32."""
+        """A NumPy array or number as an array without derivative, on the device of `like`.
+
+        Floats take the dtype of `like`; without it the engine's default, such as float32.
+        """
 
     @abc.abstractmethod
     def call_host(self, fn: Callable, specs: Sequence[Any], *args: Array) -> tuple[Array, ...]:
-        """Call `fn` on NumPy copies of `args`; the results carry no derivative and live where `args` do.
+        """Call `fn` on NumPy views or copies of `args`; the results carry no derivative and live where `args` do.
 
         Args:
             fn: host arrays → as many host arrays as there are specs.
-            specs: an `ArraySpec` for each result.
+            specs: an `ArraySpec` for each result; where it says `packed`, the engine may append rows of zeros.
             *args: arrays.
         """
 
@@ -59,7 +62,7 @@ class Engine(Plugin):
 
     @abc.abstractmethod
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
-        """Sums (count, C) of rows of `values` (M, C); `segments` (M,) holds the index of the sum of each row."""
+        """Sums (count, C) of rows of `values` (M, C); `segments` (M,) integers say which sum each row goes to."""
 
     @abc.abstractmethod
     def to_numpy(self, x: Array) -> np.ndarray:
@@ -67,7 +70,7 @@ class Engine(Plugin):
 
     @staticmethod
     def records() -> Iterator[tuple[type, Callable[[Any], tuple], Callable[[Iterable[Any], tuple], Any]]]:
-        """Records to register as pytrees: the class, a function to (arrays, other fields), and its inverse."""
+        """Classes to register as pytrees, with functions record → (arrays, others) and (arrays, others) → record."""
         for cls in STATIC_FIELDS:
             yield cls, split_record, functools.partial(join_record, cls)
 
@@ -78,22 +81,22 @@ class Engine(Plugin):
         raise self._no_derivatives()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
-        """The value of `f` and its derivative along `tangent`, differentiable in arrays that `f` closes over."""
+        """The value `f(primal)` and its derivative along `tangent`, differentiable in arrays that `f` closes over."""
         raise self._no_derivatives()
 
     def jacobian(self, f: Callable) -> Callable:
-        """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, by forward mode.
+        """Turn `f(vector) -> arrays` into `vector -> (arrays, derivatives)`, by forward mode.
 
-        The first axis of derivatives is that of the vector.
+        The derivatives of each array have a new first axis, that of the vector.
         """
         raise self._no_derivatives()
 
     def optimizer(
         self, method: Any, learning_rate: float | Sequence[float], parameters: Tree, given: Tree = None
     ) -> Callable[[Tree, Tree], Tree]:
-        """A step function `(parameters, gradient) -> parameters` with its own state.
+        """A function `(parameters, gradient) -> new parameters`, a step of a first-order optimiser.
 
-        To be kept in checkpoints, the function is an object with two more methods: `state() -> bytes`, and
+        It keeps state, perhaps the parameters too: call it with the parameters that it returned last. To be kept in checkpoints, the function is an object with two more methods: `state() -> bytes`, and
         `restore(state, parameters)`, which goes on from there.
 
         Args:
@@ -143,7 +146,7 @@ class Engine(Plugin):
     # -------------------------------------------------------------------------------- methods for speed and compilers
 
     def apply(self, operation: Any, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
-        """The result of an operation. The default runs its specification; override it to run compiled code."""
+        """The result of an operation. The default runs its array code (the specification), overrides compiled code."""
         return operation.specification(*operands, **params)
 
     def on_host(self, *arrays: Array) -> bool:
@@ -151,9 +154,9 @@ class Engine(Plugin):
         return False
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
-        """Call `f` with the arrays if `on_host` holds for them, else `otherwise`; both return the same results.
+        """Call `f` with the arrays if `on_host` holds for them, else `otherwise`; both return equal tuples of arrays.
 
-        A traced program chooses between the two once its device is known.
+        An engine may let a traced program choose when it runs, once its device is known.
         """
         return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
 
@@ -162,7 +165,7 @@ class Engine(Plugin):
         return False
 
     def plain(self, x: Array) -> bool:
-        """True if `admitted` would return the array itself. Called for every array that a user gives."""
+        """True if `admitted` is known to return the array itself, and is not called then."""
         return False
 
     def admitted(self, x: Array, name: str) -> Array:
@@ -178,13 +181,13 @@ class Engine(Plugin):
         return x
 
     def padded(self, x: Array) -> bool:
-        """True if packed arrays like this one may have rows that no cell refers to."""
+        """True if packed arrays, which have a row for each sample, may have further rows that no cell refers to."""
         return False
 
     def fill_unused(self, x: Array, row: Array) -> Array:
-        """Packed x (N, ·), with its first row in place of every row that no cell of `row` (K, H, W) refers to.
+        """Packed x (N, ·), with its first row in place of all rows behind the last that `row` (K, H, W) refers to.
 
-        Only called if `padded(row)` is True.
+        If it refers to none, all are ones. Only called if `padded(row)` is True; the default returns `x`.
         """
         return x
 
@@ -223,25 +226,25 @@ class Engine(Plugin):
     def map_rows(self, f: Callable[[Array], Array], rows: Array, size: int) -> Array:
         """The values `f(rows)` of a function that treats each row by itself, `size` rows at a time.
 
-        For more rows than memory has room for at once. It has no derivatives.
+        Use it for more rows than memory has room for at once. Engines need not differentiate it.
 
         Args:
             f: rows (size, ·) → (size, ·).
             rows: (M, ·).
-            size: the number of rows of one call; the last call may have fewer.
+            size: the number of rows of one call; the last call may have fewer, or be padded with zeros.
         """
         parts = [f(rows[i : i + size]) for i in range(0, rows.shape[0], size)]
         return parts[0] if len(parts) == 1 else self.namespace.concat(parts)
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
-        """The result of `f(make())`, computed once more for its gradient instead of keeping intermediate arrays.
+        """The result of `f(make())`. For its gradient `f` may run again, so that no intermediate arrays are kept.
 
-        `make` has no derivative. An engine may keep its result instead of calling it again.
+        `make` has no derivative. The engine runs it again, too, or keeps its tree.
         """
         return f(make())
 
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
-        """The gradient (N, C) of a function of rows (N, C) whose values (N,) depend on their own rows alone.
+        """The gradient (N, C) of a function of rows (N, C) of which each value (N,) depends on its own row alone.
 
         Differentiable in the rows and in arrays that `f` closes over. The default takes C derivatives in forward mode.
         """
@@ -270,7 +273,7 @@ class Engine(Plugin):
     def take_error(self) -> RtsError | None:
         """The last error raised inside a host call, handed out once; None if there is none.
 
-        For frameworks that wrap such errors in their own.
+        It is for frameworks that wrap such errors in their own.
         """
         return None
 
@@ -302,7 +305,8 @@ def engine_named(name: str) -> Engine:
     """The only instance of a named engine, loaded on first use.
 
     Raises:
-        PluginError: the engine cannot be loaded.
+        InputError: no engine has this name.
+        PluginError: the engine cannot be loaded, or is no `Engine`.
     """
     if name not in _ENGINES:
         engine = registry.plugin("rts.engines", name)()
@@ -324,7 +328,7 @@ def _owner(x: Any) -> Engine:
 
 
 def engine_of(*trees: Tree) -> Engine:
-    """The engine of the arrays in these trees; NumPy arrays and Python numbers go with any.
+    """The engine of the arrays in these trees. NumPy arrays and Python numbers go with any; alone, they have NumPy's.
 
     Raises:
         EngineError: arrays of two engines, or of an unknown type.
@@ -369,7 +373,7 @@ class Context(NamedTuple):
     like: Array | None
 
     def constants(self, tree: Tree) -> Tree:
-        """A copy of a tree in which every NumPy array and number is a constant of the engine."""
+        """The tree with every NumPy array and number made a constant of the engine."""
         if tree is None or type(tree) in OWNERS:  # The usual case.
             return tree
         return constants(tree, self.engine, self.like)
@@ -384,13 +388,17 @@ def context_of(*trees: Tree) -> Context:
 def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> Context:
     """The engine of a scene, and an array of its dtype: the one rule for dtypes.
 
-    The dtype is the widest floating one of the torch or jax arrays. If all arrays are NumPy, it is float64 if some θ
-    holds a float64 array, else float32. NumPy cameras, transforms and backgrounds are constants, and widen nothing.
+    The dtype is the widest floating one of the torch or jax arrays. Without these, it is float64 if some θ holds a
+    float64 array, else float32. NumPy cameras, transforms and backgrounds are constants, and widen nothing.
 
     Args:
         parts: the parts.
         *others: further arrays of the scene, such as cameras.
         engine: the name of an engine to use in any case; arrays of another one are refused.
+
+    Raises:
+        InputError: `engine` is no name of an engine.
+        EngineError: arrays of two engines, or of another one than `engine`.
     """
     own, like = context_of(parts, *others)
     if engine is not None:
@@ -430,7 +438,7 @@ def load_engines() -> None:
 
 
 def _imported() -> list[Engine]:
-    """The engines whose framework has been imported."""
+    """The engines whose framework has been imported, loaded now if need be; broken ones are left out."""
     if not _names:
         _names.extend(registry.plugins("rts.engines"))
     engines = []
@@ -479,7 +487,7 @@ def value_of(x: Array) -> np.ndarray | None:
 
 
 def exemplar(*trees: Tree) -> Array | None:
-    """The widest floating array of another engine than NumPy, or None. It sets dtype and device of constants."""
+    """The widest floating array that is not NumPy's, or None. It sets dtype and device of constants."""
     return _widest(collected(trees))
 
 
@@ -521,7 +529,7 @@ def stopped(tree: Tree) -> Tree:
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
-    """A copy of a tree in which every NumPy array and number is a constant of the engine; see `Engine.constant`."""
+    """The tree with every NumPy array and number made a constant of the engine; see `Engine.constant`."""
     if tree is None or type(tree) in OWNERS:
         return tree
     if type(tree) is np.ndarray:

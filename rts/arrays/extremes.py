@@ -27,7 +27,7 @@ def extent(x: np.ndarray) -> tuple[int, int]:
 
 
 def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """A bool mask of the non-negative indices, and the least and the largest of all; −1 takes part in both."""
+    """A bool mask, true where integers `x` are not negative; the least of them and −1; the largest of them and −1."""
     if not x.size:
         return np.zeros(x.shape, np.bool_), -1, -1
     if x.dtype == np.int32:
@@ -49,7 +49,10 @@ def _ends(x: np.ndarray, mask: np.ndarray) -> tuple[int, int]:
 
 
 def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
-    """Indices of the least covered number, if below zero, and of the largest, if above; of equals the first."""
+    """Index tuples of the least covered number, if negative, then of the largest, if positive; the first of equal ones.
+
+    `covered` is a bool mask of the shape of `x`, floats.
+    """
     if x.dtype != np.float32:
         sizes = np.where(covered, x, 0).reshape(1, -1)
         extremes, length = np.concatenate([-sizes, sizes]).max(axis=1, initial=0)[None], x.size

@@ -13,9 +13,10 @@ UNSIGNED = np.int32(2**31 - 1)
 
 @loop
 def find(first, last, bits, maxima):
-    """Fill `maxima` with the largest absolute value in each chunk of floats, given and returned as `bits`, int32.
+    """Fill `maxima`, for chunks [first, last) of float32 numbers, with their largest absolute value, or NaN.
 
-    Without the sign bit, bits are in the order of the floats, and NaN comes last.
+    Numbers are given and returned as their bits, int32. Without the sign bit, bits are in the order of the floats, and
+    NaN comes last.
     """
     for chunk in range(first, last):
         most, block = np.int32(0), bits[chunk * CHUNK : (chunk + 1) * CHUNK]
@@ -26,9 +27,9 @@ def find(first, last, bits, maxima):
 
 @loop
 def ends(first, last, numbers, extremes, mask):
-    """Fill `extremes` (·, 2) with the least and the largest of each chunk of int32.
+    """Fill `extremes` (·, 2), for chunks [first, last) of int32 `numbers`, with the least and the largest.
 
-    `mask`, unless empty, is set where numbers are not negative.
+    Unless empty, `mask` is filled with True where numbers are not negative, else False.
     """
     for chunk in range(first, last):
         block = numbers[chunk * CHUNK : (chunk + 1) * CHUNK]
@@ -43,9 +44,9 @@ def ends(first, last, numbers, extremes, mask):
 
 @loop
 def bounds(first, last, bits, covered, sizes):
-    """Fill `sizes` (·, 2) with the largest distances below and above zero of covered floats in each chunk, as bits.
+    """Fill `sizes` (·, 2), for chunks [first, last), with the largest distances of covered floats below and above zero.
 
-    Bits are below zero where the float has a sign.
+    Floats are given and returned as their bits, int32, which are negative where the float is.
     """
     zero = np.int32(0)
     for chunk in range(first, last):

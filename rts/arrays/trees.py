@@ -45,7 +45,7 @@ def record_arrays(value: Any) -> list[Any]:
 
 
 def split_record(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
-    """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
+    """A record's array fields in order of declaration, and its static fields in the order of `STATIC_FIELDS`."""
     values = value.__dict__
     return record_arrays(value), tuple([values[name] for name in STATIC_FIELDS[type(value)]])
 
@@ -63,7 +63,7 @@ def join_record(cls: type, arrays: Iterable[Any], static: tuple[Any, ...]) -> An
 
 
 def leaves(tree: Tree) -> Iterator[Any]:
-    """The leaves of nested dicts, lists, tuples and records, in a fixed order; None has none."""
+    """The leaves of nested dicts, lists, tuples and records, in a fixed order: dicts by sorted key. None has none."""
     return iter(collected(tree))
 
 
@@ -121,7 +121,7 @@ def placed_leaves(tree: Tree, place: tuple = ()) -> Iterator[tuple[tuple, Any]]:
 
 
 def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
-    """A copy of a tree with `fn` applied to each leaf, visited in the order of `leaves`."""
+    """A copy of a tree with `fn` applied to each leaf, in the order of `leaves`; None stays None."""
     kind = _KINDS.get(type(tree)) or _kind(tree)
     if kind == _LEAF:
         return fn(tree)

@@ -57,7 +57,10 @@ def ground(height: float, half: float = 4.2, squares: int = 12) -> Part:
 
 
 def run(folder: Path, engine: str | None = None, progress: bool | None = None) -> tuple[PoseFit, list[Path]]:
-    """Recover the knot's pose, and write pictures, animation, summary.json and summary.md."""
+    """Recover the knot's pose, and write pose.json, pictures, animation, summary.json and summary.md.
+
+    Returns the fit and the files written. `engine` and `progress` are as in `fit_pose`.
+    """
     model = [knot()]
     bounds = bounds_of(model)
     floor = ground(float(bounds.center[1] - 1.02 * bounds.radius))

@@ -50,7 +50,7 @@ class _Group(TyperGroup):
         return found
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Let --debug stand anywhere; without arguments, show the help."""
+        """Let --debug stand anywhere before "--"; without arguments, show the help."""
         end = args.index("--") if "--" in args else len(args)
         if "--debug" in args[:end]:
             args = ["--debug", *(a for a in args[:end] if a != "--debug"), *args[end:]]
@@ -94,7 +94,10 @@ def _as_command(name: str, found: Any, settings: dict[str, Any] | None = None) -
 
 @contextlib.contextmanager
 def _one_line(ctx: Any) -> Iterator[None]:
-    """Turn errors into a line on standard error and an exit code: 2 for wrong usage, else 1."""
+    """Turn expected errors into a line on standard error and an exit code: 2 for wrong usage, else 1.
+
+    With --debug, errors other than wrong usage are raised as they are.
+    """
     try:
         yield
     except UsageError as error:

@@ -24,6 +24,9 @@ def write_mesh(path: Path, parts: Sequence[Part], tolerance: float) -> tuple[int
 
     Returns:
         The numbers of vertices and triangles.
+
+    Raises:
+        InputError: the transform of a part is singular.
     """
     import trimesh
 

@@ -62,7 +62,7 @@ class PoseFit(NamedTuple):
 
 
 def available_engine() -> str:
-    """The name of an installed engine with derivatives, torch before jax."""
+    """The name of an installed engine with derivatives, torch before jax; a PluginError if there is none."""
     preferred = ["torch", "jax"]
     others = [name for name in registry.plugins("rts.engines") if name not in preferred]
     for name in (*preferred, *others):
@@ -75,7 +75,7 @@ def silhouette_of(image: np.ndarray) -> np.ndarray:
     """The silhouette (H, W) float32 in [0, 1] of a picture (H, W, 4): its alpha, or, if it is opaque, its luminance.
 
     Raises:
-        InputError: no pixel, or every pixel, is inside.
+        InputError: no pixel, or every pixel, is inside; above 0.5 is inside.
     """
     alpha = image[..., 3]
     mask = alpha if (alpha < 1).any() else image[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -116,7 +116,7 @@ def fit_pose(
         target: (H, W) silhouette.
         camera: the camera of the target, float64 NumPy and perspective, with its ratio of width to height.
         bounds: the bounds of the model; translations are fitted in units of their radius, to weigh like radians.
-        engine: "torch" or "jax"; by default the one installed.
+        engine: "torch" or "jax"; by default the one that is installed, torch before jax.
         method: as in `rts.fit`.
         steps: the largest number of steps at each resolution; by default that of `rts.fit`.
         fit_fov: whether the camera's field of view is fitted, too.

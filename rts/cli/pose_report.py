@@ -81,13 +81,13 @@ def _numbers(result: PoseFit) -> dict[str, Any]:
 
 
 def _moved(before: Pose, after: Pose) -> bool:
-    """True if a step is visible."""
+    """True if a step changes an entry of the pose or of the projection by enough to be seen, 1e-4."""
     changes = after.matrix - before.matrix, after.camera.projection - before.camera.projection
     return max(float(np.abs(c).max()) for c in changes) > 1e-4
 
 
 def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """A picture of the model in the scene, with the outline of the target drawn over it."""
+    """A picture (H, W, 3), linear, of parts, with the outline of the target `mask` (H, W) drawn over it."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     paper = np.asarray(PAPER) + 0.6 * mask[..., None] * (np.asarray(MARKED) - PAPER)
@@ -98,7 +98,7 @@ def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.nda
 
 
 def _plot(path: Path, history: list[float]) -> list[Path]:
-    """Plot the loss over the steps. Returns the file, or nothing if matplotlib is missing."""
+    """Plot the loss over the steps. Returns a list of the file, or an empty one if matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:

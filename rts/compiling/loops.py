@@ -24,7 +24,7 @@ except ImportError:  # Windows.
     fcntl = None
 
 TOLD_AFTER = 1.0
-"""Seconds of compilation after which a message appears on the terminal."""
+"""Seconds of compilation, summed over a process, after which a message appears on the terminal."""
 
 LOOP = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
 """numba's options of loops: no interpreter lock, no wrapper that C code could call, no error for a division by zero.
@@ -35,7 +35,7 @@ of options.
 
 
 def loop(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
+    """Compile a loop that Python calls; kept on disk, and run without the interpreter lock. `options` are numba's."""
     options = LOOP | options
 
     def decorate(function: Callable) -> Any:
@@ -103,8 +103,8 @@ class _Cache(FunctionCache):
 class _Watch(event.Listener):
     """Listener to the compilation of the library's loops and their helpers. The compiler holds its lock meanwhile.
 
-    It prints one message if compilation takes long. It also pauses garbage collection, which would take a tenth of the
-    time, since compilation makes many objects.
+    It prints one message once all compilations together have taken `TOLD_AFTER` seconds. It also pauses garbage
+    collection, which would take a tenth of the time, since compilation makes many objects.
     """
 
     def __init__(self) -> None:

@@ -43,7 +43,7 @@ _local = threading.local()
 
 
 def cores() -> set[int]:
-    """The cores that this thread may run on; for a helper, those of its caller's thread. Only Linux knows them."""
+    """The cores that this thread may run on; for a helper, those of its caller's thread. Call it on Linux alone."""
     return getattr(_local, "cores", None) or os.sched_getaffinity(0)
 
 
@@ -52,8 +52,8 @@ class _Job:
 
     Attributes:
         work: the function to call.
-        cores: the cores of the caller's thread, if the system knows them.
-        roams: whether the work may run on all of these, the caller's current core included.
+        cores: the cores of the caller's thread; None if the system does not know them.
+        roams: whether the work may run on all of these cores, the caller's current one included.
         error: the error that the work raised, or None.
     """
 
@@ -108,7 +108,7 @@ class _Helpers:
         return max(0, count - len(self._under_way))
 
     def start(self, count: int) -> None:
-        """Start helpers until there are `count`."""
+        """Start helpers until there are `count`, or as many as the system gives."""
         if self.count >= count:
             return
         with self._lock:
@@ -124,7 +124,7 @@ class _Helpers:
                 self._placed = None
 
     def keep_off(self, core: int, cores: set[int]) -> None:
-        """Have idle helpers run on `cores` without one of them, `core`.
+        """Have helpers run on `cores` without `core`, if they have another; nothing changes while a helper works.
 
         On two cores Linux often wakes a thread on its waker's core, though the other is idle. The thread would
         wait there until the loop is over.
@@ -139,7 +139,7 @@ class _Helpers:
                     _place(thread, cores)
 
     def ask(self, job: _Job) -> None:
-        """Give a job to one of the helpers."""
+        """Queue a job for the next idle helper."""
         self._jobs.put(job)
 
     def _serve(self) -> None:
@@ -187,7 +187,7 @@ if sys.platform != "win32":
 
 
 def thread_count() -> int:
-    """Number of threads to use: RTS_NUM_THREADS of the environment, or else of the cores this process may run on."""
+    """Number of threads to use: RTS_NUM_THREADS of the environment, or else the number of cores for this process."""
     wanted = os.environ.get("RTS_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
@@ -195,20 +195,22 @@ def thread_count() -> int:
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """A contiguous, read-only view, copied only if necessary. Loops are compiled for read-only arrays."""
+    """A C-contiguous, read-only view of `x`, in `dtype` if given; of a copy if need be. Loops take such arrays."""
     view = np.asarray(x, dtype, order="C").view()
     view.flags.writeable = False
     return view
 
 
 def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
-    """Call `loop(start, stop, *args)` on all cores, in ranges that cover [0, count).
+    """Call `loop(start, stop, *args)` on all cores, in ranges that together cover [0, count).
+
+    The caller's thread alone runs a loop of little `work`. An error in a range ends the loop and is raised.
 
     Args:
         loop: a function of (start, stop, *args) that releases the interpreter lock.
         count: the end of the range.
         *args: passed on.
-        work: rough time on one thread, nanoseconds.
+        work: rough time of all ranges on one thread, nanoseconds.
         apart: whether helpers must stay off the caller's core all the time. The loop must then start no threads, which
             would have to stay off as well.
     """
@@ -251,7 +253,7 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
 
 
 def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-    """The results of a function for each item, computed on all cores; loops that the function calls use idle ones.
+    """A function's results for all items, computed on all cores; loops that the function calls use idle cores.
 
     If the function fails for several items, the error is that of the first; items after it may be left out.
 

@@ -18,17 +18,19 @@ from rts.errors import InputError, RtsError
 
 FIRST = ("picture",)
 OTHERS = ("least_squares", "gradient_of_vertices", "adaptive", "gradient_of_crossing", "least_squares_of_mask")
-"""Names of calls in `warmup_calls`. The first compiles what all share; the others follow at once, the longest first."""
+"""Names of calls in `warmup_calls`. The first compiles what all share; then the others run together, longest first."""
 
 
 def warmup(processes: int | None = None) -> float:
     """Compile ahead what ordinary renders and fits of meshes use, and keep it on disk.
 
     Loops are otherwise compiled when they are first called, once for each installation: the first render takes long.
-    If all loops are compiled already, it takes seconds. Loops are for float32; those of derivatives need torch or jax.
+    If all loops are compiled already, it takes seconds. Only loops for float32 are compiled; those of derivatives only
+    if torch or jax is installed.
 
     Args:
-        processes: number of processes at once; None for as many as there are cores for this process.
+        processes: number of processes at once; more than five change nothing. None for `RTS_NUM_THREADS` of the
+            environment, or else the number of cores.
 
     Returns:
         Seconds that it took.

@@ -57,7 +57,7 @@ def adaptive() -> None:
 
 
 def gradient_of_vertices() -> None:
-    """Differentiate a picture of one part in its vertices, and in its pose."""
+    """Differentiate a picture of one part in its vertices, and in its pose, if torch or jax is installed."""
     part = octahedra()[0]
     if (found := engine()) is not None:
         array, gradient = found
@@ -69,7 +69,7 @@ def gradient_of_vertices() -> None:
 
 
 def gradient_of_crossing() -> None:
-    """Differentiate a picture of two parts in their pose, and a silhouette."""
+    """Differentiate a picture of two parts, and one of a silhouette, in the parts' pose."""
     for parts in (octahedra(), [octahedra()[1]]):
         _gradient_of_poses(parts)
 

@@ -29,7 +29,7 @@ from rts.scene.parts import Part
 
 @record(static=("surface", "shader", "cull"))
 class CheckedPart(Part):
-    """A part that passed the checks: its surface and its shader are objects of their base classes."""
+    """A part that passed the checks: its surface and its shader are instances of `rts.Surface` and `rts.Shader`."""
 
     surface: Surface
     theta: Mapping[str, Tree]
@@ -69,9 +69,9 @@ MEMORY = _memory()
 
 
 def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[CheckedPart], Camera]:
-    """Checked parts and camera. Shaders are looked up by name, and plain numbers become arrays.
+    """A list of the parts, checked, and the camera, turned to look along −z; wrong ones raise an `InputError`.
 
-    Arrays of several engines are not detected here.
+    Shaders are looked up by name, and lists of numbers become arrays. Arrays of several engines are not detected here.
     """
     listed: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
     if not listed or not all(isinstance(p, Part) for p in listed):
@@ -93,7 +93,7 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
 
 
 def check_cameras(cameras: Any) -> list[Camera]:
-    """Checked cameras of several views, from a list or from a stacked camera."""
+    """Checked cameras, one for each view, from a list or from a stacked camera."""
     if isinstance(cameras, Camera):
         if not cameras.is_stacked:
             raise InputError("cameras is the camera of one view; expected several, or what Camera.stack made of them")
@@ -108,7 +108,7 @@ def check_cameras(cameras: Any) -> list[Camera]:
 
 
 def _check_camera(camera: Camera) -> Camera:
-    """The camera with arrays for matrices, turned to look along −z. Traced values are checked later."""
+    """The camera with arrays for matrices, turned to look along −z if it looks along +z; a traced one stays."""
     view, projection = (check_matrix(f"the camera's {n}", getattr(camera, n)) for n in ("view", "projection"))
     if view is not camera.view or projection is not camera.projection:
         camera = camera.replace(view=view, projection=projection)
@@ -149,7 +149,7 @@ def check_channels(parts: Sequence[CheckedPart]) -> int:
 
 
 def check_colors(channels: int) -> None:
-    """Refuse shaders that give another number of channels than three, where an image of colours is needed."""
+    """Refuse another number of channels than three, where an image of colours is needed."""
     if channels != 3:
         raise InputError(
             f"the scene's shaders give {channels} channels besides alpha; expected 3: look at three of them at a "
@@ -224,7 +224,7 @@ def checked_plugin(given: Any, what: str, base: type, others: str = "a name, ") 
 
     Raises:
         InputError: its class does not subclass `base`.
-        PluginError: a function of its class is named almost like an optional member.
+        PluginError: its class overrides a final method, or has a function named almost like an optional one.
     """
     if not isinstance(given, base):
         bases = "rts.TriangleSurface or rts.RaySurface" if base is Surface else f"rts.{base.__name__}"
@@ -234,7 +234,7 @@ def checked_plugin(given: Any, what: str, base: type, others: str = "a name, ") 
 
 
 def check_matrix(name: str, matrix: Any) -> Array:
-    """A (4, 4) matrix of floating numbers; anything else is refused."""
+    """A (4, 4) matrix of floating numbers: lists become float32, NumPy integers float64. Other arrays are refused."""
     matrix = from_numbers(matrix, name)
     if shape_of(matrix) != (4, 4):
         several = len(shape_of(matrix)) == 3 and shape_of(matrix)[1:] == (4, 4)
@@ -247,7 +247,7 @@ def check_matrix(name: str, matrix: Any) -> Array:
 
 
 def check_ratio(camera: Camera, size: tuple[int, int]) -> None:
-    """Warn if the image's ratio of width to height is off the camera's by more than a pixel."""
+    """Warn if a size (height, width) is off the camera's ratio, if it is known, by more than a pixel."""
     if not isinstance(camera.aspect, float):
         return
     height, width = size
@@ -260,7 +260,10 @@ def check_ratio(camera: Camera, size: tuple[int, int]) -> None:
 
 
 def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple[int, int]:
-    """The image size as (height, width) integers, after checks of the size and of the counts given with it."""
+    """The image size as (height, width) integers. Refuse a wrong size, or counts that are no integers of at least 1.
+
+    Also allowed are `layers="auto"` and a capacity of None.
+    """
     height, width = check_pixels(size)
     if not (isinstance(layers, str) and layers == "auto") and not is_count(layers):
         raise InputError(f'layers is {quoted(layers)}; expected an integer of at least 1, or "auto"')
@@ -272,7 +275,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
 
 
 def check_memory(height: int, width: int, layers: int, capacity: int | None, *, gradient: bool) -> None:
-    """Refuse a render that needs more memory than this machine has."""
+    """Refuse a render that needs more memory than this machine has, by `BYTES_PER_CELL`."""
     bytes_ = BYTES_PER_CELL["gradient" if gradient else "forward"]
     if capacity is not None and capacity * bytes_ > MEMORY:
         raise InputError(
@@ -298,7 +301,10 @@ def is_real(value: Any) -> bool:
 
 
 def check_background(background: Any, size: tuple[int, int], channels: int) -> Array | None:
-    """The background as an array. Shapes that do not fit the image are refused."""
+    """The background as finite floats, (C,), (C + 1,), (H, W, C) or (H, W, C + 1), C `channels`; else refused.
+
+    None stays None.
+    """
     if background is None:
         return None
     background = from_numbers(background, "background")
@@ -316,13 +322,13 @@ def check_background(background: Any, size: tuple[int, int], channels: int) -> A
 
 
 def check_floating(name: str, value: Array) -> None:
-    """Refuse integers: their range is ambiguous, 0 to 255 or 0 to 1."""
+    """Refuse arrays of other numbers than floating ones: the range of integers is ambiguous, 0 to 255 or 0 to 1."""
     if not floating_bits(value):
         raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
 
 
 def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
-    """Refuse a shader's result if its shape is wrong or its numbers are not floating."""
+    """Refuse a shader's result unless it is (count, C + 1), C its channels, and its numbers are floating."""
     expected, shape = (count, shader.channels + 1), shape_of(rgba)
     if shape != expected:
         other = len(shape) == 2 and shape[0] == count and shape[1] > 4
@@ -337,14 +343,15 @@ def check_splats(
 ) -> None:
     """Refuse samples of a part whose position or colour is NaN or infinite, and name the cause.
 
-    Traced values are skipped. No shader or splatter of the library turns NaN into a number.
+    Traced values are skipped, and rows that no cell refers to. No shader or splatter of the library turns NaN into a
+    number.
 
     Args:
         index: the index of the part.
         part: the part.
-        gbuffer: the attributes that its shader read, in world space.
+        gbuffer: the G-buffer that its shader was given, in world space.
         positions: (N, 3) pixel x, pixel y, depth.
-        rgba: (N, 4).
+        rgba: (N, C + 1).
         row: (K, H, W) int32, the row of each cell's sample, counted over all parts.
         first: the first row of this part.
     """

@@ -12,10 +12,10 @@ class GBuffer(dict):
     """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
 
     Surfaces return attributes in local space; shaders receive positions and normals in world space. An attribute may be
-    deferred: it is computed when first read, so a shader pays for what it reads. Reading a missing attribute raises an
-    `InputError`. Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
-    If there is "uv", shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the
-    right, and ∂u/∂y, ∂v/∂y, the change to the cell below; without derivative.
+    deferred: it is computed when first read, as `gbuffer[name]`, so a shader pays for what it reads. Reading a missing
+    attribute raises an `InputError`. Built-in surfaces use the names position, normal, uv and color. If there is "uv",
+    shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the right, and ∂u/∂y,
+    ∂v/∂y, the change to the cell below; without derivative.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -25,7 +25,7 @@ class GBuffer(dict):
 
     @property
     def like(self) -> Any:
-        """An array (N, ·), a row for each sample, for its dtype and device. Reading it costs nothing."""
+        """An array (N, ·), a row for each sample, for its dtype and device, where no attribute is needed."""
         return self["position"] if self._like is None else self._like
 
     @like.setter

@@ -12,14 +12,14 @@ def pieces(faces: np.ndarray) -> np.ndarray:
     """Number the consistently oriented pieces of a triangle table, the largest first.
 
     Two triangles are joined if they alone share an edge and run along it in opposite directions; joined triangles make
-    a piece. A piece has no sides if some two of its triangles run along their edge in the same direction, as in a
-    Möbius strip. Such a piece has the number 0, and so have pieces from `Cells.MORE_BEHIND` on.
+    a piece. A piece has no sides if two of its triangles run along their edge in the same direction, as in a Möbius
+    strip. Such a piece has the number 0, and so have pieces whose number would be `Cells.MORE_BEHIND` or more.
 
     Args:
         faces: (T, 3) integers.
 
     Returns:
-        (T,) int16, for each triangle the number of its piece, from 1 on, or 0.
+        (T,) int16, read-only, for each triangle the number of its piece, from 1 on, or 0.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

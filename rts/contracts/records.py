@@ -94,17 +94,17 @@ class Cells:
     """The samples in the cells of a grid, front to back, as indices of packed rows.
 
     Attributes:
-        row: (K, H, W) int32, the index of the sample in each cell, or −1.
+        row: (K, H, W) int32, the index of the sample in each cell, or −1 for none.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1. None where positions hold it.
         facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on. It is negative
             where the piece is seen from behind, and 0 where the side is unknown or not of interest. Pieces are
             consistently oriented: a piece seen from opposite sides in two neighbouring cells is not one sheet there.
-            Numbers are larger by `MORE_BEHIND` in the last layer of cells whose K layers are all covered. None where
-            no sides are recorded.
+            Absolute values are larger by `MORE_BEHIND` in the last layer of cells whose K layers are all covered. None
+            where no sides are recorded.
         exit: (E, H, W) int32, indices of one or two further samples, not in `row`, in cells at outlines and beside
-            them, or −1. The first alone is the sample where the ray leaves the closed part behind its front. Two are
-            samples beside the deepest point of the front's chord in a field: the mean of their motions is that of the
-            outline (`rts.splatting.rims`). None if none are recorded.
+            them; −1 for none. A single one is where the ray leaves the closed part behind its front. Two are samples
+            beside the deepest point of the ray, where the field that it crosses is least: the mean of their motions
+            is that of the outline (`rts.splatting.rims`). None if none are recorded.
         settled: (H, W) integers. In a cell whose colour cannot change, however the scene moves, the index of a sample
             of this colour; −1 in others. Such a cell may lack a sample of its own, and so may cells around it that
             affect no others. Samples in it and in the eight cells around it have its colour. None if no cells are
@@ -125,7 +125,7 @@ class Cells:
         return Cells(*(None if x is None else f(x) for x in arrays))  # pyright: ignore[reportArgumentType]
 
     def first(self, layers: int) -> Cells:
-        """The cells reduced to their first layers."""
+        """The cells with only their first layers; `exit` and `settled`, which have no layers, stay."""
         own = (None if x is None else x[:layers, ...] for x in (self.row, self.depth, self.facing))
         return Cells(*own, exit=self.exit, settled=self.settled)  # pyright: ignore[reportArgumentType]
 
@@ -166,7 +166,7 @@ class Samples(_OnCells):
         asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
         by_sample: names of the tables that have a row for each sample; other tables are shared by all.
-        followed: the fields of the `Request`, out of "cells" and "hidden", that the sampler followed.
+        followed: the fields of the `Request`, out of "cells" and "hidden", that were given and that the sampler obeyed.
         ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
             None for a surface that is not refined.
     """
@@ -205,7 +205,7 @@ class Decision(NamedTuple):
 
     Attributes:
         kept: (K, H, W) bool, the samples to compute: `needed` without samples that only settled cells need.
-        settled: (H, W) int8, `Cells.settled` of a scene of one part; None unless the decider `settles`.
+        settled: (H, W) int8, `Cells.settled` of a scene of one part; None unless the rule `settles` (see `Hidden`).
         needed: (K, H, W) bool, the samples that the splatter needs.
     """
 
@@ -215,7 +215,7 @@ class Decision(NamedTuple):
 
 
 class Hidden(Protocol):
-    """A rule that tells which samples are hidden, by their depths alone. It keeps no state.
+    """A rule that tells which samples can reach the image, by their depths, and which are hidden. It keeps no state.
 
     Attributes:
         settles: whether decisions have `settled` (see `Cells.settled`).
@@ -239,15 +239,17 @@ class Hidden(Protocol):
 
 @dataclass(frozen=True)
 class Request:
-    """Options of a call of a sampler. It may ignore most of them; `Samples.followed` names those that it followed.
+    """Options of a call of a sampler, which may ignore all but `capacity`.
+
+    `Samples.followed` tells whether it obeyed `cells` and `hidden`.
 
     Attributes:
-        capacity: number of packed rows to allot, or None for as many as there are. Every sampler follows it.
-        cells: (L, C) int32, the only cells of the grid to sample, as flat indices, none twice, or −1 for none; an array
-            of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
-        hidden: the rule that tells which samples to drop, once depths are known; None to keep all.
+        capacity: number of packed rows to allot, or None for as many as there are samples.
+        cells: (L, C) int32, the only cells of the grid to sample, in any layout, as flat indices, none twice, or −1 for
+            none; an array of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
+        hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
-        exits: whether to compute `Cells.exit` of a part that is culled, at outlines and beside them.
+        exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
@@ -261,17 +263,17 @@ class Request:
 
 @record(static=("supersample", "apron", "flat"))
 class Fine(_OnCells):
-    """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in strips.
+    """The fine samples of an adaptively sampled scene: of its active pixels and an apron around them.
 
-    Strips lie side by side in one layout of h × w cells, which splatters treat as any other picture. Cells of the
-    layout outside of active pixels are no part of the image.
+    They lie in strips, runs of pixels a few lines high, side by side in one picture of h × w cells, the layout.
+    Splatters treat it as any other. Cells of the layout outside of active pixels are no part of the image.
 
     Attributes:
         samples: one `Samples` for each part; their cells are a list, not a grid.
         index: (M,) int32, the index of the sample that each splat shows, counted over all parts in order.
         shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
         cells: the index of the splat in each cell of the layout; without depth.
-        part: (K, h, w) int32, the part seen there, or −1.
+        part: (K, h, w) int32, the part of the splat in each cell of the layout, or −1.
         wanted: (h, w) bool, the cells of active pixels.
         pixel: (H, W) int32, for each pixel of the image the index of its pixel in the layout, counted row by row with
             the apron left out; −1 where the pixel is not active.
@@ -307,12 +309,12 @@ class Sampled(_OnCells):
     Attributes:
         samples: one `Samples` for each part.
         cells: the index of the sample in each cell, counted over all parts in order. Pieces of different parts have
-            different numbers; exits are of the part that is seen.
+            different numbers in `facing`; `exit` is that of the part in front.
         overflow: () int32, number of samples dropped for want of capacity, or beyond the limit of `layers="auto"`;
             `fine.overflow` is included. Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        fine: further samples at outlines (`rts.Adaptive`), or None.
+        fine: further samples, in pixels that `rts.Adaptive` makes active, or None.
     """
 
     samples: tuple[Samples, ...]
@@ -329,7 +331,7 @@ class Sampled(_OnCells):
 
     @property
     def part(self) -> Array:
-        """(K, H, W) int32, the part seen in each cell, or −1."""
+        """(K, H, W) int32, the part of the sample in each cell and layer, or −1."""
         if self.one_part:
             return _first_part(self.row)
         xp, first = namespace(self.row), 0
@@ -352,7 +354,8 @@ class Splats(_OnCells):
     Optional fields carry more about the scene, where it is known. A splatter may ignore them.
 
     Attributes:
-        positions: (N, 3) pixel x, pixel y, linear depth; differentiable.
+        positions: (N, 3) x and y in cells from the corner of the grid, border included, and linear depth;
+            differentiable.
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
             channels, (N, C + 1): splatters are given three of them at a time, and alpha.
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.

@@ -12,7 +12,7 @@ from rts.scene.parts import Part
 
 
 class Sampler(Plugin):
-    """Finds where rays meet one part: the step without derivative.
+    """The step without derivative: it finds where the rays of cells meet one part.
 
     Attributes:
         concurrent: whether several threads may call `sample` at once, so that `rts.render_views` takes views at once.
@@ -25,7 +25,7 @@ class Sampler(Plugin):
         """The `layers` nearest samples of every cell.
 
         Args:
-            part: the part; its `transform` is already in the camera. A sampler that cannot ignore triangles seen from
+            part: the part, whose `transform` is already in the camera. A sampler that cannot ignore triangles seen from
                 behind refuses parts with `cull="back"`.
             camera: the camera, in the part's local space.
             size: (height, width) of the grid of cells.
@@ -37,7 +37,7 @@ class Sampler(Plugin):
             depends on the sampler, the part and the request, never on values in arrays.
 
         Raises:
-            InputError: this sampler cannot sample the surface.
+            InputError: this sampler cannot sample the part.
         """
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:

@@ -13,7 +13,7 @@ from rts.scene.camera import Camera
 
 
 class Shader(Plugin):
-    """A function that colours samples. A plain function with the signature of `__call__` and these attributes will do.
+    """A function that colours samples. A plain function with the signature of `__call__` will do, attributes or not.
 
     Promises other than `opaque` hold for the `__call__` of the class that states them. A subclass that overrides
     `__call__` has to repeat them.
@@ -63,7 +63,7 @@ class FunctionShader(Shader):
             setattr(self, name, getattr(function, name, getattr(Shader, name)))
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `Shader`."""
+        """The colours that the function returns; see `Shader`."""
         return self.function(theta, gbuffer, camera)
 
     def __repr__(self) -> str:

@@ -16,14 +16,14 @@ from rts.plugin_base import Plugin
 
 
 class Splatter(Plugin):
-    """Turns shaded samples into an image that has derivatives at occlusion boundaries.
+    """The step from shaded samples to an image that has derivatives at occlusion boundaries.
 
     Attributes:
         layers: the number of layers it reads, from the front; None for all.
         reach: the largest distance, in cells along either axis, at which a sample has an effect; at least 1.
         reads: the fields of `Cells` that it reads, out of "facing" and "exit"; samplers compute no others.
         fills_interiors: a promise on samples of one opaque colour, on cells' centres, that move by little. A cell shows
-            this colour if the nine cells in and around it have samples in front and no hidden sample beside these is
+            this colour if the nine cells in and around it have samples in layer 0, and no sample behind these is
             `needed`. It shows nothing if all nine are empty. A cell that is `settled` shows the colour of its sample,
             whichever samples are given. Samples farther than `reach` from all cells that are not settled may therefore
             be missing; with `Splats.wanted`, those farther than `reach` + 1 from wanted ones that are not settled.
@@ -50,7 +50,7 @@ class Splatter(Plugin):
         """Splat packed samples; for direct calls, with arrays of any engine, lists and numbers.
 
         Args:
-            positions: (N, 3) pixel x, pixel y, linear depth.
+            positions: (N, 3) x and y in cells from the corner of the grid, border included, and linear depth.
             rgba: (N, 4) premultiplied.
             row: (K, H, W) int32, the index of the sample of each cell, front to back, or −1.
             border: cells at each side that splat into the image but are no part of it.
@@ -61,7 +61,7 @@ class Splatter(Plugin):
             (H − 2 border, W − 2 border, 4) premultiplied RGBA.
 
         Raises:
-            InputError: wrong shapes, or `row` holds no integers.
+            InputError: wrong shapes, or `row` holds no signed integers.
             EngineError: arrays of two engines.
         """
         return self.cropped(_checked_splats(positions, rgba, row, border).replace(opaque=opaque))
@@ -72,7 +72,7 @@ class Splatter(Plugin):
         If a class overrides this method, other samples are dropped before they are evaluated. Host arrays.
 
         Args:
-            covered: (K, H, W) bool.
+            covered: (K, H, W) bool, true where there is a sample.
             depth: (K, H, W) float; 0 where nothing is covered.
 
         Returns:
@@ -101,7 +101,7 @@ class SummingSplatter(Splatter):
             splats: the samples; without the border there are s h × s w cells, and a pixel is the mean of s × s.
             t_positions: (T, N, 3), tangents of positions along T directions.
             t_rgba: (T, N, 4), tangents of colours; None for zeros.
-            target: (h, w, C): alpha (C = 1), colours (3) or both (4).
+            target: (h, w, C), alpha (C = 1), colours (3) or both (4) of h × w pixels.
             weights: (h, w, 1) or (h, w, C); None for ones.
             background: (h, w, 4), composited under the image, or None.
             loss: of the residuals, an `rts.Loss`; None for the square.

@@ -41,15 +41,15 @@ class Rate(NamedTuple):
 
 
 class Surface(Plugin):
-    """A kind of surface. It holds topology and is immutable; its numbers come as θ.
+    """The topology of a surface, such as the triangles of a mesh; immutable. Its numbers, such as vertices, come as θ.
 
     Subclass `TriangleSurface`, `RaySurface`, or both. Several threads may call its methods at once.
 
     Attributes:
         sample_widths: (I, P), the number of integers and reals of a sample, after `refine`. Every surface sets it.
         centered: whether samples lie on the rays through cells' centres. If not, splatters receive points of the rays.
-        param_step: step in the two `params` of a sample for finite differences of position and uv, which choose the
-            level of mipmaps. Larger where both are linear in `params`.
+        param_step: step in each of the two `params` of a sample, for the finite differences of position and uv that
+            choose the level of mipmaps. Set a larger step where position and uv are linear in `params`.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
@@ -64,15 +64,18 @@ class Surface(Plugin):
 
         Args:
             theta: the entries that `Surface.reads` names.
-            samples: points to evaluate; constants. Rows that no cell refers to are all zero, and must give finite
-                values.
+            samples: the points to evaluate, without derivative. Rows that no cell refers to are all zero, and must
+                give finite values.
 
         Returns:
             "position" (N, 3) and further attributes, each (N, C), in θ's dtype.
         """
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
+        """Raise an `InputError` of one line if an entry of θ is missing or of a wrong shape; values may be traced.
+
+        The default accepts every θ.
+        """
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The names of the entries of θ that the surface reads; others are its shader's. The default is all of them."""
@@ -167,7 +170,8 @@ class TriangleSurface(Surface):
     def proxy_key(self, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Hashable:
         """A value that changes when the view requires other triangles, for the same inputs.
 
-        Override it only if triangles depend on the view. The default is size and camera: each view has its triangles.
+        Override it only if triangles depend on the view; otherwise it is not called. `super().proxy_key` gives each
+        view its own triangles.
         """
         return size, *(m.tobytes() for m in camera)
 
@@ -219,8 +223,8 @@ class TriangleSurface(Surface):
             tables: the tables that `refine` filled. None may be `by_sample`.
 
         Returns:
-            Ids (R, 2, I) and params (R, 2, P) of the pairs, as after `refine`, marks (R,) bool of rays that have one,
-            and the tables, perhaps with further rows; where these exceed their specs there are no pairs. None, the
+            Ids (R, 2, I) and params (R, 2, P) of the pairs, as after `refine`, marks (R,) bool of rays that have a
+            pair, and the tables, perhaps with further rows; if tables exceed their specs, no pair is used. None, the
             default, for surfaces without a field.
         """
         return None
@@ -288,7 +292,7 @@ class RaySurface(Surface):
         Args:
             theta: θ without derivatives.
             origins: (R, 3), local space.
-            directions: (R, 3), not of unit length; distances are in units of them.
+            directions: (R, 3), of any length, which is the unit of distances.
             layers: K.
         """
 
@@ -309,6 +313,6 @@ class RaySurface(Surface):
 
         Returns:
             `Samples.params` (R, 2, P) of the pairs, for surfaces whose hits have no ids, and marks (R,) bool of rays
-            that have one. None, the default, for surfaces without a field.
+            that have a pair. None, the default, for surfaces without a field.
         """
         return None

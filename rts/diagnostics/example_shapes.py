@@ -44,6 +44,6 @@ def mesh(vertices: np.ndarray, faces: Any, shader: str, cull: str = "none", **en
 
 
 def unlit(vertices: np.ndarray, faces: Any, colors: Any, cull: str = "none") -> Part:
-    """Mesh with vertex colours (V, 3), or one colour (3,)."""
+    """An unlit part that is a mesh, with vertex colours (V, 3), or one colour (3,)."""
     colors = np.broadcast_to(np.asarray(colors, float), (len(vertices), 3)).copy()
     return mesh(np.asarray(vertices, float), faces, "unlit", cull, colors=colors)

@@ -48,7 +48,13 @@ class GradientImage(NamedTuple):
 
     @property
     def picture(self) -> np.ndarray:
-        """(H, W, 3) linear RGB for `rts.save_image`: middle grey is zero, brighter positive, darker negative."""
+        """(H, W, 3) linear RGB for `rts.save_image`: middle grey is zero, brighter positive, darker negative.
+
+        One channel becomes grey; of four channels the last is left out.
+
+        Raises:
+            InputError: the image has another number of channels than 1, 3 or 4.
+        """
         if self.derivative.shape[2] not in (1, 3, 4):
             raise InputError(f"the image has {self.derivative.shape[2]} channels; expected 1, 3 or 4 for a picture")
         color = self.derivative if self.derivative.shape[2] in (1, 3) else self.derivative[..., :3]
@@ -68,7 +74,9 @@ def gradient_image(
         scale: the change that is shown at full strength; None for the largest there is.
 
     Raises:
-        InputError: parameters that have no derivative, or a direction of another structure.
+        InputError: parameters that have no derivative; a direction of another structure; an image that is no (H, W, C)
+            array of the parameters' engine, or whose derivative is not finite.
+        EngineError: arrays of two engines.
     """
     _check_function("image", image, "a function: parameters → (H, W, C)")
     engine, parameters = _differentiable(parameters, "rts.gradient_image")
@@ -174,8 +182,13 @@ def check_gradient(
         progress: True to show a bar on standard error, False for none; None to show it on a terminal.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
+    Returns:
+        The two derivatives of each number that was checked, the reasons, and a picture; see `GradientCheck`.
+
     Raises:
-        InputError: parameters that have no derivative, or arguments that `rts.render` refuses.
+        InputError: parameters that have no derivative, nothing that depends on them, or arguments that `rts.render`
+            refuses.
+        EngineError: arrays of two engines.
     """
     clock = Clock(budget_s)
     _check_function("scene", scene, "a function: parameters → (parts, camera)")

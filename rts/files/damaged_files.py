@@ -54,10 +54,10 @@ def is_plain(text: str) -> bool:
 
 @contextlib.contextmanager
 def gathered(path: Path) -> Iterator[list[str]]:
-    """Gather warnings about a file: a list that holds a line for each warning in the block, once the block ends.
+    """Gather warnings about a file: a list that holds a line for each different one in the block, once the block ends.
 
-    Other libraries warn in their own ways, and some only log: their messages are caught, and get the name of the file.
-    Threads take turns.
+    Other libraries warn in their own ways, and trimesh only logs: their messages are caught, and get the name of the
+    file. Warnings of deprecations and of files left open are dropped. Threads take turns.
 
     Raises:
         InputError: NumPy came upon text among numbers.

@@ -89,7 +89,11 @@ def rows_of(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views:
 def check_attributes(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[str, int]:
-    """Refuse attributes and indices that do not fit. Returns the index of each accessor with data, by attribute."""
+    """Refuse attributes and indices that do not fit.
+
+    Returns:
+        For the attributes that are read (`ATTRIBUTES`, "indices" among them) and have data, the index of the accessor.
+    """
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
     accessors = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}

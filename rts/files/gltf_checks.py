@@ -44,7 +44,8 @@ def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
         file: name → bytes of a file that it refers to.
 
     Raises:
-        InputError: it is shorter than it promises; accessors reach beyond the data; colours are not finite or far off.
+        InputError: it is shorter than it promises, a part is missing or unsound, accessors reach beyond the data, or
+            colours are not finite or far off.
     """
 
     def fail(what: str) -> InputError:
@@ -275,7 +276,7 @@ def _check_material(
 
 
 def _check_colors(path: Path, name: str, colors: np.ndarray, fail: Any) -> None:
-    """Refuse invalid colours (N, C); warn of colours that trimesh clips to their range."""
+    """Refuse colours (N, C) that are NaN or beyond ±255; warn of others not from 0 to 1, which trimesh clips."""
     wrong = ~(np.abs(colors) <= 255).all(axis=1)
     if wrong.any():
         at = int(np.argmax(wrong))

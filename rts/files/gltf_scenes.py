@@ -1,4 +1,4 @@
-"""Nodes and scenes of GLB and glTF files: a forest, in which every mesh has a place."""
+"""Checks of nodes and scenes of GLB and glTF files: nodes form a forest, and transforms of meshes are sound."""
 
 from __future__ import annotations
 

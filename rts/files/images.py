@@ -124,7 +124,7 @@ def _duration(kind: str, fps: float) -> int:
 
 
 def _each(frames: Any) -> Iterable[Any]:
-    """The frames of an animation, refused if there are none, or only one image."""
+    """The frames of an animation as they are, refused if they are one image, or nothing to iterate over."""
     shape = tuple(getattr(frames, "shape", ()))
     one = len(shape) in (1, 2) or (len(shape) == 3 and shape[2] in (1, 3, 4))
     if one or isinstance(frames, (str, bytes, dict)) or not isinstance(frames, Iterable):
@@ -199,7 +199,7 @@ def _on_white(image: np.ndarray) -> np.ndarray:
 
 
 def read_texture(path: Path, referrer: Path) -> np.ndarray:
-    """Pixels of the image that `referrer` names; see `pixels`."""
+    """The result of `pixels` for an image file that `referrer` names; an InputError if it is missing or unreadable."""
     if not path.is_file():
         raise InputError(
             f"{referrer} refers to the texture {path.name!r}, but there is no file {path}; put it there, or "
@@ -209,7 +209,7 @@ def read_texture(path: Path, referrer: Path) -> np.ndarray:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Pixels of an image file; see `pixels`."""
+    """The result of `pixels` for an image file; an InputError if it cannot be read."""
     from PIL import Image
 
     try:

@@ -40,7 +40,7 @@ class Piece(NamedTuple):
 
 
 def check_piece(path: Path, piece: Piece) -> None:
-    """Refuse indices that refer to nothing, rows of another width, and values that are not finite in float32."""
+    """Refuse indices that refer to nothing, rows of another width, values not finite in float32, unsound transforms."""
     tables = {"vertices": (piece.vertices, piece.faces), **piece.attributes}
     for name, (rows, table) in tables.items():
         if rows.ndim != 2 or rows.shape[1] not in WIDTHS[name]:

@@ -25,7 +25,7 @@ from rts.shading.shaders import Lambert, Textured
 
 
 def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh") -> list[Part]:
-    """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, what trimesh reads.
+    """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, and others that trimesh reads.
 
     There is one part for each mesh of the scene or, in an OBJ, for each material; in an STL as text, for each solid;
     `merge=True` makes them one. θ holds NumPy float32 arrays: "vertices", and where the file has them "uv",
@@ -54,7 +54,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     Raises:
         InputError: the file is missing, damaged, of unknown kind, empty, holds other than it promises, or refers to
             what is missing or elsewhere; something in it is not finite or too large for float32, colours as linear
-            ones included; or `merge` or `weld` is neither True nor False.
+            ones included; `merge` or `weld` is neither True nor False, or given with another surface than "mesh"; or
+            there is no such surface.
 
     Warns:
         FileWarning: something was left out or guessed, such as a library of materials that is not there, a statement or
@@ -157,7 +158,10 @@ def _settled(
 
 
 def _merged(path: Path, pieces: list[Piece]) -> Piece:
-    """All pieces as one, transforms applied, material colours moved to the vertices."""
+    """All pieces as one, transforms applied, material colours moved to the vertices.
+
+    Attributes that only some pieces have are dropped; pieces with different textures are refused.
+    """
     first = pieces[0].texture
     for piece in pieces[1:]:
         other = piece.texture
@@ -184,7 +188,7 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
 
 
 def _in_scene(piece: Piece) -> Piece:
-    """The piece in the scene's coordinates, its colours (A, 4) in "colors"."""
+    """The piece in the scene's coordinates; "colors" (A, 4) are its own, white if none, times its material's."""
     rows, table = piece.attributes.get("colors", (np.ones((len(piece.vertices), 3)), piece.faces))
     colors = np.ones((len(rows), 4))
     colors[:, : rows.shape[1]] = rows

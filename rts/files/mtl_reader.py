@@ -24,8 +24,9 @@ class Material(NamedTuple):
     """The part of an MTL material that shaders use.
 
     Attributes:
-        color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd. Without d, alpha is
-            1 − Tr, unless Tr is at least 1 or MeshLab wrote the file: then Tr is taken for d.
+        color: (3,) Kd, sRGB, or (4,) with alpha where d or Tr make it translucent. Without a Kd, or with a texture, it
+            is white with alpha, or None where opaque. Without d, alpha is 1 − Tr, unless Tr is at least 1 or MeshLab
+            wrote the file: then Tr is taken for d.
         texture: file of map_Kd, or None. It replaces Kd.
     """
 

@@ -75,7 +75,10 @@ class _Lines:
         return self
 
     def _check_key(self, key: str, rest: str, number: int) -> None:
-        """Refuse an unknown key that may be a damaged one: of letters v, t, n, f only, or no word before numbers."""
+        """Refuse an unknown key that may be a damaged one: of letters v, t, n, f only, or no word before numbers.
+
+        Other keys are noted in `unknown`.
+        """
         letters = {c for c in key.lower() if "a" <= c <= "z"}
         if letters and letters <= set("vtnf") or not _WORD.fullmatch(key) and _NUMERIC.fullmatch(rest or key):
             raise self.fail(number, f"it begins with {key[:20]!r}; expected v, vt, vn or f, and a space after it")
@@ -110,7 +113,7 @@ class _Lines:
             raise self.fail(number, f"{token[:60]!r} is no index") from None
 
     def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
-        """The rows of one kind.
+        """The rows (N, C) of one kind, float64.
 
         The result has the largest of `widths` columns that every row fills. If a row is shorter than all `widths`,
         there are as many columns as the first says, filled up with zeros.
@@ -233,7 +236,7 @@ def read_polygons(path: Path) -> Polygons:
 
 
 def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, perhaps with colours, texture coordinates and normals of a file that has faces."""
+    """Positions (V, 3), or (V, 6) with colours, texture coordinates and normals; a file without faces is refused."""
     v, vt, vn = lines.array("v", (3, 6)), lines.array("vt", (2,)), lines.array("vn", (3,))
     if not lines.faces:
         what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
@@ -279,7 +282,7 @@ def read_obj(path: Path) -> list[Piece]:
 
 
 def _materials(lines: _Lines) -> dict[str | None, Material]:
-    """The materials of all libraries by name."""
+    """The materials of all libraries by name; a warning if a library, or a material that is used, is missing."""
     materials: dict[str | None, Material] = {}
     complete = True
     for name in lines.libraries:

@@ -95,7 +95,7 @@ def _vertices(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray:
 
 
 def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.ndarray, np.ndarray]:
-    """The number of corners of each face, and all corners, face after face."""
+    """The number of corners of each face (F,), and the corners of all faces, one after the other, (C,); int64 both."""
     numbers = numbers_of(rows, fail) if rows else []
     if isinstance(numbers, np.ndarray) and (numbers[:, 0] == numbers.shape[1] - 1).all() and numbers.shape[1] > 3:
         faces = numbers[:, 1:]
@@ -125,7 +125,8 @@ def sound_stl(path: Path, data: bytes) -> bytes:
     """A binary STL as it is, if its length is right; an STL in text with numbers in place of the names of solids.
 
     Raises:
-        InputError: the file is longer or shorter than its header says, or its text departs from the format.
+        InputError: the file is longer or shorter than its header says, its numbers are misplaced, or its text departs
+            from the format.
     """
     if len(data) >= 84 and len(data) == 84 + TRIANGLE * struct.unpack_from("<I", data, 80)[0]:
         _check_records(path, np.frombuffer(data, _RECORD, offset=84))

@@ -110,7 +110,10 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
 
 
 def cache_folder() -> Path:
-    """The folder of files that are costly to make, such as compiled libraries; later processes read them."""
+    """The folder of files that are costly to make, such as compiled libraries, which later processes read.
+
+    Without a home folder, one of this process alone.
+    """
     try:
         if sys.platform == "darwin":
             return Path.home() / "Library" / "Caches" / "rts"

@@ -101,7 +101,11 @@ def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
 
 
 def written(path: Path, kind: str, mesh: Mesh) -> bytes:
-    """A binary PLY of triangles."""
+    """A binary PLY of a mesh, its polygons cut into triangles.
+
+    Raises:
+        InputError: a face has less than 3 corners, or refers to a missing vertex; colours are no colours.
+    """
 
     def fail(what: str) -> InputError:
         return unreadable(path, kind, what)
@@ -156,7 +160,7 @@ def _face_table(path: Path, mesh: Mesh, fail: Fail) -> tuple[list[str], bytes]:
 
 
 def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> dict[str, np.ndarray]:
-    """The columns, with colours of 8 bits, from 0 to 255."""
+    """The columns, with colours as uint8; they may go to 1 as floats, to 255 or to 65535, and others are refused."""
     if not {"red", "green", "blue"} <= set(columns):
         return columns
     names = [name for name in COLORS if name in columns]
@@ -247,7 +251,7 @@ def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
 
 
 def _joined(sizes: Any, entries: list[np.ndarray], dtype: str) -> Lists:
-    """Lists of their lengths and their entries; integers as int64."""
+    """`Lists` of these lengths, with these entries one list after the other; integers as int64."""
     kind = np.int64 if dtype[0] in "iu" else dtype
     flat = np.concatenate(entries) if entries else np.zeros(0)
     return np.asarray(sizes, np.int64), flat.astype(kind)

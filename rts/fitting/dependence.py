@@ -29,7 +29,7 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
         purpose: text for the end of an error.
 
     Raises:
-        InputError: no array has derivatives.
+        InputError: an entry is no torch or jax array of floats; there is no number; dicts have keys of several kinds.
         EngineError: arrays of two engines.
     """
     try:

@@ -17,7 +17,8 @@ def interrupts_held_back() -> Iterator[None]:
     mode switched on, and all derivatives fail from then on. A compiled program of jax that calls Python cannot pass it
     on: the program fails with an error of jax's, or goes on. A step is short, and between steps everything is whole.
 
-    Only the main thread is interrupted. The interrupt then goes to the signal handler that was set before.
+    The interrupt then goes to the signal handler that was set before. Nothing changes in threads other than the main
+    one, which are never interrupted, and where no Python handler is set.
     """
     own = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(own):

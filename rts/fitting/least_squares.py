@@ -35,7 +35,7 @@ class _Linear(NamedTuple):
     rounding: float
 
     def checked(self, start: bool) -> _Linear:
-        """Give itself back, or raise an error where it is not finite."""
+        """Give itself back, or raise the error of `require` if the loss or the matrix is not finite."""
         require(math.isfinite(self.value), f"the loss is {self.value}", start)
         require(bool(np.isfinite(self.matrix).all()), "the Jacobian is not finite", start)
         return self
@@ -71,7 +71,7 @@ class _Model:
         self._open = np.linalg.qr(self.open * self.units[:, None])[0] if self.open.shape[1] else None
 
     def step(self, damping: float) -> tuple[np.ndarray, float]:
-        """The step, and the gain that the model predicts for it."""
+        """The step (U,), and the gain that the model predicts for it."""
         along = self._downhill / (self._values + damping)
         step = self._directions @ along
         if self._open is not None:
@@ -121,10 +121,10 @@ def levenberg_marquardt(
     supersample: int | None,
     saving: Saving,
 ) -> None:
-    """Minimise a loss of residuals by normal equations.
+    """Minimise a loss of residuals by normal equations; `run` records the steps and keeps the result.
 
-    With Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004), which is never below the
-    rounding of JᵀJ.
+    Scaling is Marquardt's; the damping is controlled as by Nielsen (Madsen et al. 2004), and never below the rounding
+    of JᵀJ.
 
     The model of a robust loss has the loss's second derivative where that is positive enough (`Loss.weights`). With ρ'
     alone (iteratively reweighted least squares) the model would lie above the loss, but steps would be shorter: up to
@@ -231,7 +231,7 @@ def _no_step(jumps: bool, supersample: int | None) -> str:
 
 
 def _note_open(model: _Model, parameters: Tree, sizes: Sequence[int], run: Run) -> None:
-    """Tell the run which directions the residuals do not determine, but for arrays that never mattered at all."""
+    """Add a remark to the run on directions that the residuals do not determine; arrays that never mattered are out."""
     names, arrays = zip(*named_leaves(parameters), strict=True)
     mattered = np.concatenate([np.full(n, m) for n, m in zip(sizes, run.mattered, strict=True)])
     # Without those arrays, columns may depend on each other.
@@ -262,7 +262,7 @@ def normal_equations(
 def _least_squares(
     terms: Terms, loss: Loss, own: bool, parameters: Tree, engine: Engine, run: Run, jit: bool
 ) -> tuple[Callable, Callable]:
-    """Functions of a vector: loss with normal equations JᵀSJ and JᵀWr on the host, and loss alone."""
+    """Two functions of a vector (U,): to a `_Linear`, loss and normal equations on the host; and to the loss alone."""
     vector, unflatten = flatten(parameters)
 
     def equations(v: Array, data: Tree) -> tuple[Array, Array, Array]:
@@ -289,7 +289,7 @@ def _least_squares(
 
 
 def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
-    """The result of a user's `normal_equations`, refused if its shapes are wrong."""
+    """The result of a user's `normal_equations`, refused unless it is arrays of the engine, of the right shapes."""
     expected = (), (count, count), (count,)
     equations: Any = tuple(result) if isinstance(result, (tuple, list)) else (result,)
     if not all(engine.owns(x) for x in equations) or tuple(tuple(x.shape) for x in equations) != expected:

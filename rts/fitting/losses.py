@@ -133,11 +133,14 @@ class Loss:
         return xp.mean(FORMS[self.name].cost(xp, residuals, self.f_scale))
 
     def weights(self, residuals: Array) -> tuple[Array, Array]:
-        """Weights W and curvatures S of residuals, for normal equations JᵀSJ and JᵀWr.
+        """Weights W and curvatures S, of the residuals' shape, for normal equations JᵀSJ and JᵀWr.
 
         Half the derivative of a residual's loss is W r, where W is ρ', at most 1. S is half its second derivative, at
         least a tenth of W, so that JᵀSJ is positive semidefinite. (Triggs et al. 2000; SciPy has the rounding error in
         place of a tenth.) Both are zero only where the dtype has no number so small.
+
+        Raises:
+            InputError: see `__call__`.
         """
         residuals = _checked_residuals(residuals)
         xp, form = namespace(residuals), FORMS[self.name]

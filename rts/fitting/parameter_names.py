@@ -14,12 +14,12 @@ def named_leaves(tree: Tree) -> Iterator[tuple[str, Array]]:
 
 
 def one_line(text: str, longest: int = 200) -> str:
-    """The text in one line, cut where it is too long."""
+    """The text in one line, cut to at most `longest` characters."""
     text = " ".join(text.split())
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def listed(names: Sequence[str], most: int = 3) -> str:
-    """Names in a row, not more than a few."""
+    """The first `most` names, separated by commas, and the number of the others."""
     more = [f"{len(names) - most} more"] if len(names) > most else []
     return ", ".join([*names[:most], *more])

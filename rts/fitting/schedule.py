@@ -62,12 +62,13 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
 
     An outline is pulled over one pixel only, to whichever outline is nearest, the right one or not. Blurred images
     show where most of an object is. So the first stage is of few pixels, with many samples each, and blurred by a
-    sixteenth of the image. Later stages double the resolution; the last is the image itself. From how far off poses are
-    found: benchmarks/RESULTS.md, "Basin of convergence".
+    sixteenth of the image. Later stages double the resolution; the last is the image itself, or as `largest` says. From
+    how far off poses are found: benchmarks/RESULTS.md, "Basin of convergence".
 
     Args:
         size: (height, width) of the residuals.
-        coarsest: the longer side of the first stage has this many pixels, or up to twice as many.
+        coarsest: the longer side of the first stage has this many pixels, or up to twice as many; fewer only if the
+            last stage has.
         largest: the longer side of the last stage has at most this many pixels; None for all.
 
     Returns:
@@ -91,7 +92,7 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
 
 
 def checked_schedule(schedule: Any) -> Sequence[Stage]:
-    """The stages of a schedule that a user gave."""
+    """The stages of a schedule that a user gave, a list or tuple of at least one `Stage`; others are refused."""
     stages = tuple(schedule) if isinstance(schedule, (list, tuple)) else ()
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise InputError(

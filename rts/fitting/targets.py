@@ -47,7 +47,7 @@ def warn_of_gradients(images: Mapping[str, Any]) -> None:
 
 
 def refuse_zero(weights: Sequence[Array | None]) -> None:
-    """Refuse weights that are zero in all views, so that nothing is compared; traced ones pass."""
+    """Refuse weights that are zero in all views, so that nothing is compared. None means ones; traced ones pass."""
     known = [None if own is None else value_of(namespace(own).any(own != 0)) for own in weights]
     if not any(own is None or own.any() for own in known):
         raise InputError("weights are all zero, so that nothing is compared; expected some above zero")

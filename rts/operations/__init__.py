@@ -1,1 +1,1 @@
-"""Functions of arrays, each with a specification in array code and compiled loops for the host."""
+"""Functions of arrays, most with compiled loops for the host beside a specification: array code for any engine."""

@@ -12,7 +12,7 @@ from rts.arrays.trees import Array
 
 
 def ranges_of_views(view: np.ndarray, count: int) -> Iterator[tuple[int, slice]]:
-    """The index, from 0 on, and the slice of rows of each of `count` views."""
+    """Pairs for `count` views: the index, from 0 on, and the slice of rows whose `view` it is."""
     ends = np.searchsorted(view[: rows_in_views(view)], np.arange(1, count + 2))
     return enumerate(itertools.starmap(slice, itertools.pairwise(ends.tolist())))
 
@@ -23,7 +23,7 @@ def rows_in_views(view: np.ndarray) -> int:
 
 
 def index_of_views(view: Array) -> Array:
-    """The view (N,) of each row, counted from 0 on; unused rows get 0."""
+    """The view (N,) of each row, counted from 0 on; unused rows get 0 as well."""
     return view - namespace(view).astype(view > 0, view.dtype)
 
 

@@ -23,7 +23,7 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
         weights: (N, I) float.
 
     Raises:
-        InputError: shapes do not fit, or an id is no index of a row.
+        InputError: shapes or dtypes do not fit; or, on the host, an id is no index of a row.
     """
     rows, weights = from_numbers(rows, "rows"), from_numbers(weights, "weights")
     ids = np.asarray(from_numbers(ids, "ids"), np.int32) if isinstance(ids, (list, tuple)) else from_numbers(ids, "ids")
@@ -45,7 +45,7 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     """Interpolation c + w₀ (a − c) + w₁ (b − c), (N, C), of rows a, b, c, whose indices are three columns of `ids`.
 
-    This is `combine` of three rows, whose last weight is one minus the others.
+    This is `combine` of a, b and c, where c has the weight 1 − w₀ − w₁.
 
     Args:
         rows: (V, C) float.
@@ -54,7 +54,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
         weights: (N, W) float, of which the first two are used.
 
     Raises:
-        InputError: ids and weights do not fit the rows: they are samples of another surface.
+        InputError: shapes of ids and weights do not fit; or, on the host, an id is no index of a row.
     """
     given, wanted = shape_of(ids), shape_of(weights)
     plain = len(given) == len(wanted) == 2
@@ -95,7 +95,7 @@ def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...]
 
 
 def _check(rows: np.ndarray, weights: np.ndarray, ids: np.ndarray, *, column: int, count: int, affine: bool) -> None:
-    """Refuse ids and weights with too few columns."""
+    """Refuse ids and weights with too few columns, or with different numbers of rows."""
     if len(ids) != len(weights) or not 0 <= column <= ids.shape[1] - count or weights.shape[1] < count - affine:
         raise InputError(
             f"ids and weights have shapes {ids.shape} and {weights.shape}; expected (N, {column + count}) and "
@@ -120,7 +120,7 @@ COMBINE = Operation.of_loops(
     packed=(1, 2),
     packed_result=True,
 )
-"""The operation of `combine` and `interpolate`, on rows, weights and ids.
+"""The operation of `combine` and `interpolate`, on rows (V, C), weights (N, W) and ids (N, I).
 
 Parameters: `column` is the first of the `count` columns of ids that are used. If `affine`, the last weight is one minus
 the others."""

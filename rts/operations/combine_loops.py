@@ -2,7 +2,7 @@
 
 `count` columns of `ids` (N, I), from `column` on, are indices of rows of (V, C). The first columns of weights (N, W)
 belong to these rows. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last).
-Triangles have loops of their own. Gradients are added up in the order of the samples.
+Affine sums of three rows have loops of their own. Gradients are added up in the order of the samples.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rts.errors import InputError
 
 
 def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
-    """Raise an InputError if an id is no index of a row."""
+    """Raise an InputError if an id in the `count` columns from `column` on is no index of a row."""
     named = ids[:, column : column + count]
     if not named.size:
         return
@@ -74,7 +74,7 @@ def pull(
     count: int,
     affine: bool,
 ) -> None:
-    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), fill `g_weights` (N, W); skip None."""
+    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), fill `g_weights` (N, W), unless None."""
     if g_rows is not None:
         if affine and count == 3:
             _scatter(ids, column, weights, g, g_rows)

@@ -13,21 +13,21 @@ from rts.arrays.trees import Array
 from rts.errors import InputError
 
 STEP = 6e-6
-"""The step of central differences in float64, as a share of the largest coordinate: the cube root of its precision."""
+"""The step of central differences, as a share of the largest coordinate: the cube root of float64's precision."""
 
 
 def gradient(f: Callable[[Array], Array], points: Array) -> Array:
-    """The gradient (N, 3) of a function of points. Each value must depend on its own point alone.
+    """The gradient (N, 3) of a function of points, of which each value must depend on its own point alone.
 
     The gradient is differentiable in the points and in arrays that `f` closes over. For NumPy arrays, which have no
-    derivatives, it is a central difference in float64.
+    derivatives, it is a central difference: `f` is called with float64, and the gradient has the dtype of the points.
 
     Args:
         f: points (N, 3) → (N,), in array code.
         points: (N, 3) float.
 
     Raises:
-        InputError: `f` returns another shape.
+        InputError: `f` is no function, or returns another shape; or points are no floating array of two axes.
     """
     if not callable(f) or isinstance(f, type):
         raise InputError(f"f is {quoted(f)}; expected a function of points (N, 3)")

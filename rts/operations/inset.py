@@ -1,4 +1,4 @@
-"""Insets: images in which some pixels are means of a finer image; others are given, or have one colour."""
+"""Insets: images in which some pixels are means of a finer image; others are given, or have one colour or zeros."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from rts.operations.operation import Arrays, Operation, Some
 
 
 def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:
-    """The image (H, W, C), with means of `side`² cells of a finer image where `pixel` is not negative.
+    """A copy (H, W, C) of an image, with means of `side`² cells of a finer image where `pixel` is not negative.
+
+    Differentiable in both images.
 
     Args:
         image: (H, W, C).
@@ -25,6 +27,8 @@ def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:
 
 def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, side: int) -> Array:
     """`with_inset` for an image (H, W, C) that has one colour on covered pixels, and zeros elsewhere.
+
+    Differentiable in `color` and `fine`.
 
     Args:
         color: (C,).

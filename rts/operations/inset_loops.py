@@ -33,7 +33,7 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
 
 @compiled
 def _sum(fine, top, left, c, side, share):
-    """The sum of the means of columns of a pixel's cells."""
+    """The sum, in channel c, of the means of the `side` columns of a pixel's cells; `share` is 1 / `side`."""
     # Rows first, for the same rounding as in the specification.
     total = fine.dtype.type(0)
     for u in range(left, left + side):
@@ -63,7 +63,7 @@ def _paint(out, c, value, there):
 def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
     """Fill the gradients `image` and `fine`, given as zeros, from rows [start, stop) of the result's gradient `g`.
 
-    Empty gradients are skipped. `sums` (H, C) receives the colour's gradient, summed over each row.
+    `sums` (H, C), given as zeros, receives the colour's gradient, summed over each row. Empty arrays are skipped.
     """
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)
@@ -84,7 +84,7 @@ def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
 
 @compiled
 def _share(fine, top, left, side, g, y, x, share):
-    """Give each cell of a pixel its share of the pixel's gradient."""
+    """Fill the pixel's cells in `fine` with its gradient in `g` times `share`."""
     for v in range(top, top + side):
         for u in range(left, left + side):
             for c in range(g.shape[2]):

@@ -18,7 +18,7 @@ from rts.operations.operation import Arrays, Operation, Some
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Product of two small matrices."""
+    """Product of two small matrices, in one engine; NumPy's beside another's is a constant."""
     engine = engine_of(a, b)
     if type(a) is not type(b):
         a, b = constants((a, b), engine, exemplar(a, b))
@@ -28,7 +28,7 @@ def matmul(a: Array, b: Array) -> Array:
 
 
 def affine(row: Array, points: Array) -> Array:
-    """One coordinate (N,) of an affine map of points (N, 3): `row` is (4,), its last entry the offset."""
+    """One coordinate (…) of an affine map of points (…, 3): `row` is (4,), its last entry the offset."""
     return points[..., 0] * row[0] + points[..., 1] * row[1] + points[..., 2] * row[2] + row[3]
 
 
@@ -41,13 +41,13 @@ def affine_map(rows: Array, points: Array) -> Array:
 
 
 def is_plain_product(*arrays: Array) -> bool:
-    """True if a matrix product suffices: it is exact, and the engine has no derivatives."""
+    """True if a plain matrix product will do: it keeps the precision, and the engine has no derivatives."""
     engine = engine_of(*arrays)
     return not engine.differentiates and engine.exact_products(*arrays)
 
 
 def specified_affine_map(rows: Array, points: Array) -> Array:
-    """`affine_map` in array code."""
+    """`affine_map` in array code, its specification."""
     engine = engine_of(rows, points)
     if engine.exact_products(rows, points):
         return points @ rows[:, :3].T + rows[:, 3]
@@ -77,7 +77,7 @@ AFFINE = Operation.of_loops("rts.affine", specified_affine_map, (2, 2), _shape, 
 
 
 def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
-    """Points (N, 3) of several views, each under the affine map of its view: (N, R).
+    """Points (N, 3) of several views, each under the affine map of its view: (N, R), anything in unused rows.
 
     Args:
         rows: (B, R, 4), the affine map of each view.

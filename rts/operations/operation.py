@@ -24,11 +24,11 @@ _SHAPE = attrgetter("shape")
 
 
 SMALL = 4096
-"""Largest count of numbers, in operands and result, for which the result's shape is checked by the specification."""
+"""Largest count of numbers in operands and result for which the specification checks a result without NaN."""
 
 
 class _Specifying(threading.local):
-    """`on` while a specification is checked. Operations inside it then run as array code, and compile nothing."""
+    """`on` while a specification runs as a check. Operations inside it then run as array code, and compile nothing."""
 
     on = False
 
@@ -41,7 +41,7 @@ def _listed(shapes: Iterable[tuple[int, ...]]) -> str:
 
 
 def known_value(x: Array) -> np.ndarray | None:
-    """The value of an array in host memory; None if it is on another device, or traced."""
+    """The value of an array in the host's memory; None if the array is on another device, or traced."""
     if type(x) is np.ndarray:
         return x
     return value_of(x) if engine_of(x).on_host(x) else None
@@ -56,12 +56,12 @@ Some = Sequence[np.ndarray | None]
 
 @dataclass(frozen=True, eq=False)
 class Operation:
-    """A function of arrays that every engine can differentiate, in forward and reverse mode, and to second order.
+    """A function of arrays that torch and jax can differentiate, in forward and reverse mode, and to second order.
 
     `forward`, `push` and `pull` compute value and first derivatives if arrays are on the host, and all floats have one
     dtype, float32 or float64. Otherwise, and for second derivatives, `specification` runs. Under `vmap` items are
     computed one after another. An operation is called with its operands, and with parameters by name. Parameters are
-    hashable values, not arrays, and are passed to all of its functions.
+    hashable values, not arrays, and are passed to all of its functions but `used`.
 
     `forward`, `push` and `pull` run on the host. Their `operands` are NumPy arrays, C-contiguous and read-only; they
     fill `out` and `results` in place.
@@ -106,7 +106,7 @@ class Operation:
     sweeps: bool = False
 
     _seen: set[tuple] = field(default_factory=set, init=False, repr=False)
-    """Dtype and names of parameters of the calls whose first value has been checked."""
+    """Dtype and parameters' names of calls whose first value has been checked; also `_SHAPED`."""
 
     @classmethod
     def of_loops(
@@ -173,7 +173,7 @@ class Operation:
         self._check_indices()
 
     def _integers(self, name: str) -> tuple[int, ...]:
-        """The field `name` as a tuple of integers."""
+        """The field `name` as a tuple of integers of at least 0; anything else is refused."""
         indices = getattr(self, name)
         if isinstance(indices, (tuple, list)) and all(type(n) is int and n >= 0 for n in indices):
             return tuple(indices)
@@ -199,7 +199,9 @@ class Operation:
         """The result, in the engine of the operands. NumPy arrays beside arrays of another engine are constants.
 
         Raises:
-            InputError: the number of operands, or of the axes of one, is wrong.
+            InputError: an operand is no array, the number of operands or of the axes of one is wrong, or the
+                operation's functions refuse them.
+            EngineError: operands of two engines.
         """
         if len(operands) != len(self.ranks):
             raise InputError(
@@ -230,7 +232,7 @@ class Operation:
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
-        """True if functions on the host take operands of these NumPy dtypes; never while a specification is checked."""
+        """True if compiled code takes operands of these NumPy dtypes; never while a specification runs as a check."""
         first = dtypes[0]
         if _specifying.on or (first != np.float32 and first != np.float64):
             return False
@@ -263,14 +265,15 @@ class Operation:
         return result
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
-        """The result, and the object that `forward` keeps for the derivatives."""
+        """The result, and the object that `forward` keeps for the derivatives, or None."""
         out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         return out, self.forward_on_host(operands, out, params)
 
     def forward_on_host(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> Any:
         """Fill `out` with the value, and return the object that `forward` keeps for the derivatives.
 
-        The first value of each dtype is checked: all of it must be written, and its shape be the specification's.
+        The first value of each dtype and set of parameters is checked: `forward` must write all of it, and its shape
+        be the specification's, which is looked at if the value is small or has NaN.
 
         Raises:
             InputError: `forward` cannot take the operands, or its first value fails the check.
@@ -325,7 +328,7 @@ class Operation:
         )
 
     def push_on_host(self, operands: Arrays, tangents: Some, out: np.ndarray, kept: Any, params: dict) -> None:
-        """Fill `out` (T, ·) with the derivatives along tangents (T, ·)."""
+        """Fill `out` (T, ·) with the derivatives along tangents (T, ·) of T directions; None is a tangent of zeros."""
         options = {**params, "kept": kept} if self.keeps else params
         if self.sweeps:
             self.push(operands, tangents, out, **options)
@@ -334,5 +337,5 @@ class Operation:
             self.push(operands, [None if t is None else t[i] for t in tangents], result, **options)
 
     def pull_on_host(self, operands: Arrays, g: np.ndarray, results: Some, kept: Any, params: dict) -> None:
-        """Fill `results`, given as zeros, with the gradients of the operands; `g` is the gradient of the result."""
+        """Fill `results`, given as zeros or None, with the operands' gradients; `g` is the gradient of the result."""
         self.pull(operands, g, results, **({**params, "kept": kept} if self.keeps else params))

@@ -15,9 +15,9 @@ from rts.operations.operation import Arrays, Operation, Some
 
 
 def projective_map(rows: Array, points: Array) -> Array:
-    """Points (N, 3) under four affine maps (4, 4), as (N, 3): the first two coordinates over the third, and the fourth.
+    """The first two values over the third, and the fourth, (N, 3), of four affine maps (4, 4) of points (N, 3).
 
-    A point whose third coordinate is zero has no image; its result is finite.
+    A point whose third value is zero has no image; its result is finite.
     """
     if is_plain_product(rows, points):
         PROJECTION.check_ranks((rows, points))

@@ -1,7 +1,7 @@
 """Perspective projection of points, and its derivatives: one compiled loop each, on NumPy arrays.
 
-Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two coordinates over the third, and the fourth. A point
-whose third coordinate is zero has no image; its result is finite. All floats are of one dtype.
+Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two values over the third, and the fourth. A point
+whose third value is zero has no image; its result is finite. All floats are of one dtype.
 """
 
 from __future__ import annotations

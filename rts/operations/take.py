@@ -15,7 +15,11 @@ from rts.operations.operation import Arrays, Operation, Some, known_value
 
 
 def take(rows: Array, index: Array) -> Array:
-    """Rows (M, C) of an array (V, C), by their indices (M,). Gradients are added up in the order of the indices."""
+    """Rows (M, C) of an array (V, C), by their indices (M,). Gradients are added up in the order of the indices.
+
+    Raises:
+        InputError: on the host, an index names no row.
+    """
     return TAKE(rows, index)
 
 

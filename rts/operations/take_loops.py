@@ -7,9 +7,9 @@ from rts.compiling.loops import loop
 
 @loop
 def put(start, stop, rows, index, shift, out, bad):
-    """Fill rows [start, stop) of out (M, C) with rows of (V, C) by an index (M,), plus the shift if it has rows.
+    """Fill rows [start, stop) of `out` (M, C) with the rows of (V, C) that `index` (M,) names, plus `shift` (M, C).
 
-    `bad` (1,) is set if an index names no row.
+    An empty `shift` is none. `bad` (1,) is set if an index names no row; that row of `out` is left unwritten.
     """
     count, channels = rows.shape
     for m in range(start, stop):
@@ -23,7 +23,7 @@ def put(start, stop, rows, index, shift, out, bad):
 
 @loop
 def add(values, index, total):
-    """Add rows of (M, C) to rows of (V, C) by an index (M,), in its order. Indices of no row are skipped."""
+    """Add each row of `values` (M, C) to the row of `total` (V, C) that `index` (M,) names; skip indices of no row."""
     for m in range(len(index)):
         if 0 <= index[m] < len(total):
             for c in range(values.shape[1]):

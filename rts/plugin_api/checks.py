@@ -1,4 +1,4 @@
-"""Checks of arguments that users give, with one-line errors, and of tables of triangles."""
+"""Checks of arguments that users give, with one-line errors; tables of triangles; fingerprints of arrays."""
 
 from rts.arrays.argument_checks import check_numbers, check_positive, quoted
 from rts.contracts.checks import is_count

@@ -1,4 +1,4 @@
-"""The splatters in array code, which compiled ones extend."""
+"""The splatters in array code, which compiled ones extend, and cells at outlines."""
 
 from rts.sampling.exits import outline_cells
 from rts.splatting.single_and_multi import Multi, Single

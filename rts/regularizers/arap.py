@@ -43,7 +43,7 @@ class ARAP(OfRestShape):
         weights: (E,) float64, wᵢⱼ, at least 0.
 
     Raises:
-        InputError: an argument is of another kind or shape.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge.
     """
 
     def __init__(self, vertices: Any, faces: Any, weights: str = "cotangent"):
@@ -79,7 +79,7 @@ class ARAP(OfRestShape):
         return engine.call_host(host, [ArraySpec((self.terms, 3), dtype)], spokes)
 
     def _turned(self, spokes: Array) -> tuple[Array, ...]:
-        """`_turned_by_host` in array code: rotations by singular values, as in the paper (eq. 6)."""
+        """The result of `_turned_by_host` in array code: rotations by singular values, as in the paper (eq. 6)."""
         engine, count = engine_of(spokes), len(self._rest)
         xp, rest = engine.namespace, engine.constant(self._at_rest, spokes)
         products = xp.reshape(spokes[:, :, None] * rest[:, None, :], (-1, 9))

@@ -50,7 +50,9 @@ def _turn(start, stop, spokes, rest, starts, out):
 
 @numba.njit(error_model="numpy")
 def _nearest_rotation(columns, axes, rotation):
-    """Fill `rotation` with the R of largest tr(Rᵀ M). `columns` holds the columns of M as rows, and is overwritten.
+    """Fill `rotation` with the R of largest tr(Rᵀ M); the identity if M is zero or not finite.
+
+    `columns` (3, 3) holds the columns of M as rows. It and the scratch array `axes` (3, 3) are overwritten.
 
     Columns are rotated in pairs until all are orthogonal (Hestenes 1958): M V = U Σ. The axis of the least singular
     value follows from the other two, so that U Vᵀ is a rotation. R is unique even if the least singular value is zero.
@@ -98,7 +100,10 @@ def _length(x):
 
 @numba.njit(error_model="numpy")
 def _orthogonalise(columns, axes, p, q):
-    """Rotate two columns, and their axes, until they are orthogonal. Returns False if they were already."""
+    """Rotate rows p and q of `columns`, and of `axes` alike, until those of `columns` are orthogonal.
+
+    Returns False if they were already.
+    """
     first, second, both = 0.0, 0.0, 0.0
     for r in range(3):
         first += columns[p, r] * columns[p, r]

@@ -22,7 +22,7 @@ def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         faces: (T, 3) integers.
 
     Returns:
-        Edges (E, 2) int32, the lower vertex first, in order; and (T, 3), the index of the edge opposite each
+        Edges (E, 2) int32, the lower vertex first, sorted; and (T, 3) int64, the index of the edge opposite each
         corner, or −1 where its ends are one vertex.
 
     Raises:
@@ -48,6 +48,9 @@ def pairs_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Pairs (P, 2) int32; and (P,) float64, 1 where the faces are oriented alike, so that they pass their edge in
         opposite directions, and −1 elsewhere.
+
+    Raises:
+        InputError: there is no edge.
     """
     sides = edges_of(faces)[1].reshape(-1)
     forward = (np.roll(faces, -1, axis=1) < np.roll(faces, -2, axis=1)).reshape(-1)
@@ -85,7 +88,7 @@ def edge_weights(kind: Any, vertices: np.ndarray, faces: np.ndarray) -> tuple[np
         faces: (T, 3) integers.
 
     Raises:
-        InputError: another kind.
+        InputError: another kind, or faces without an edge.
     """
     if not isinstance(kind, str) or kind not in WEIGHTS:
         raise InputError(f"weights is {quoted(kind)}; expected one of {', '.join(WEIGHTS)}")

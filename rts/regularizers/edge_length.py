@@ -37,7 +37,7 @@ class EdgeLength(OfRestShape):
         edges: (E, 2) int32, the lower vertex first.
 
     Raises:
-        InputError: an argument is of another kind or shape.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge.
     """
 
     def __init__(self, vertices: Any, faces: Any, target: str | float = "rest"):

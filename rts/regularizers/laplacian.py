@@ -22,9 +22,9 @@ class Laplacian(OfRestShape):
 
     δᵢ = Σⱼ wᵢⱼ (vⱼ − vᵢ) / Σⱼ |wᵢⱼ| over the neighbours j of vertex i is the offset from their mean (Sorkine et al.
     2004, *Laplacian Surface Editing*). Uniform weights are 1. Cotangent weights are ½ (cot α + cot β) of the two angles
-    opposite the edge at rest (Pinkall and Polthier 1993). With these δ points along the normal; inside a flat sheet it
-    is zero for any linear function, on uneven triangles, too. Cotangent weights may be negative at obtuse angles, hence
-    the absolute values. Where more than two faces share an edge, all of their angles count; at a border the only one.
+    opposite the edge at rest (Pinkall and Polthier 1993). With these, δ of the mesh at rest points along the normal,
+    and inside a flat sheet δ is zero, on uneven triangles, too. Cotangent weights may be negative at obtuse angles,
+    hence the absolute values. Where more than two faces share an edge, all of their angles count; at a border the one.
     Cotangents are bounded: angles below a twentieth of a degree count as that, and so do triangles without area.
 
     Without `relative` the energy shrinks and flattens the mesh, and draws borders inwards. With `relative`, shifts cost
@@ -43,7 +43,7 @@ class Laplacian(OfRestShape):
         weights: (E,) float64, wᵢⱼ.
 
     Raises:
-        InputError: an argument is of another kind or shape.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge.
     """
 
     def __init__(self, vertices: Any, faces: Any, weights: str = "uniform", relative: bool = False):

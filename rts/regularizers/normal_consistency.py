@@ -1,4 +1,4 @@
-"""The energy `NormalConsistency`, which aligns the normals of adjacent faces."""
+"""The energy `NormalConsistency`, which grows with the angles between normals of faces that share an edge."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class NormalConsistency(Regularizer):
         pairs: (P, 2) int32 into faces.
 
     Raises:
-        InputError: an argument is of another kind or shape.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge.
     """
 
     def __init__(self, vertices: Any = None, faces: Any = None):

@@ -48,7 +48,7 @@ class Regularizer(abc.ABC):
 
     @uncompiled
     def residuals(self, vertices: Array) -> Array:
-        """Residuals whose sum of squares is the energy, for `rts.fit(method="lm")`; see the class.
+        """Residuals whose sum of squares is the energy, for `rts.fit(method="lm")`; each class says of which shape.
 
         Args:
             vertices: (V, 3) float32 or float64.
@@ -72,7 +72,7 @@ class Regularizer(abc.ABC):
 
     @abc.abstractmethod
     def _residuals(self, vertices: Array) -> Array:
-        """`residuals` of checked vertices."""
+        """The residuals of checked vertices; see `residuals`."""
 
 
 class OfRestShape(Regularizer):
@@ -83,7 +83,7 @@ class OfRestShape(Regularizer):
         faces: (T, 3) integers into vertices; copied.
 
     Raises:
-        InputError: an argument is of another kind or shape.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing vertices.
     """
 
     def __init__(self, vertices: Any, faces: Any):
@@ -101,7 +101,11 @@ def check_count(count: int, expected: int) -> None:
 
 
 def known_vertices(name: str, vertices: Any, faces: np.ndarray) -> np.ndarray:
-    """A copy (V, 3) float64 of vertices at rest, refused if faces name a vertex that does not exist."""
+    """A copy (V, 3) float64 of vertices at rest.
+
+    Raises:
+        InputError: vertices are not (V, 3) finite numbers, or traced; faces name a vertex that does not exist.
+    """
     shape = shape_of(vertices := from_numbers(vertices, name))
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise InputError(f"{name} is {quoted(vertices)}; expected (V, 3) numbers, at least one row")

@@ -52,7 +52,7 @@ def render_views(
     Gradients of hidden parts may differ more where layers are closer than float32 resolves at their distance. The
     threshold for equal depths is set by the farthest view, and is up to twice that of a single view.
 
-    Views lie side by side in one picture of at most 1024² cells. Python's overhead, results for the whole of θ such as
+    Views lie side by side in pictures of at most 1024² cells. Python's overhead, results for the whole of θ such as
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
     shaders without mipmaps do. With jax, and under `torch.func`, views share a picture only if all fit into one, and if
     each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are with
@@ -77,6 +77,7 @@ def render_views(
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
         EngineError: torch and jax arrays in one scene.
+        PluginError: a plugin cannot be imported, such as for want of a package.
 
     Warns:
         EmptyImageWarning: nothing is seen in a view; the warning says why.

@@ -74,11 +74,14 @@ def render(
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
         EngineError: torch and jax arrays in one scene.
+        PluginError: a plugin cannot be imported, such as for want of a package.
 
     Warns:
         EmptyImageWarning: nothing is seen; the warning says why.
         AspectWarning: the camera is for images of another ratio of width to height.
-        InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`.
+        InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`; nothing reads an entry of θ; a
+            culled part is wound inside out.
+        LayersWarning: surfaces or light behind the last layer are left out.
     """
     scene = Scene.of(parts, camera, sampler, engine)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
@@ -92,7 +95,7 @@ def image_over(scene: Scene, size: tuple[int, int], background: Array | None, se
 
 
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image (H, W, C + 1) of a checked scene, without a background; `context` is that of `splatted`."""
+    """The image (H, W, C + 1) of a checked scene, without a background; for `context` see `splatted`."""
     if settings.contrast is not None:
         return _of_contrast(scene, size, context, settings)
     bands, reader = settings.bands(size), settings.reader
@@ -151,7 +154,7 @@ def render_samples(
     Args:
         sampled: the result of `sample` for these parts. θ, transform and camera may have other values now, with one
             exception: if a part's θ is NumPy, beside torch or jax arrays, `sample` may have evaluated its surface, and
-            new values have no effect.
+            new values have no effect. Samples taken with `settles=True` need the same values.
         parts: as in `render`.
         camera: as in `render`.
         splatter: as in `render`.
@@ -159,11 +162,11 @@ def render_samples(
         engine: as in `render`.
 
     Returns:
-        (H, W, 4) premultiplied linear RGBA, row 0 on top.
+        The image (H, W, 4), or (H, W, C + 1), as in `render`.
 
     Raises:
-        InputError: the samples are of other parts, their apron is too narrow for the splatter, or samples that it
-            needs were left out.
+        InputError: an argument is wrong; the samples are of another number of parts, their apron is too narrow for the
+            splatter, or samples that it needs were left out.
         EngineError: torch and jax arrays in one scene.
     """
     if not isinstance(sampled, Sampled):

@@ -62,6 +62,10 @@ def prepare(
     Returns:
         The parts with their structures. Later changes to vertices have no effect; `replace` changes transforms, shaders
         and the rest of θ.
+
+    Raises:
+        InputError: an argument is wrong or traced, or a surface's triangles depend on a view that is not given.
+        PluginError: the sampler cannot be imported, such as for want of a package.
     """
     return PreparedParts.of(parts, sampler, camera, size)
 
@@ -96,7 +100,7 @@ class Renderer:
             **changes: its `transform`, `theta`, `shader` or `cull`, for this call alone.
 
         Returns:
-            (H, W, 4) premultiplied linear RGBA.
+            (H, W, 4) or (H, W, C + 1), as in `render`.
 
         Raises:
             InputError: there is no such part or field, or its value is wrong.

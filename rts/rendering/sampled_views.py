@@ -195,9 +195,9 @@ def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tupl
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
-    """Leave out samples beyond the capacity of each view, deepest layers first. Returns their number.
+    """Set False what exceeds `capacity` in each view, deepest layers first. Returns the number of these samples in all.
 
-    `kept` (K, height, width) is changed in place.
+    `kept` (K, height, width) bool is of the whole picture, and is changed in place.
     """
     over = 0
     for lines, columns in picture.places():
@@ -360,7 +360,10 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
-    """The number (B,) of samples of each view, which have one cell each; rows beyond all go to the first view."""
+    """The number (B,) of samples of each view, from `row` (K, height, width), in which each has one cell.
+
+    If there are more than these, `rows` in all, the others count as the first view's.
+    """
     from rts.sampling import packing_loops
 
     assert row is not None

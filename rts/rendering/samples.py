@@ -65,6 +65,7 @@ def sample(
     Raises:
         InputError: an argument is wrong; the scene cannot be sampled.
         EngineError: torch and jax arrays in one scene.
+        PluginError: a plugin cannot be imported, such as for want of a package.
     """
     scene = Scene.of(parts, camera, sampler, engine)
     check_flag("settles", settles)

@@ -61,7 +61,7 @@ class Scene(NamedTuple):
         return cls(checked, camera, *fields, context_of_scene(checked, camera, engine=engine))
 
     def at(self, size: tuple[int, int]) -> Scene:
-        """The scene for images of a size."""
+        """The scene with its camera made for images of a size; an AspectWarning if the camera is for another ratio."""
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
 
@@ -75,7 +75,7 @@ class Scene(NamedTuple):
         return [suited_sampler(sampler, part, self.camera) for sampler, part in pairs]
 
     def context_with(self, *others: Tree) -> Context:
-        """The context of the scene with further arrays, such as a background."""
+        """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""
         context = context_of_scene(self.parts, self.camera, *others)
         return context if context.engine.differentiates else self.context
 

@@ -23,7 +23,11 @@ from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
-    """The part's G-buffer at the samples, local space; not evaluated anew if the samples carry all of it."""
+    """The part's G-buffer at the samples, local space.
+
+    The samples' own G-buffer is taken, if they have one, where the surface's θ is constant and the G-buffer has all
+    that the shader reads.
+    """
     theta = _read(part)
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
@@ -46,14 +50,14 @@ def _read(part: CheckedPart) -> dict[str, Tree]:
 
 
 def shaded_at_once(part: CheckedPart) -> bool:
-    """True if a part's shader takes the samples of several views in one call."""
+    """True if a part's shader takes the samples of several views in one call, or gives one colour."""
     # The footprint of a sample depends on the camera of its view.
     needs_no_footprint = part.reads is not None and FOOTPRINT not in part.reads
     return part.uniform or (part.takes_views and needs_no_footprint)
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
-    """The θ that a part's shader sees; entries that the surface does not read become constants of the engine."""
+    """The θ that a part's shader sees; NumPy entries that the surface does not read become the engine's constants."""
     reads = part.surface.reads(part.theta)
     return {k: v if k in reads else context.constants(v) for k, v in part.theta.items()}
 
@@ -66,7 +70,7 @@ def add_footprint(
     grid: tuple[int, int],
     context: Context,
 ) -> None:
-    """Defer "uv_footprint" in the G-buffer `local` of samples in one view, if it has "uv".
+    """Add a deferred "uv_footprint" to the G-buffer `local` of samples in one view, if it has "uv" but no footprint.
 
     Arguments are as in `uv_footprint`; `own` is its camera.
     """
@@ -198,7 +202,7 @@ def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
 
 
 def _move_normals(transform: Array, normals: Array) -> Array:
-    """Normals under an affine map: times the cofactor matrix, turned so that a mirror image keeps its outside."""
+    """Normals (N, 3), of any length, under an affine map: times the cofactor matrix; a mirror keeps them outward."""
     xp = namespace(transform)
     a, b, c = (transform[:3, i] for i in range(3))
     cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]

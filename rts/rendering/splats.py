@@ -253,9 +253,9 @@ def _shown_in_views(
 
 
 def _on_rays(samples: Samples, position: Array) -> Array:
-    """Positions (N, 3) of samples, moved onto the rays of their cells; derivatives stay.
+    """Positions (N, 3) of samples, moved onto the rays of their cells unless they are centred; derivatives stay.
 
-    Splatters need samples that move from the centres of their cells. On the rays, projections are finite, too.
+    Splatters need samples whose motion starts at their cells' centres. On the rays, projections are finite, too.
     """
     if samples.centered:
         return position

@@ -69,7 +69,7 @@ class Adaptive:
         """The `supersample` written as a text: "4", "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2".
 
         Raises:
-            InputError: the text has none of these forms.
+            InputError: the text has none of these forms, or a number of `Adaptive` is out of range.
         """
         kind, *rest = (word.strip().lower() for word in text.split(":"))
         number, *further = rest if rest and kind == "adaptive" else [kind]
@@ -165,6 +165,8 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
 
 def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
     """Cells (H, W) bool where the front's colour has a second difference above `least` along any of four directions.
+
+    A difference is of three covered cells in a line.
 
     Args:
         row: (H, W), the row of each front in `rgba`; −1 in empty cells.

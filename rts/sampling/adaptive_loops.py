@@ -9,7 +9,7 @@ from rts.compiling.loops import compiled, loop
 
 @loop
 def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, marks):
-    """Mark the cells of rows [start, stop) whose front ends towards a neighbour, or a neighbour's towards them.
+    """Fill rows [start, stop) of `marks`: 1 where a cell's front ends towards a neighbour, or a neighbour's towards it.
 
     Args:
         start: first row.
@@ -53,7 +53,7 @@ def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, ma
 
 @compiled
 def _differ(marks, above, level, below):
-    """Mark the cells of a row whose part, −1 for none, differs from a neighbour's."""
+    """Fill `marks` (W,): 1 for cells whose part, −1 for none, differs from one of their eight neighbours'."""
     for x in range(len(marks)):
         own = level[x + 1]
         found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
@@ -63,7 +63,7 @@ def _differ(marks, above, level, below):
 
 @compiled
 def _unite(near, above, level, below):
-    """Mark the cells in `near` whose 3 × 3 window has a mark in the three rows. Returns True if there are any."""
+    """Fill `near` (W,): 1 for cells whose 3 × 3 window has a mark in the three rows. Returns True if there are any."""
     some = np.uint8(0)
     for x in range(len(near)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
@@ -75,7 +75,7 @@ def _unite(near, above, level, below):
 
 @compiled
 def _ends(row, depth, y, x, beyond, margin, continued):
-    """True if the front of a cell ends towards one of its neighbours; all these cells are covered."""
+    """True if the front of the cell (y, x) may end towards one of its neighbours; all these cells must be covered."""
     _, height, width = row.shape
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1

@@ -15,7 +15,7 @@ from rts.scene.camera import Camera
 
 
 def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:
-    """The likely cause, for each part, of an image without samples, or with transparent ones only."""
+    """The likely cause, for each of the first four parts, of an image without samples, or with transparent ones."""
     causes = [_cause(part, camera) for part in parts]
     if len(parts) == 1:
         return causes[0].format("the part")
@@ -45,7 +45,10 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
 
 
 def out_of_view(part: CheckedPart, camera: Camera) -> str | None:
-    """The place of a part outside of the view, such as "lies behind …"; None if it may be seen, or is traced."""
+    """The place of a part outside of the view, such as "lies behind …".
+
+    None if the part may be seen, has no triangles, or is traced.
+    """
     if not isinstance(part.surface, TriangleSurface):
         return None
     known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))

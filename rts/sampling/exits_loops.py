@@ -36,7 +36,10 @@ def find(kept, cells):
 
 @loop
 def mark_ends(start, stop, cells, covered, depth, ends):
-    """Mark covered cells [start, stop) of a list whose front ends towards a neighbour; see `exits.outline_cells`."""
+    """Fill `ends` (M,) for covered cells [start, stop) of a list: True where the front ends towards a neighbour.
+
+    See `exits.outline_cells`.
+    """
     layers, height, width = covered.shape
     for i in range(start, stop):
         ends[i] = _ends(covered, depth, cells[i] // width, cells[i] % width, layers, height, width)

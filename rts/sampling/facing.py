@@ -42,7 +42,7 @@ def facing_of_views(
     view: tuple[int, ...],
     listed: bool = False,
 ) -> np.ndarray:
-    """`facing` of views (height, width) that lie side by side, line after line; each has a camera."""
+    """The result of `facing` for views (height, width) side by side, line after line, with a camera for each."""
     from rts.sampling import facing_loops
 
     behind = np.count_nonzero(kept[1:])

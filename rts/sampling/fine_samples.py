@@ -71,7 +71,8 @@ def fine_samples(
         hidden: the rule for hidden samples of an image; None to keep all.
         layers: K, or "auto".
         capacity: rows to allot; None for as many as there are, or could be if coarse samples are traced.
-        flat: True if inactive pixels show one colour alone. If none lacks room, the result is marked `Fine.flat`.
+        flat: True if inactive pixels show one colour alone. The result is then marked `Fine.flat`, unless pixels lack
+            room, no coarse cell is settled, or coarse samples are traced.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
     most, coarse_arrays = (

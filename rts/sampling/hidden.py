@@ -38,9 +38,9 @@ def hidden_by(
 ) -> HiddenRule | None:
     """The rule that drops hidden samples of a scene; None to keep all.
 
-    A hidden sample has no effect only behind samples of opaque parts that lie on cells' centres, and if no number of
-    the scene is so large that rounding reorders depths. Where these numbers are traced, those of the triangles serve;
-    all samples are kept if there are no triangles, or if samples are refined.
+    A sample is dropped only behind samples of opaque parts, and while no number of the scene is so large that rounding
+    reorders depths. Where these numbers are traced, those of the triangles serve; all samples are kept then if a part
+    has no triangles, or refines its samples. All are kept if the splatter has no `needed`, or no part is opaque.
 
     Args:
         splatter: the splatter.
@@ -93,7 +93,7 @@ class HiddenBySplatter:
     settles: bool
 
     def unsized(self) -> HiddenBySplatter:
-        """The rule for depths in units of their own, for which `size` has no meaning."""
+        """The rule with `size` 0, for depths in units of their own."""
         return replace(self, size=0.0)
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
@@ -150,7 +150,7 @@ class HiddenBehindOpaque:
         return replace(self, rule=self.rule.unsized())
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
-        """See `HiddenBySplatter`; the samples of one part alone are all needed."""
+        """See `HiddenBySplatter`; if the question has no `part`, all samples are needed."""
         covered, depth, _, part = question
         if part is None:
             return Decision(covered, None, covered)
@@ -181,7 +181,7 @@ def numbers_of(settled: np.ndarray) -> np.ndarray:
 def with_layers_that_count(
     taken: Callable[[int, Hidden | None], Sampled], hidden: Hidden | None, opaque: Sequence[bool]
 ) -> Sampled:
-    """A scene sampled with as many layers as its image needs.
+    """A scene sampled with as many layers as its image needs, up to `LAYER_LIMIT`; a LayersWarning if that is too few.
 
     If parts are translucent, an empty layer is added: it says that nothing lies behind the others.
 
@@ -189,6 +189,9 @@ def with_layers_that_count(
         taken: samples the scene with a number of layers, without the samples that a rule drops.
         hidden: the rule; None to keep all.
         opaque: for each part, whether its shader promises to be opaque.
+
+    Raises:
+        InputError: the samples are traced.
     """
     count = 3  # A closed surface before nothing needs two: the second at its outlines.
     while True:
@@ -221,7 +224,13 @@ def _ran_out(sampled: Sampled) -> bool:
 
 
 def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> Sampled:
-    """The scene without the samples that a decision does not keep; one host call."""
+    """The scene without the samples that a decision does not need, and without single exits away from outlines.
+
+    One host call.
+
+    Raises:
+        InputError: `row` or `exit` names a sample that does not exist.
+    """
     sizes = [s.ids.shape[0] for s in sampled.samples]
     total, part = sum(sizes), sampled.part
 

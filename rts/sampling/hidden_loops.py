@@ -56,7 +56,7 @@ def _mark(start, stop, row, kept, used):
 
 @loop
 def _number(start, stop, used, firsts, numbers, index, counts):
-    """Number the rows of parts [start, stop)."""
+    """Fill, for parts [start, stop), the new `numbers` of rows (N,), −1 if unused; used rows `index`; and `counts`."""
     for part in range(start, stop):
         first, count = firsts[part], 0
         for i in range(first, firsts[part + 1]):

@@ -44,7 +44,7 @@ class Shape(NamedTuple):
         return self.layers * self.size[0] * self.size[1] if self.capacity is None else self.capacity
 
     def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
-        """The spec of an array with a row for each sample."""
+        """The spec of an array (rows, *widths) with a row for each sample."""
         return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
 
     def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:

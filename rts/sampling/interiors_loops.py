@@ -20,7 +20,7 @@ def settle(
     reach: int,
     wanted: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Cells (H, W) bool whose 3 × 3 window is all fronts, without kept hidden samples. Drop samples only they need.
+    """Find cells amid fronts, and drop from `kept` the samples that only these cells need.
 
     Samples within reach of any other wanted cell stay. So do the nearest and the farthest front, since splatters
     measure differences of depth relative to these two.
@@ -30,7 +30,10 @@ def settle(
         depth: (K, H, W) float, of one dtype.
         kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
         reach: of the splatter, in cells.
-        wanted: (H, W) bool, the cells that are shown; None for all, and for cells beyond the edges of the grid.
+        wanted: (H, W) bool, the cells that are shown; None for all, those beyond the grid included.
+
+    Returns:
+        (H, W) bool, True for cells whose 3 × 3 window is all fronts, without kept hidden samples.
     """
     layers, height, width = covered.shape
     wanted = np.empty((0, width), np.bool_) if wanted is None else np.ascontiguousarray(wanted)
@@ -47,7 +50,7 @@ def settle(
 
 @loop
 def _settle(start, stop, covered, kept, wanted, reach, found, near):
-    """Fill rows [start, stop) of `found`, cells amid one colour, and of `near`, cells within reach of other cells."""
+    """Fill rows [start, stop) of `found`, cells amid fronts, and of `near`, cells within reach of other wanted ones."""
     layers, height, width = covered.shape
     around = reach + 1
     rows = stop - start + 2 * around

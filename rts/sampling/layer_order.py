@@ -104,7 +104,10 @@ def refined(
 
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
-    """The rays of packed samples (N, 3). A single row that no cell refers to gets the ray of the first cell."""
+    """The rays (N, 3) of packed samples; those of rows that no cell names are undefined.
+
+    A single row that no cell names gets the ray of the first cell.
+    """
     from rts.sampling import layer_order_loops
 
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
@@ -132,7 +135,7 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
         spread: the `spread` of `Rays`, local units.
 
     Returns:
-        Samples with a new `row` and `depth`; samples before the near or beyond the far plane are dropped.
+        Samples with a new `row` and `depth`; samples nearer than the near plane or beyond the far plane are dropped.
     """
     from rts.sampling import layer_order_loops
 

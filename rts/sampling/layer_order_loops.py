@@ -46,7 +46,7 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
 
 @compiled
 def _ray(x, y, p, inverse, origin, direction):
-    """The ray through a point of the image, in NDC. See `rts.Camera.rays`."""
+    """Fill `origin` and `direction` (3,) with the ray through the point (x, y) of NDC. See `rts.Camera.rays`."""
     a, b, across, lean = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1], x * p[3, 3] - p[0, 3], p[0, 2] - x * p[3, 2]
     c, d, down, fall = p[1, 0] - y * p[3, 0], p[1, 1] - y * p[3, 1], y * p[3, 3] - p[1, 3], p[1, 2] - y * p[3, 2]
     determinant = a * d - b * c
@@ -82,7 +82,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
 
 @loop
 def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
-    """Fill the rays of the samples `row` (K, M) of M cells, which are at `lines` (M,) and `columns` (M,)."""
+    """Fill `origins` and `directions` (N, 3) of the samples `row` (K, M) of M cells at `lines` and `columns` (M,)."""
     height, width = size
     for k in range(len(row)):
         for m in range(len(lines)):

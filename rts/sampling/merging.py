@@ -14,7 +14,10 @@ from rts.errors import InputError
 
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
-    """Interleave the layers of several parts by depth and keep the nearest; at ties the earlier part is first."""
+    """Interleave the layers of several parts by depth and keep the nearest `layers`; the earlier part is first at ties.
+
+    A single part keeps its cells as they are.
+    """
     overflow = samples[0].overflow
     for s in samples[1:]:
         overflow = overflow + s.overflow
@@ -54,9 +57,9 @@ def _nothing_told(row: Array) -> Array:
 
 
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
-    """Part, row within the part, depth and facing (K, H, W), merged from row, depth and facing of each part.
+    """Part, row within the part, depth and facing (K, H, W), merged from those of all parts.
 
-    Facing is missing if `tables` are without it.
+    `tables` are the rows of all parts, then their depths, then their facings. Without facings, none is returned.
     """
     xp, count = namespace(tables[0]), len(sizes)
     rows, facing = tables[:count], tables[2 * count :]
@@ -84,7 +87,7 @@ def _of_part(facing: Array, part: int, count: int) -> Array:
 
 
 def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
-    """`_interleaved`, compiled: sorting many short columns takes array code far longer."""
+    """`_interleaved`, compiled, for known arrays: sorting many short columns takes array code far longer."""
     count = len(sizes)
     rows, depths = tables[:count], tables[count : 2 * count]
     shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])

@@ -63,7 +63,10 @@ def _merge(
     merged_depth,
     merged_facing,
 ):
-    """Merge a part into the parts before it, merged already. If `part` is empty, only one part came before."""
+    """Fill lines [start, stop) of `merged_*` (K, H, W) with a part and the parts before it, which are merged already.
+
+    If `part` is empty, only one part came before. `own_*` are of part `number` of `count`.
+    """
     before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(facing) > 0
     for y in range(start, stop):
         for x in range(row.shape[2]):
@@ -97,7 +100,7 @@ def _merge(
 
 @compiled
 def _of_part(facing, part, count, more):
-    """The number of a part's piece among those of all parts; 0 if it would be too large."""
+    """`Cells.facing` with the part's piece numbered among those of all parts; 0 if the number would be too large."""
     size = abs(np.int64(facing))
     beyond = more if size >= more else 0
     number = (size - beyond) * count + part

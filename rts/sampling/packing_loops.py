@@ -20,7 +20,7 @@ def pack(
     *more: tuple[Fragments, np.ndarray],
     views: tuple[int, int] = (1, 1),
 ) -> tuple[Any, ...]:
-    """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of samples.
+    """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of these cells.
 
     Args:
         fragments: the fragments of all layers.
@@ -29,7 +29,7 @@ def pack(
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
         capacity: rows to allot, or 0 for as many as are taken, at least one.
         *more: further fragments, and the ones to take, for rows behind all others, at most K · H · W in all. Their
-            `row` is returned last; the number of samples does not include them.
+            `row` is returned last; the number of cells does not include them, but those that found no room.
         views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
     grids = [_Lines.of(fragments, kept, views), *(_Lines.of(*given) for given in more)]
@@ -83,7 +83,7 @@ class _Lines(NamedTuple):
 
 
 def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
-    """The number of kept cells, of (K, H, W) bool, in each view of a grid of `views` (down, across)."""
+    """The number of kept cells, of (K, H, W) bool, in each view of a grid of `views` (down, across): (B,)."""
     layers, height, width = kept.shape
     lines, counts = kept.reshape(-1, width // views[1]), np.zeros(layers * height * views[1], np.int64)
     parallel(_count, len(lines), np.ascontiguousarray(lines), counts, work=kept.size // 8)

@@ -1,4 +1,4 @@
-"""Checks of cameras, proxies, fragments, samples and refined samples, on the host. To refuse is an InputError."""
+"""Checks of cameras, proxies, fragments, samples and refined samples, on the host; "refused" means an InputError."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any
 
 
 def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
-    """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
+    """The proxy with contiguous arrays of the right dtypes; wrong shapes, widths and indices are refused."""
     if not isinstance(proxy, Proxy):
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected a Proxy")
     vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
@@ -64,7 +64,7 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
 
 
 def check_faces(proxy: Proxy, surface: Any = None) -> None:
-    """Refuse triangles that name no vertex, before compiled code reads there."""
+    """Refuse faces with an index that is no vertex's, before compiled code reads there."""
     if not len(proxy.faces):
         return
     least, most = table_extent(proxy.faces)
@@ -94,7 +94,7 @@ def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: 
 
 
 def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
-    """The result of a surface's `pieces`, refused where compiled code would read out of its bounds."""
+    """The result of a surface's `pieces`, refused unless it is int16 of (T,) or (1,)."""
     pieces = np.asarray(surface.pieces(proxy))
     if pieces.dtype != np.int16 or pieces.shape not in ((1,), (len(proxy.faces),)):
         raise InputError(
@@ -108,7 +108,7 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
     """A sampler's samples of a part, refused where their arrays do not fit the grid, or one another.
 
     Args:
-        samples: the samples; traced values are not checked.
+        samples: the samples; of traced ones only shapes and dtypes are checked.
         grid: (H, W) of the cells.
         sampler: the sampler.
     """
@@ -160,7 +160,8 @@ WELL_CONDITIONED = 1e-6
 def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
     """The camera of host matrices, refused where it makes no image.
 
-    They must be finite and invertible, the last row of the view 0, 0, 0, 1, and that of the projection 0, 0, c ≤ 0, d.
+    Its matrices must be finite and invertible. The last row of the view must be 0, 0, 0, 1, and that of the projection
+    0, 0, c ≤ 0, d.
 
     Args:
         camera: float64; its view is that of the camera times the part's transform.

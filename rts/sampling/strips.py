@@ -64,7 +64,7 @@ class FineGrid(NamedTuple):
 
     @property
     def gap(self) -> int:
-        """Pixels of width that the aprons of a run take, left and right together."""
+        """Pixels of width that the aprons of a run take, left and right together, rounded up."""
         return -(-2 * self.apron // self.side)
 
     @property
@@ -155,8 +155,8 @@ def lay_out(
         active: (H, W) bool, the active pixels.
         grid: the sizes.
         room: the room; None for as much as needed.
-        sizes_of: needed number of columns, or of lines of cells → the number to allot. None if shapes follow from
-            `room`.
+        sizes_of: needed number of columns, or of lines of cells → the number to allot. None for the numbers of `room`,
+            or without room for as many as needed.
     """
     from rts.sampling import strips_loops
 
@@ -188,7 +188,7 @@ def lay_out(
 
 
 def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """The first pieces, with at most `most` cells; and the number of their cells in each line of the grid."""
+    """The first pieces, with at most `most` cells (None for all); and the number of their cells in each grid line."""
     from rts.sampling import strips_loops
 
     def counted(n: int) -> np.ndarray:
@@ -258,9 +258,9 @@ class HiddenInStrips:
         return Decision(self._listed(kept, needed), numbers_of(amid), needed)
 
     def _listed(self, marks: np.ndarray, among: np.ndarray, kinds: np.ndarray | None = None) -> np.ndarray:
-        """Listed cells (K, L, LINE) with a mark (K, h, w) in the layout; with `kinds`, only marks near wanted cells.
+        """Cells (K, L, LINE) bool of the list: true where `among` is, and `marks` (K, h, w) of the layout mark it.
 
-        Other marks are then cleared.
+        With `kinds`, marks that are not near wanted cells are first cleared, in `marks` itself.
         """
         from rts.sampling import strips_loops
 
@@ -332,7 +332,7 @@ def _arranged(
     width: int,
     settled: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
-    """The arrays that `strips_loops.arrange` fills; there is always at least one splat."""
+    """Index, shift, laid, part and shown, as `strips_loops.arrange` fills them; there is always at least one splat."""
     from rts.sampling import strips_loops
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
@@ -376,6 +376,8 @@ def _with_exits(
 
 def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     """The samples of listed cells, selected from those of all cells, for samplers that do not follow lists.
+
+    They are without exits and settled cells.
 
     Args:
         whole: samples of the whole grid.

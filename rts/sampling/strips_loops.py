@@ -82,7 +82,7 @@ def number(active, pieces, high, pitch, across, pixel):
 
 @compiled
 def _needs(needs, active, line, strip, first, columns, side, apron, high):
-    """Mark the columns of a piece whose active pixels need a line of cells of the grid. True if there are any."""
+    """Fill `needs`: 1 for the columns of a piece whose active pixels need a line of cells. Returns True if any do."""
     needs[:columns] = 0
     top, bottom = strip * high, min(len(active), (strip + 1) * high)
     begin, end = _pixels(line, side, apron)
@@ -211,7 +211,7 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
 
 @compiled
 def _repeat(to, given, more):
-    """Copy numbers and add `more` to each, except to −1."""
+    """Fill `to` with the numbers `given`, `more` added to each but −1."""
     more = to.dtype.type(more)
     for u in range(len(to)):
         to[u] = given[u] + more if given[u] >= 0 else given[u]
@@ -219,7 +219,10 @@ def _repeat(to, given, more):
 
 @compiled
 def _number(numbers, cells, first, n):
-    """Number the cells of a run that have no number yet, from n on. Returns the next number."""
+    """Number the cells of a run that have no number yet, from n on, and list them in `cells`. Returns the next number.
+
+    `first` is the flat index of the run's first cell in the grid.
+    """
     known = False
     for u in range(len(numbers)):
         known |= numbers[u] >= 0
@@ -243,7 +246,7 @@ def _copy(to, given):
 
 @compiled
 def _near(line, side, apron):
-    """First and end of the lines of pixels near a line of cells of the grid, and the line of pixels that holds it."""
+    """First and end of the lines of pixels within two cells, or the apron, of a line of cells; and its own line."""
     begin, end = _pixels(line, side, apron)
     own = line - apron
     return max(begin, (own - side - 2) // side + 1), min(end, (own + 2) // side + 1), own // side
@@ -251,7 +254,7 @@ def _near(line, side, apron):
 
 @compiled
 def _tell(kinds, active, near, strip, first, columns, side, apron, high):
-    """Set the bits of a line of cells of a piece, from the active pixels on `near` lines of pixels."""
+    """Set bits in `kinds`, a line of cells of a piece, from the active pixels on the lines of pixels of `_near`."""
     around = min(apron, 2)
     begin, end, own = near
     for y in range(max(strip * high, begin), min(len(active), (strip + 1) * high, end)):
@@ -322,7 +325,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
 
 @loop
 def gather(start, stop, covered, depth, place, laid, deep):
-    """Copy cover and depth of cells (K, M) into lines [start, stop) of a layout, of K · h lines in all layers."""
+    """Fill lines [start, stop), of K · h, of `laid` and `deep` (K, h, w) with cover and depth of cells (K, M)."""
     height = len(place)
     for line in range(start, stop):
         k, y = line // height, line % height

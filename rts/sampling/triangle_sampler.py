@@ -202,9 +202,9 @@ class TriangleSampler(Sampler):
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
-        Sides are not recorded for surfaces that move samples off their triangles. Exits are not recorded for surfaces
-        with a `refine` but no `refine_outlines`, and for surfaces that are not `centered`. Lists of cells get only
-        those of `refine_outlines`.
+        Sides are recorded for parts that are not culled, of surfaces with `pieces` that do not move their samples.
+        Exits are recorded for parts with cull="back", of centred surfaces without `refine`, but not for lists of cells.
+        Pairs at outlines are recorded for surfaces with `refine_outlines` that do not move their samples.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -349,7 +349,8 @@ class _Search:
     def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
         """The prepared entry, the fragments (K, ·, ·), and their covered cells.
 
-        With `exits` also the decision on the fragments, and the exits of rays from the part; otherwise None for both.
+        With `exits` also the exits of rays from the part and, if it has triangles, the decision on the fragments; else
+        None for these.
         """
         sampler, (camera, view) = self.sampler, (self.camera, self.shape.view)
         grid = layers, *self.shape.size

@@ -22,7 +22,10 @@ _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
-    """Warn of culled parts that are wound inside out; each surface is checked only once."""
+    """Warn of culled parts that are wound inside out; each surface is checked once, while it is not traced.
+
+    Surfaces whose triangles are costly or depend on the view are left out.
+    """
     for index, part in enumerate(parts):
         if part.cull != "back" or _triangles_of(part) is None or not _is_new(part.surface):
             continue
@@ -49,7 +52,8 @@ INSIDE_OUT = "is closed and wound inside out: cull='back' leaves out the side th
 def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
     """True if a culled part is closed, seen from outside, and its triangles face its inside; None if it is traced.
 
-    A part seen from within, such as a room, is right with triangles that face its inside.
+    A part seen from within, such as a room, is right with triangles that face its inside. False for parts that
+    `warn_of_winding` leaves out.
     """
     surface = _triangles_of(part)
     if part.cull != "back" or surface is None:

@@ -12,14 +12,14 @@ from rts.compiling.loops import compiled
 
 @compiled
 def add(marks, more):
-    """Add the marks of `more` (W,) to a row of marks, uint8."""
+    """Add the marks of `more` (W,) to `marks` (W,) uint8."""
     for x in range(len(more)):
         marks[x] |= np.uint8(more[x])
 
 
 @compiled
 def spread(found, above, level, below):
-    """Mark the cells of a row (W,) with a mark in their 3 × 3 window; the other rows have a cell more at each side."""
+    """Fill `found` (W,) with the marks of each cell's 3 × 3 window, in rows with one more cell at each side."""
     for x in range(len(found)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         found[x] = around | below[x] | below[x + 1] | below[x + 2]
@@ -27,6 +27,6 @@ def spread(found, above, level, below):
 
 @compiled
 def unite(found, a, b, c):
-    """Mark the cells of `found` that any of three rows marks, uint8; these rows may be longer."""
+    """Fill `found` (W,) uint8 with the marks of three rows together; these rows may be longer."""
     for x in range(len(found)):
         found[x] = a[x] | b[x] | c[x]

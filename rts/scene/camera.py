@@ -5,8 +5,8 @@
 - Image row 0 is on top; the centre of pixel (x, y) is (x + 0.5, y + 0.5). `size` is (height, width) everywhere.
 - Depth is linear: the distance along the camera's axis, −z in camera space.
 
-Matrices act on column vectors. Every constructor is differentiable in its arguments: give torch or jax arrays, and the
-camera's matrices are of that kind; give numbers or NumPy arrays, and they are float64 NumPy.
+Matrices act on column vectors. Constructors such as `Camera.look_at` are differentiable in their arguments: give torch
+or jax arrays, and the camera's matrices are of that kind; give numbers or NumPy arrays, and they are float64 NumPy.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ class Camera:
         load_engines()  # So that cameras may be arguments of their transforms.
 
     def __iter__(self) -> Iterator[Array]:
-        """View and projection, for `view, projection = camera`."""
+        """View and projection, for `view, projection = camera`; refused while `aspect` is "open"."""
         self._check_closed("unpacked")
         return iter((self.view, self.projection))
 
     def __eq__(self, other: Any) -> bool:
-        """True if both cameras have the same matrices, in value, and the same ratio."""
+        """True if both cameras have matrices of equal values, and the same ratio; traced ones equal only themselves."""
         if not isinstance(other, Camera):
             return NotImplemented
         pairs = (self.view, other.view), (self.projection, other.projection)
@@ -101,13 +101,14 @@ class Camera:
         """The cameras of several views as one, for `rts.render_views`: both matrices are (B, 4, 4).
 
         The stack is a tree of two arrays, as any camera: `jax.vmap` and `torch.vmap` map over its views.
-        `unstack()[b]` is the camera of view b.
+        `unstack()[b]` is the camera of view b, but for ratios that differ from view to view: they become None.
 
         Args:
             cameras: at least one, each of one view.
 
         Raises:
-            InputError: no cameras, or some leave the ratio of width to height open, and some do not.
+            InputError: no list of cameras of one view each, or some leave the ratio of width to height open, and some
+                do not.
         """
         cameras = list(cameras) if isinstance(cameras, (list, tuple)) else []
         if not cameras or not all(isinstance(camera, Camera) and not camera.is_stacked for camera in cameras):
@@ -125,7 +126,7 @@ class Camera:
         """The cameras of the single views of a stack. A matrix of shape (4, 4) is shared by all views.
 
         Raises:
-            InputError: this is a camera of one view, or the matrices are not (B, 4, 4).
+            InputError: this is a camera of one view, or the matrices have other shapes.
         """
         shapes = [shape_of(m) for m in (self.view, self.projection)]
         counts = {shape[0] for shape in shapes if len(shape) == 3}
@@ -161,12 +162,13 @@ class Camera:
             up: (3,) direction that is up in the image. Where the camera looks along it, +x is to the right instead.
             fov_y: vertical field of view, degrees.
             aspect: width over height of the image; None for the ratio of the rendered size.
-            near: near plane; default 1/100 of the distance to the target.
-            far: far plane; default 100 times the distance to the target.
+            near: depth of the near plane; default 1/100 of the distance to the target.
+            far: depth of the far plane; default 100 times the distance to the target.
             principal_point: (2,) where the axis meets the image, NDC.
 
         Raises:
-            InputError: eye and target coincide, `up` is zero, or planes are out of order.
+            InputError: eye and target coincide, `up` is zero, an angle or ratio makes no image, planes are out of
+                order, or an argument has another shape or is not finite.
 
         Warns:
             InputWarning: a field of view below 2, likely to be in radians.
@@ -200,12 +202,13 @@ class Camera:
             fov_y: vertical field of view, degrees.
             view: (4, 4) camera-from-world, affine; None for the identity.
             aspect: width over height of the image; None for the ratio of the rendered size.
-            near: near plane.
-            far: far plane.
+            near: depth of the near plane, positive.
+            far: depth of the far plane.
             principal_point: (2,) where the axis meets the image, NDC.
 
         Raises:
-            InputError: a field of view, ratio or view that makes no image, or planes are out of order.
+            InputError: a field of view, ratio or view makes no image, planes are out of order, or an argument has
+                another shape or is not finite.
 
         Warns:
             InputWarning: a field of view below 2, likely to be in radians.
@@ -244,7 +247,8 @@ class Camera:
             principal_point: (2,) where the axis meets the image, NDC.
 
         Raises:
-            InputError: eye and target coincide, `up` is zero, or planes are out of order.
+            InputError: eye and target coincide, `up` is zero, a height or ratio makes no image, planes are out of
+                order, or an argument has another shape or is not finite.
         """
         view = look_at(eye, target, up)
         projection = orthographic(height, 1.0 if aspect is None else aspect, near, far, principal_point)
@@ -267,15 +271,16 @@ class Camera:
         Args:
             K: (3, 3) intrinsics, pixels; skew is kept.
             R: (3, 3) rotation, camera-from-world.
-            t: (3,) translation, or (3, 1).
+            t: (3,) translation, or (3, 1), world units.
             size: (height, width).
-            near: near plane.
-            far: far plane.
+            near: depth of the near plane, positive.
+            far: depth of the far plane.
             pixel_center: where K puts the centre of the first pixel: 0 in OpenCV, 0.5 in COLMAP and most data sets
                 whose principal point is exactly (width / 2, height / 2).
 
         Raises:
-            InputError: K is no matrix of intrinsics, R no rotation, or planes are out of order.
+            InputError: K is no matrix of intrinsics, R no rotation, planes are out of order, or `t` or `size` is
+                wrong.
         """
         check_planes(near, far, positive=True)
         _check_intrinsics(K)
@@ -310,7 +315,7 @@ class Camera:
         A matrix that is transposed (for row vectors), or multiplied in the other order, is refused where it shows. It
         does not show in a view without rotation, or of rotation alone. Depths from 0 to 1, as in Direct3D and Vulkan,
         are read as those of a near plane at about half its depth; pictures are the same. Depths from 1 to 0 are
-        refused.
+        refused. A traced matrix is not checked, and taken for perspective.
 
         Args:
             matrix: (4, 4) OpenGL clip space from world space, acting on column vectors; `projection @ view`.
@@ -348,6 +353,9 @@ class Camera:
         Args:
             modelview: (4, 4) camera-from-world.
             projection: (4, 4) clip space from camera space.
+
+        Raises:
+            InputError: a matrix has another shape, or is not finite.
         """
         check_numbers("modelview", modelview, (4, 4))
         check_numbers("projection", projection, (4, 4))
@@ -359,7 +367,7 @@ class Camera:
         """A camera from the matrices whose product feeds `nvdiffrast`.
 
         nvdiffrast's row 0 is NDC y = −1, the bottom. With plain OpenGL matrices its image is ours upside down. The
-        matrices stay unchanged.
+        matrices stay unchanged unless `top_down`.
 
         Args:
             modelview: (4, 4) camera-from-world.
@@ -391,11 +399,12 @@ class Camera:
             focal_length: number or (2,), NDC; 1 / tan(fov / 2) of a `FoVPerspectiveCameras`.
             principal_point: (2,) NDC, x left and y up; the shorter side of the image spans [−1, 1].
             size: (height, width).
-            near: near plane.
-            far: far plane.
+            near: depth of the near plane, positive.
+            far: depth of the far plane.
 
         Raises:
-            InputError: R is no rotation, a focal length is not positive, or planes are out of order.
+            InputError: R is no rotation, a focal length is not positive, planes are out of order, or another argument
+                has a wrong shape.
         """
         check_planes(near, far, positive=True)
         check_rotation("R", R)
@@ -430,11 +439,12 @@ class Camera:
             camera_to_world: (4, 4) or (3, 4).
             size: (height, width).
             focal: focal length, pixels: 0.5 width / tan(0.5 camera_angle_x).
-            near: near plane.
-            far: far plane.
+            near: depth of the near plane, positive.
+            far: depth of the far plane.
 
         Raises:
-            InputError: the matrix is not affine or singular, or planes are out of order.
+            InputError: the matrix is singular or not affine, `focal` is not positive, planes are out of order, or
+                `size` is wrong.
         """
         value = check_numbers("camera_to_world", camera_to_world, (4, 4), (3, 4))
         if value is not None and not (_is_affine(value) and is_invertible(value[:3, :3])):
@@ -452,10 +462,10 @@ class Camera:
     # ------------------------------------------------------------------------------------------ converters
 
     def to_opencv(self, size: tuple[int, int], *, pixel_center: float = 0.0) -> tuple[Array, Array, Array]:
-        """OpenCV's K (3, 3), R (3, 3) and t (3,) of a perspective camera; the inverse of `from_opencv`.
+        """OpenCV's K (3, 3), R (3, 3) and t (3,) of a perspective camera; arguments are as in `from_opencv`.
 
         Raises:
-            InputError: the camera is orthographic.
+            InputError: the camera is orthographic, or `size` is wrong.
         """
         xp, p = self._perspective("to_opencv", size)
         height, width = size
@@ -482,6 +492,9 @@ class Camera:
 
         Args:
             size: (height, width) of the image; needed where the camera leaves its ratio open.
+
+        Raises:
+            InputError: the ratio is open, and there is no size.
         """
         view, projection = self if size is None else self.for_size(size)
         return view, projection
@@ -500,7 +513,7 @@ class Camera:
         """PyTorch3D's R (3, 3), T (3,), focal_length (2,) and principal_point (2,); the inverse of `from_pytorch3d`.
 
         Raises:
-            InputError: the camera is orthographic.
+            InputError: the camera is orthographic, or `size`, (height, width), is wrong.
         """
         xp, p = self._perspective("to_pytorch3d", size)
         sx, sy, scale = min(size) / size[1], min(size) / size[0], -1 / p[3, 2]
@@ -517,7 +530,7 @@ class Camera:
         """Blender's camera-to-world matrix (4, 4), and the focal length in pixels; the inverse of `from_blender`.
 
         Raises:
-            InputError: the camera is orthographic.
+            InputError: the camera is orthographic, or `size`, (height, width), is wrong.
         """
         _, p = self._perspective("to_blender", size)
         return namespace(self.view).linalg.inv(self.view), p[1, 1] * size[0] / 2
@@ -534,7 +547,7 @@ class Camera:
     # ----------------------------------------------------------------------------------------------- use
 
     def for_size(self, size: tuple[int, int]) -> Camera:
-        """The camera for images of a size (height, width): itself, unless it leaves the ratio open."""
+        """The camera for images of a size (height, width): itself, or a copy of that ratio if `aspect` is "open"."""
         if self.aspect is None or isinstance(self.aspect, Real):
             return self
         if not (isinstance(self.aspect, str) and self.aspect == "open"):
@@ -549,7 +562,7 @@ class Camera:
         return map_leaves(f, self)
 
     def within(self, transform: Array | None) -> Camera:
-        """This camera in the local space of a part with a world-from-local transform (4, 4)."""
+        """This camera in the local space of a part with a world-from-local transform (4, 4); None is the identity."""
         if transform is None:
             return self
         if shape_of(transform) != (4, 4):
@@ -595,6 +608,9 @@ class Camera:
 
         Returns:
             (N, 3). Points on the plane of the camera's centre have no image; their values are finite.
+
+        Raises:
+            InputError: another shape of points, or a wrong size.
         """
         size, points = check_pixels(size), from_numbers(points, "points")
         if shape_of(points)[-1:] != (3,):
@@ -602,7 +618,7 @@ class Camera:
         return projective_map(self.pixel_rows(size), points)
 
     def pixel_rows(self, size: tuple[int, int]) -> Array:
-        """Affine maps (4, 4) of world points: pixel x times w, pixel y times w, w, and linear depth."""
+        """Four affine maps (4, 4) of world points: pixel x times clip w, pixel y times w, w, and linear depth."""
         (x, y), p = (size[1] / 2, size[0] / 2), self.for_size(size).projection
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
@@ -652,7 +668,7 @@ class Camera:
         return xp.minimum(*depths), xp.maximum(*depths)
 
     def rays(self, size: tuple[int, int]) -> Rays:
-        """Rays through cells: `origins` and `directions` (H, W, 3), world space, and `spread`; differentiable."""
+        """Rays through pixels' centres: `origins` and `directions` (H, W, 3), world, and `spread`; differentiable."""
         size = check_pixels(size)
         self = self.for_size(size)
         xp, (view, p) = promote(self.view, self.projection)
@@ -707,7 +723,7 @@ def world_vectors(view: Array, direction: Sequence[float]) -> Array:
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
-    """View and projection in one engine and dtype; if only one is a constant, those of the other."""
+    """View and projection in one engine; if only one is a constant, in the other's dtype, too."""
     _, (view, projection) = promote(view, projection)
     return view, projection
 

@@ -26,7 +26,7 @@ class Bounds(NamedTuple):
 
     Attributes:
         center: (3,) middle of the bounding box.
-        radius: largest distance of a vertex from the centre.
+        radius: largest distance of a vertex from the centre, of a rough mesh where the surface is curved.
     """
 
     center: np.ndarray
@@ -37,7 +37,7 @@ def bounds_of(parts: Sequence[Part]) -> Bounds:
     """The bounding sphere of parts of NumPy arrays, whose surfaces can become meshes.
 
     Raises:
-        InputError: all vertices are in one point.
+        InputError: all vertices are in one point, or a surface cannot become a mesh.
     """
     points = []
     for part in parts:
@@ -76,9 +76,9 @@ def orbit(
     Args:
         bounds: the sphere around the object.
         size: (height, width) of the image.
-        azimuth: degrees about the upright axis; 0 looks from +z (from −y if z is up), 90 from +x.
+        azimuth: degrees about the upright axis; at 0 the camera is on the side of +z (−y if z is up), at 90 of +x.
         elevation: degrees above the horizon, −90 to 90.
-        distance: the camera's distance from the centre; by default the whole object is seen.
+        distance: the camera's distance from the centre; None for one from which the whole object is seen.
         fov: vertical field of view, degrees.
         up: "y" or "z", the upright axis.
 

@@ -39,5 +39,5 @@ class Part:
             registry.check_name("rts.shaders", self.shader)
 
     def replace(self, **changes: Any) -> Part:
-        """A copy with some fields changed."""
+        """A copy with some fields changed; its fields are checked again."""
         return replace(self, **changes)

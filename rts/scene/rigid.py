@@ -28,7 +28,7 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
         (4, 4), usable as `Part.transform`.
 
     Raises:
-        InputError: the pose has another shape, or is not finite.
+        InputError: `pose` or `center` has another shape, or is not finite.
     """
     if shape_of(pose) != (6,):
         check_numbers("pose", pose, (6,))
@@ -72,7 +72,7 @@ def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix (4, 4), and its Jacobian (16, 9) by pose and centre; float64."""
+    """The matrix (4, 4), and its entries' Jacobian (16, 9) by pose (6,) and centre (3,); float64."""
     from rts.scene import rigid_loops
 
     pose, center = operands

@@ -13,7 +13,7 @@ SMALL = 1e-2
 
 
 def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix (4, 4) of a pose (6,) about a centre (3,), and its Jacobian (16, 9) by pose and centre; float64."""
+    """The matrix (4, 4) of a pose (6,) about a centre (3,), and the entries' Jacobian (16, 9) by both; float64."""
     matrix, jacobian = np.empty((4, 4)), np.empty((16, 9))
     _rigid(pose.astype(np.float64), center.astype(np.float64), matrix, jacobian)
     return matrix, jacobian

@@ -17,7 +17,7 @@ from rts.scene.camera import Camera, toward_rows, world_vectors
 class RowCameras:
     """A camera for each of N samples, for shaders that promise `takes_views`.
 
-    The methods are named as in `Camera`, and return a row for each sample. Row n of `points` is seen by camera n.
+    Methods named as in `Camera` return a row for each sample. Row n of `points` is seen by camera n.
 
     Attributes:
         views: (B, 4, 4) camera-from-world, of each view.
@@ -52,7 +52,7 @@ class RowCameras:
         return take(world_vectors(self.views, direction), index_of_views(self.number))
 
     def depth_range(self) -> tuple[Array, Array]:
-        """(N,) linear depths of the near and the far plane; infinity for no such plane."""
+        """Linear depths (N,) of each sample's near plane, and (N,) of its far plane; infinity for a missing plane."""
         views = [Camera(self.views[b, ...], self.projections[b, ...]).depth_range() for b in range(self.views.shape[0])]
         xp, index = namespace(self.views), index_of_views(self.number)
         near, far = (take(xp.stack(depths)[:, None], index)[:, 0] for depths in zip(*views, strict=True))

@@ -41,7 +41,7 @@ def index_table(name: str, table: Any, width: int) -> np.ndarray:
 
 
 def _known(name: str, table: Any) -> np.ndarray:
-    """The values of a table, on the host."""
+    """The values of a table, on the host; refused if they are traced or no array."""
     if not isinstance(table, np.ndarray) and any(isinstance(x, (str, bytes)) for x in leaves(table)):
         raise InputError(f"{name} is {quoted(table)}; expected an array of integers")
     if isinstance(table, (np.ndarray, list, tuple)) or shape_of(table) == ():
@@ -73,7 +73,7 @@ _extent: dict[int, tuple[weakref.ref, tuple[int, int]]] = {}
 
 
 def table_extent(array: np.ndarray) -> tuple[int, int]:
-    """Least and largest number in a non-empty table. A read-only table is searched only once."""
+    """Least and largest number in a non-empty table. A read-only table that owns its memory is searched only once."""
     kept = not array.flags.writeable and array.flags.owndata
     key = id(array)
     if kept and key in _extent and _extent[key][0]() is array:

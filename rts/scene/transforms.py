@@ -19,14 +19,14 @@ from rts.operations.linear import matmul
 
 
 def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:
-    """A matrix of array scalars and numbers, in the dtype of `like`."""
+    """A matrix of array scalars and numbers, in the dtype of `like`, a scalar of their engine."""
     zero = xp.zeros_like(like)
     # Forward-mode torch widens products of a number and a scalar tensor; hence the cast.
     return xp.astype(xp.stack([xp.stack([zero + entry for entry in row]) for row in rows]), like.dtype)
 
 
 def scaled_rows(matrix: Array, row_signs: tuple[float, ...]) -> Array:
-    """The matrix with its rows multiplied by signs."""
+    """The matrix with each row multiplied by its sign."""
     xp = namespace(matrix)
     return xp.stack([matrix[i, :] * s for i, s in enumerate(row_signs)])
 
@@ -114,7 +114,7 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     If the camera looks along `up`, or against it, +x is to the right in the image; +y if `up` is along x.
 
     Raises:
-        InputError: eye and target coincide, or `up` is zero.
+        InputError: eye and target coincide, `up` is zero, or one of them is no finite vector (3,).
     """
     checked = [check_numbers(name, x, (3,)) for name, x in (("eye", eye), ("target", target), ("up", up))]
     values = None if any(x is None for x in checked) else [np.asarray(x, np.float64) for x in checked]
@@ -176,7 +176,7 @@ def warn_of_radians(fov_y: Any) -> None:
 def check_product(matrix: np.ndarray) -> None:
     """Refuse a matrix (4, 4) that seems to be another product than `projection @ view`.
 
-    In `projection @ view` clip z and w grow along one axis, and both planes of a perspective lie before the camera.
+    In `projection @ view` clip z and w grow along one axis, and both planes of a perspective are in front of the eye.
     """
     # A transposed projection alone may look like a product, but its view would scale.
     rows = _is_product(matrix.T) and _is_unscaled(matrix.T) and not _is_unscaled(matrix)

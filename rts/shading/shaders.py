@@ -5,10 +5,11 @@ A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. Entries of 
     "color" (3,) or (4,)             factor on the base colour
     "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
                                      over gbuffer["uv_footprint"] by shaders with `mip=True`
-    "light"                          dict of "direction" (3,) or (L, 3) towards the light, world space; "color" (3,) or
-                                     (L, 3); "ambient" (3,). Default: one white light from above the camera's left
-                                     shoulder and an ambient 0.2.
-    "specular" (3,), "shininess" ()  of `blinn_phong`
+    "light"                          dict of "direction" (3,) or (L, 3) towards the light, world space, by default from
+                                     above the camera's left shoulder; "color" (3,) or (L, 3), by default 0.8;
+                                     "ambient" () or (3,), by default 0.2
+    "specular" () or (3,)            of `blinn_phong`: the highlight's strength, by default 0.3
+    "shininess" ()                   of `blinn_phong`: its exponent, by default 32
     "depth_range" (2,)               of `depth`: the depths of black and white; default the near and far planes
 
 The base colour is the texture where θ has one and the surface has uv, else the G-buffer's "color", else white.
@@ -70,7 +71,7 @@ class Normals(Shader):
 
 @dataclass(frozen=True)
 class Depth(Shader):
-    """Linear depth, from 0 at the near plane (or θ["depth_range"][0]) to 1 at the far plane."""
+    """Linear depth as a grey, from 0 at the near plane to 1 at the far plane, or over θ["depth_range"]; clipped."""
 
     opaque = True
     takes_views = True
@@ -90,7 +91,7 @@ class Depth(Shader):
 
 @dataclass(frozen=True)
 class Unlit(Shader):
-    """The base colour.
+    """The base colour times θ["color"], without light.
 
     Attributes:
         wrap: continuation of the texture outside [0, 1]: "repeat", "mirror" or "clamp".
@@ -118,7 +119,7 @@ class Unlit(Shader):
         return self.premultiplied(color, alpha)
 
     def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
-        """The base colour (N, 3) times θ["color"], not premultiplied, and alpha (N, 1)."""
+        """The base colour (N, 3), not premultiplied, and its alpha (N, 1), both times θ["color"] if there is one."""
         position = gbuffer["position"]
         xp = namespace(position)
         if "texture" in theta and "uv" in gbuffer:
@@ -152,7 +153,7 @@ class Unlit(Shader):
 
 @dataclass(frozen=True)
 class Textured(Unlit):
-    """The base colour, which must come from a texture."""
+    """`Unlit` whose base colour must come from a texture; θ without one, or a surface without uv, is refused."""
 
     takes_views = True
     reads = ("uv", "texture", "color")
@@ -226,7 +227,7 @@ def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
 def _lit(
     theta: Mapping[str, Tree], camera: Camera | RowCameras
 ) -> tuple[Array | float, list[tuple[Array, Array | float]]]:
-    """The ambient light, and for each other light the unit vector towards it, (3,) or (N, 3), and its colour."""
+    """The ambient light; for each other light the unit vector towards it, (3,) or (N, 3), and its colour."""
     light = theta.get("light", {})
     if not isinstance(light, Mapping):
         raise InputError(f"theta['light'] is a {type(light).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
@@ -270,7 +271,7 @@ def _entry(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Ar
 
 
 def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
-    """Refuse an entry of θ that is no finite number or floating array of the expected shape."""
+    """Refuse an entry of θ that is no finite number or floating array; `ok` says that it has the expected shape."""
     number = isinstance(value, (bool, int, float))
     if not ok or not (number or hasattr(value, "dtype")):
         raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")

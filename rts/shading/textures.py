@@ -19,11 +19,12 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
     """Bilinear texture lookup, or trilinear where a footprint is given; differentiable in texture and uv.
 
     Args:
-        texture: (h, w, C), row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w, v = 1 − (i + 0.5) / h.
+        texture: (h, w, C), C = 1, 3 or 4, row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w,
+            v = 1 − (i + 0.5) / h.
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
         wrap: "repeat", "mirror" or "clamp" outside [0, 1].
-        footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one step from sample to sample, without derivative. The
-            texture is averaged over roughly this area, by `mip_levels` and `level_of`. None for no average.
+        footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for a step to the next cell, constant. The texture is averaged
+            over roughly this area, by `mip_levels` and `level_of`. None for no average.
 
     Returns:
         (N, C).
@@ -61,8 +62,8 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
 def mip_levels(texture: Array) -> list[Array]:
     """The texture (h, w, C) and its averages, each of half the previous height and width, down to a single texel.
 
-    An odd number n of rows or columns becomes (n − 1) / 2. Each new one averages 2 n / (n − 1) old ones, by the shares
-    that it covers, so that all levels have the mean of the texture. Differentiable.
+    An odd number n > 1 of rows or columns becomes (n − 1) / 2; one stays one. Each new row or column averages
+    2 n / (n − 1) old ones, by the shares that it covers, so that all levels have the texture's mean. Differentiable.
     """
     levels = [texture]
     while max(shape_of(levels[-1])[:2]) > 1:
@@ -73,10 +74,10 @@ def mip_levels(texture: Array) -> list[Array]:
 
 
 def level_of(footprint: Array, size: tuple[int, int]) -> Array:
-    """The level (N,), a real number, at which texels are as large as the longer side of the footprint.
+    """The level (N,) of `mip_levels`, a real number, at which texels are as large as the footprint's longer side.
 
-    Level 0 is the texture itself, for steps of at most a texel from sample to sample. The last is a single texel.
-    Without derivative.
+    Level 0 is the texture itself, for sides of at most a texel, and of NaN. The last is a single texel. Without
+    derivative.
 
     Args:
         footprint: (N, 4), see `sample_texture`.
@@ -107,7 +108,7 @@ def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first:
     """Bilinear lookup (N, C) in a table of texels: of one texture, row by row, or of several, one after the other.
 
     Args:
-        flat: (M, C).
+        flat: (M, C), the texels.
         uv: (N, 2).
         wrap: see `sample_texture`.
         height: height of the texture; for several textures (N,) floats of uv's dtype.
@@ -130,7 +131,7 @@ def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first:
 
 
 def _wrapped(index: Array, count: Any, wrap: str) -> Array:
-    """Whole-numbered floats as indices in [0, count); `wrap` tells how those outside continue."""
+    """Whole-numbered floats as int32 in [0, count), by `wrap` where they lie outside; 0 for NaN."""
     xp = namespace(index)
     index = xp.where(index == index, index, 0.0)  # NaN has no texel; as an index it would be out of range.
     if wrap == "repeat":

@@ -25,7 +25,7 @@ ALIKE = 0.8
 
 
 def shaded_by(part: CheckedPart) -> set[str] | None:
-    """The entries of θ that a part's shader declares to read; None if it declares nothing."""
+    """The names that a part's shader declares to read and that may be entries of θ; None if it declares nothing."""
     return None if part.reads is None else set(part.reads).difference(ATTRIBUTES)
 
 
@@ -43,7 +43,7 @@ def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]
 
 
 def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | None:
-    """The name that the unread entry `name` was probably meant to have, or None; other arguments as in `unread`."""
+    """The name that the unread entry `name` of θ was probably meant to have, or None; `shaded` is as in `unread`."""
     rest = dict(part.theta)
     value = rest.pop(name)
     shaped = (n for n in SURFACE_ENTRIES if n in part.surface.reads({**rest, n: value}))
@@ -53,7 +53,7 @@ def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | 
 
 
 def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
-    """Warn of unread entries of θ whose names almost match those of entries that would be read."""
+    """Warn of unread entries of θ whose names almost match one that would be read; built-in names cause no warning."""
     for index, part in enumerate(parts):
         shaded = shaded_by(part)
         for name in unread(part, shaded):
@@ -85,7 +85,7 @@ class Observed(Shader):
 
 
 class _Noting(dict):
-    """A dict that records every name looked up, present or not; iteration records all names."""
+    """A dict that adds to `read` every name looked up, present or not; iteration adds all names."""
 
     def __init__(self, entries: Mapping[str, Any], read: set[str]):
         super().__init__(entries)

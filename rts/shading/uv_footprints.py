@@ -34,8 +34,8 @@ def uv_footprint(
     """∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y (N, 4) for one cell to the right and one cell down; without derivative.
 
     The derivative is taken on the tangent plane of each sample, without other samples: outlines and seams of uv have no
-    effect. The surface is evaluated at parameters `Surface.param_step` away from the sample's. The projection is
-    differentiated exactly.
+    effect. The surface is evaluated once for each parameter, `Surface.param_step` away from the sample's. The
+    projection is differentiated exactly.
 
     Args:
         surface: a surface of two parameters a sample.

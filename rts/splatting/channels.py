@@ -16,14 +16,14 @@ GROUP = 3
 """Number of channels, besides alpha, in one call of a splatter."""
 
 LOST = 0.01
-"""The share of light that may pass through a layer, and be lost, without a warning."""
+"""The share of light that may be lost behind a sample, or behind the last layer, without a warning."""
 
 
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     """The image (h, w, C + 1) of splats, the border cut off.
 
     Channels depend on alpha, but not on one another. So the splatter makes one image of every three channels and alpha,
-    filled up with zeros. The alpha of the first image is returned.
+    filled up with zeros. The alpha of the first image is returned. Warns of light that translucent samples lose.
 
     Args:
         splatter: a splatter.
@@ -49,7 +49,7 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
 
 
 def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
-    """Warn if samples are translucent under a splatter that takes them to be opaque, or if the last layer's are."""
+    """Warn if light is lost: behind samples that a splatter takes to be opaque, or behind the last layer."""
     alpha, row = value_of(splats.rgba[:, -1]), value_of(splats.row)
     if alpha is None or row is None or not len(alpha):
         return

@@ -17,8 +17,8 @@ least along m. On planes R is zero.
 
 Let q be a covered target of a pair. A source belongs to b if it forms a pair with q. Otherwise it belongs to a if it is
 paired front to front with q. ∇z_a and ∇z_b are differences over q's neighbours in its row and column. Any other source
-with two layers belongs to the sheet whose plane is nearer. Where all nine sources belong to a sheet, the image's
-derivative in positions is that of
+with two layers belongs to the sheet whose plane is nearer, if both layers fit the planes. Where all nine sources belong
+to a sheet, the image's derivative in positions is that of
 
     (Ŵ_a c_a + Ŵ_b c_b) / (Ŵ_a + Ŵ_b),    c = Σ w rgba / Σ w over the fronts of one sheet:
 
@@ -70,7 +70,7 @@ class Lines(NamedTuple):
     slopes: list[tuple[Array, Array]]
 
     def sums(self, values: Callable[[int, int], Array]) -> list[Array]:
-        """The sums, over the sources of each sheet, of `values(u, v)` (H, W, ·) for offsets from source to target."""
+        """The sums [a's, b's] over each sheet's sources of `values(u, v)` (H, W, ·); (u, v) leads to the target."""
         totals: list[Any] = [0.0, 0.0]
         for n in NEIGHBOURS:
             value, other = values(*n), self.other[n] if n in self.other else self.target & False
@@ -86,7 +86,7 @@ def motion(kernel: Kernel, layers: Layers, lines: Lines, colors: Callable[[int, 
         kernel: the splatter.
         layers: the samples, of at least two layers.
         lines: see `targets`.
-        colors: for offsets (u, v), what each source shows, (H, W, 4).
+        colors: for offsets (u, v), the colour that each source shows with a 1 appended, (H, W, 5), as `Layers.color`.
     """
     xp, target = layers.xp, lines.target
     moves = [
@@ -111,8 +111,8 @@ def targets(layers: Layers, shift: dict[Steps, Array], crosses: dict[Steps, Arra
 
     Args:
         layers: the samples, of at least two layers.
-        shift: for each offset (u, v) from source to target, the number s of `Multi` at each target; 0 at empty targets.
-        crosses: see `pairs`.
+        shift: for each offset (u, v) from source to target, the number s of `Visible` at each target; 0 at empty ones.
+        crosses: the result of `pairs`.
     """
     xp, (z, two) = layers.xp, _depths(layers)
     # By the step from the target to the source.
@@ -142,19 +142,19 @@ def targets(layers: Layers, shift: dict[Steps, Array], crosses: dict[Steps, Arra
 
 
 def pairs_of(layers: Layers) -> dict[Steps, Array]:
-    """`pairs` of samples of at least two layers."""
+    """The result of `pairs` for samples in at least two layers."""
     z, two = _depths(layers)
     return pairs(z[0], z[1], two, stopped(layers.extent))
 
 
 def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps, Array]:
-    """Pairs of cells between which lines of crossing run: for each step m, cells q (H, W) of pairs (q, q + m).
+    """Pairs of cells between which lines of crossing run: for each step m, (H, W) bool, true at q of pairs (q, q + m).
 
     Args:
         z0: depths of the first layer (H, W), finite.
         z1: depths of the second layer (H, W), finite.
         two: (H, W) bool, true where both layers are covered.
-        extent: range of the fronts' depths, the camera's included.
+        extent: range of the fronts' depths and the camera's, 0.
     """
     xp, starts = namespace(two, z0), {}
     ratios = {m: _ratio(z0, z1, two, TIE * extent, m) for m in HALF}
@@ -167,9 +167,9 @@ def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """The first two layers (K, H, W) near possible pairs, from covered (K, H, W) bool and depth (K, H, W).
+    """Samples (K, H, W) bool of the first two layers near possible pairs, from covered (K, H, W) bool and depth.
 
-    `pairs` gives the same result if other hidden layers are left out.
+    There are none without a second layer. `pairs` gives the same result if other hidden layers are left out.
     """
     if len(covered) < 2 or not covered[1].any():
         return covered & False
@@ -201,7 +201,7 @@ def ahead(cells: Array, steps: Steps, value: float) -> Array:
 
 
 def _depths(layers: Layers) -> tuple[list[Array], Array]:
-    """Depths (H, W) of the first two layers without derivative, and a mask of the cells with both."""
+    """Depths (H, W) of the first two layers without derivative, 0 unless a cell has both; and a mask of such cells."""
     two = layers.at(layers.covered[1], 0, 0)
     return [stopped(layers.xp.where(two, layers.target[k], 0.0)) for k in (0, 1)], two
 

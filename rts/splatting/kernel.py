@@ -1,7 +1,7 @@
 """The kernel of the splatters (paper §3.3): the target cells of a sample, and its weights there.
 
-A splat belongs to the cell (y, x) that its sample was cast through; its targets are that cell's 3 × 3 neighbours,
-for any computed position. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
+A splat belongs to the cell (y, x) that its sample was cast through. Its targets are the 3 × 3 cells in and around that
+cell, wherever its position is. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
 and (u, v) ∈ {−1, 0, 1}², the weight is
 
     w(u, v) = (1 + ε) / W · exp(−‖c + (u, v) − P‖² / 2σ²),    W = Σ exp(−‖(u, v)‖² / 2σ²).
@@ -42,7 +42,7 @@ class Kernel(Splatter):
 
     Attributes:
         sigma: standard deviation, cells (pixels without supersampling). Below 0.45 little of the kernel reaches the
-            neighbouring cells, and most of the derivative at edges is lost.
+            neighbouring cells, and most of the derivative at outlines is lost.
         epsilon: excess of the weights' sum over one, so that the interior is always normalised.
         calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c). It leaves the image of
             samples on pixel centres unchanged, and multiplies its derivative. None for the γ of `exact_calibration`.
@@ -70,7 +70,7 @@ class Kernel(Splatter):
 
     @staticmethod
     def check(row: Array, count: int, settled: Array | None = None, exits: Array | None = None) -> None:
-        """Refuse fields of `Splats` that name a sample not below `count`, before compiled loops read there."""
+        """Raise an InputError if fields of `Splats` name a sample not below `count`, before compiled loops read it."""
         check_rows(row, count)
         if exits is not None:
             check_rows(exits, count)
@@ -94,7 +94,7 @@ class Kernel(Splatter):
 
     @abc.abstractmethod
     def plain(self, depths: Depths, margin: float) -> Array:
-        """Targets (H, W) bool that only front layers affect, for any rounding of depths within a margin."""
+        """Targets (H, W) bool that only fronts affect, even if rounding changes differences of depth by `margin`."""
 
     @functools.cached_property
     def gamma(self) -> float:
@@ -111,7 +111,7 @@ class Kernel(Splatter):
         )
 
     def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
-        """Factors (x, y) of the weights w(u, v) = x[u] · y[v] of cells (h, w); the first cell is (−1, −1)."""
+        """Factors x and y (h, w) by offset, of the weights w(u, v) = x[u] · y[v]; the first cell is (−1, −1)."""
         rx, ry = self.offsets(position)
         return {u: self._factor(u - rx) for u in OFFSETS}, {v: self._factor(v - ry) for v in OFFSETS}
 
@@ -149,6 +149,9 @@ def exact_calibration(sigma: float, reach: int = 1) -> float:
 
     Returns:
         γ = σ² Σ e / Σ u² e, e = exp(−u² / 2σ²) over −reach ≤ u ≤ reach.
+
+    Raises:
+        InputError: sigma is no positive finite number, or reach no integer of at least 1.
     """
     if not (is_real(sigma) and 0 < sigma < math.inf) or not is_count(reach):
         raise InputError(

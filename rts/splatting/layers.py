@@ -21,11 +21,11 @@ NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
 AROUND = [n for n in NEIGHBOURS if n != (0, 0)]
 
 Steps = tuple[int, int]
-"""Cells along x and y."""
+"""A step: numbers of cells along x and y."""
 
 
 def check_rows(row: Array, count: int, name: str = "row") -> None:
-    """Raise an InputError if rows, on the host and not traced, name a sample that is not below `count`."""
+    """Raise an InputError if `row` holds a number that is neither −1 nor an index below `count`; traced rows pass."""
     value = known_value(row)
     if value is None or not value.size:
         return
@@ -37,7 +37,7 @@ def check_rows(row: Array, count: int, name: str = "row") -> None:
 
 
 def check_settled(settled: Array, shape: tuple[int, ...], count: int) -> None:
-    """Raise an InputError if `Splats.settled` has not the grid's shape, or names a sample that is not below `count`."""
+    """Raise an InputError unless `Splats.settled` is of the grid's `shape`, and of −1 or indices below `count`."""
     if tuple(settled.shape) != tuple(shape):
         raise InputError(f"settled has shape {tuple(settled.shape)}; expected {tuple(shape)}, as row says")
     if not namespace(settled).isdtype(settled.dtype, "signed integer"):
@@ -53,9 +53,8 @@ class Depths:
     def __init__(self, depth: list[Array], covered: Array, facing: list[Array] | None = None):
         """Take depths of each layer (h, w), finite, a mask of covered cells (K, h, w), and `Splats.facing`.
 
-        All have a border of one empty cell around the image (H, W).
-        Without `facing`, any two layers may pair. `extent` is the range of the fronts' depths, since hidden samples may
-        have been left out.
+        All have a border of one empty cell around the image (H, W). Without `facing`, any two layers may pair.
+        `extent` is the range of the fronts' depths and the camera's, 0: hidden samples may have been left out.
         """
         self.xp = namespace(covered, depth[0])
         self.size = covered.shape[1] - 2, covered.shape[2] - 2
@@ -89,8 +88,8 @@ class Depths:
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
         """The number s of `Multi`, and the difference of the paired depths, (H, W) both.
 
-        A hidden layer does not pair with a front that is the other side of its piece. The last of K layers may have
-        unknown layers behind it, which may pair with fronts that lie behind it.
+        With `facing`, a hidden layer does not pair with a front that is the other side of its piece. Only a last layer
+        marked `Cells.MORE_BEHIND` may, with fronts behind it: it stands for the unknown layers there.
         """
         source, xp = self.source(u, v), self.xp
         ahead, below = [xp.abs(z - self.target[0]) for z in source], [xp.abs(z - source[0]) for z in self.target]
@@ -105,7 +104,10 @@ class Depths:
         return xp.where(best_b < best_a, -b, a), xp.minimum(best_a, best_b)
 
     def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
-        """True where fronts are nearer, by a margin, than a front and a hidden layer; and the least distance."""
+        """True where two fronts are closer, by a margin, than a front and a hidden layer; and the least distance.
+
+        Distances are of depths between a source's and a target's layer, at least one of them a front; (H, W) both.
+        """
         source, xp = self.source(u, v), self.xp
         front, hidden = xp.abs(source[0] - self.target[0]), xp.full_like(source[0], xp.inf)
         for p, q in zip(source[1:], self.target[1:], strict=True):
@@ -113,7 +115,7 @@ class Depths:
         return front + margin < hidden, xp.minimum(front, hidden)
 
     def continues(self, u: int, v: int, limit: Array) -> Array:
-        """True where one front, the source's or the target's, lies on the line through the other and its next cell.
+        """True (H, W) where a front, the source's or target's, is on the line through the other and the cell beyond it.
 
         The distance from the line must be less than `limit`.
         """
@@ -126,7 +128,7 @@ class Depths:
         return continued
 
     def at(self, cells: Array, u: int, v: int, border: int = 1) -> Array:
-        """For each target, the cell from which (u, v) leads to it; |u| and |v| are at most `border`."""
+        """For each target (H, W), the cell of (h, w, …) from which (u, v) leads to it; `border` cells are around."""
         top, left = border - v, border - u
         return cells[top : top + self.size[0], left : left + self.size[1], ...]
 
@@ -181,7 +183,7 @@ class Layers(Depths):
 
 
 def nothing(rgba: Array, row: Array) -> Array:
-    """The image (H, W, 4) of no samples: zeros."""
+    """The image (H, W, 4) of no samples: zeros. An InputError if `row` (K, H, W) names a sample."""
     check_rows(row, 0)
     xp = namespace(rgba, row)
     return xp.stack([xp.zeros_like(row[0], dtype=rgba.dtype)] * 4, axis=-1)
@@ -210,15 +212,15 @@ def _weighted(rgba: Array, covered: Array) -> Array:
 
 
 def normalised(total: Array, xp: Any) -> Array:
-    """Accumulated colours over the sum of their weights, or over one where it is less (paper eq. 3)."""
+    """Colours (H, W, 4) of sums (H, W, 5): over the sum of weights, the last, or over 1 if less (paper eq. 3)."""
     return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
 
 
 def _beyond(depth: list[Array], covered: Array) -> list[Array]:
-    """Depths of each layer, finite where it is not covered.
+    """Depths of each layer, with one depth for all empty places.
 
-    An empty cell lies beyond all layers, at a distance of the scene's own scale. It is at least as far from any layer
-    as two layers are from each other, so that no layer pairs with it.
+    It lies beyond all layers, at a distance of the scene's own scale: at least as far from any layer as two layers are
+    from each other, so that no layer pairs with an empty place.
     """
     xp = namespace(covered, depth[0])
     extent = _extent(xp.stack(depth), covered)
@@ -227,7 +229,7 @@ def _beyond(depth: list[Array], covered: Array) -> list[Array]:
 
 
 def _extent(depth: Array, covered: Array) -> Array:
-    """The range of the covered depths, the camera's included."""
+    """The range () of the covered depths and the camera's, 0."""
     xp = namespace(covered, depth)
     depth = xp.where(covered, depth, 0.0)
     return xp.clip(xp.max(depth), 0.0, None) - xp.clip(xp.min(depth), None, 0.0)
@@ -272,7 +274,7 @@ def first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
 
 
 def nearest(source: list[Array], depth: Array, s: Array, xp: Any) -> Array:
-    """Index of each source's layer beyond s that is nearest to a depth; K where no layer is beyond s."""
+    """Index of each source's hidden layer beyond s that is nearest to `depth` (H, W); K where no layer is beyond s."""
     best, index = xp.full_like(depth, xp.inf), xp.full_like(s, len(source))
     for k, z in enumerate(source[1:], start=1):
         distance = xp.abs(z - depth)
@@ -282,5 +284,5 @@ def nearest(source: list[Array], depth: Array, s: Array, xp: Any) -> Array:
 
 
 def over(front: Array, back: Array) -> Array:
-    """Premultiplied compositing (Porter and Duff 1984)."""
+    """`front` composited over `back`, both premultiplied RGBA (…, 4) (Porter and Duff 1984)."""
     return front + (1 - front[..., 3:]) * back

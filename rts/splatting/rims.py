@@ -59,12 +59,12 @@ def gains(
     Args:
         kernel: the splatter.
         layers: the samples.
-        shift: for each offset (u, v) from source to target, the number s of `Multi` at each target; 0 at empty targets.
+        shift: for each offset (u, v) from source to target, the number s of `Visible` at each target; 0 at empty ones.
         part: (K, H, W), the part of each sample, or None where all may be of one.
         crossed: (H, W) bool, true for cells beside lines where surfaces cross; None if unknown.
 
     Returns:
-        The changes in front of the targets' surfaces, and at them.
+        The changes (H, W) of coverage in front of the targets' surfaces, and at them.
     """
     xp, motion = layers.xp, _motion(layers, layers.position[0], layers.covered[0])
     outline = outline_motion(layers, shift, part, motion)
@@ -87,7 +87,7 @@ def gains(
 
 
 def spread(total: Array, gain: Array) -> Array:
-    """The change of a buffer (H, W, 5) with its coverage: its mean, unless it fills the target.
+    """The change (H, W, 5) of a buffer: `gain` times its mean; 0 where it is empty, or fills the target.
 
     Args:
         total: the buffer's sums (H, W, 5), colours and weight.

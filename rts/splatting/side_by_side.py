@@ -96,7 +96,7 @@ class Picture(NamedTuple):
 def depth_scales(largest: np.ndarray) -> np.ndarray:
     """(B,) float32 factors that scale the largest depth (B,) of each view to between 1 and 2.
 
-    All factors are one if the views would need the same factor.
+    All factors are one if the views would need the same factor. So are those of views without a positive, finite depth.
     """
     usable = np.isfinite(largest) & (largest > 0)
     powers = np.frexp(np.where(usable, largest, 1.0))[1]

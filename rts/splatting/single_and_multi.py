@@ -58,7 +58,7 @@ class Single(Kernel):
 
     @functools.cached_property
     def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
-        """See `rts.Splatter`: True where weights fill a cell."""
+        """See `rts.Splatter`: True if ε outweighs rounding, so that nine centred samples fill a cell."""
         return self.epsilon >= LEAST_EPSILON
 
     def accumulate(self, splats: Splats) -> Array:

@@ -91,7 +91,7 @@ def picked(values: list[Array], index: Array, xp: Any) -> Array:
 
 
 def composites(layers: Layers) -> Callable[[int, int], Array]:
-    """For an offset (u, v), the layers of each source composited, in the form of `Layers.color`, (H, W, 5)."""
+    """A function that gives all layers of each source at (u, v), composited: (H, W, 5), as `Layers.color`."""
 
     def composite(u: int, v: int) -> Array:
         front, total = layers.color(0, u, v), 0.0
@@ -145,7 +145,10 @@ def nominal(u: int, v: int, sigma: float) -> float:
 
 
 def pairing(source: Source, target: Source, left: Left, level: int, xp: Any) -> Array:
-    """The number s (H, W) of a source at a level: its layer start + s is at the level, or −s levels lie before it."""
+    """The number s (H, W) of a source at a level; 0 where the target lacks this level.
+
+    s ≥ 0: the source's layer start + s is at the level. s < 0: its layer start pairs with the target's layer level − s.
+    """
     count, start, own = len(source.depth), left.start, target.depth[level]
     z = picked(source.depth, start, xp)
     beyond = xp.full_like(own, xp.inf)
@@ -173,7 +176,7 @@ def buffers(
     level: int,
     xp: Any,
 ) -> list[Array]:
-    """The sums (H, W, 5) of F, S and gap at a level."""
+    """The sums (H, W, 5) of F, S and gap at a level, over the sources that are `present` there."""
     own, count = sources[0, 0], len(sources[0, 0].depth)
     least = xp.full_like(shift[0, 0], count)
     for n, s in shift.items():
@@ -195,7 +198,7 @@ def buffers(
 
 
 def _nearest(depth: list[Array], level: Array, at: Array, xp: Any) -> Array:
-    """Index of each source's layer beyond `at` that is nearest to a depth; K where there is none."""
+    """Index of each source's layer beyond `at` that is nearest to the depth `level` (H, W); K where none is beyond."""
     best, index = xp.full_like(level, xp.inf), xp.full_like(at, len(depth))
     for k, z in enumerate(depth):
         distance = xp.abs(z - level)
@@ -205,7 +208,7 @@ def _nearest(depth: list[Array], level: Array, at: Array, xp: Any) -> Array:
 
 
 def advanced(source: Source, left: Left, s: Array, level: int, xp: Any) -> Left:
-    """The layers left for the levels behind one."""
+    """The layers that a source of number s at `level` has left for the levels behind it."""
     count, never = len(source.depth), xp.full_like(s, len(source.depth))
     here, at = left.joins <= level, left.start + s
     taken = here & (s >= 0)

@@ -17,7 +17,7 @@ from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 
 CONTINUED = 0.8
-"""`Visible` continues a front along its line if the error is below this share of the error of plain pairing."""
+"""Fronts also pair if one is off the other's line by less than this share of the smallest A or B of `Multi`."""
 
 RIMS = rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF
 CROSSINGS = crossings.LARGEST, crossings.DIRECT, crossings.FIT, crossings.SLACK, crossings.KEPT
@@ -26,7 +26,7 @@ CROSSINGS = crossings.LARGEST, crossings.DIRECT, crossings.FIT, crossings.SLACK,
 
 @dataclass(frozen=True)
 class Visible(Kernel):
-    """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
+    """`Multi` with a calibrated derivative, in which nearer opaque layers of a source hide its farther ones.
 
     Pairing is that of `Multi`, with an addition. Front layers also pair (s = 0) if one lies on the line through the
     other and its next cell, or off it by less than 0.8 of the smallest of A and B. Where depth changes fast, as on the
@@ -69,13 +69,13 @@ class Visible(Kernel):
 
     @functools.cached_property
     def reads(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
-        """See `rts.Splatter`."""
+        """See `rts.Splatter`: "facing" if `facing` is True; "exit" if `rims` and `exits` are."""
         switches = {"facing": self.facing, "exit": self.rims and self.exits}
         return frozenset(name for name, read in switches.items() if read)
 
     @functools.cached_property
     def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
-        """See `rts.Splatter`: True where weights fill a cell."""
+        """See `rts.Splatter`: True if ε outweighs rounding, so that nine centred samples fill a cell."""
         return self.epsilon >= LEAST_EPSILON
 
     def accumulate(self, splats: Splats) -> Array:
@@ -101,7 +101,7 @@ class Visible(Kernel):
         revealed = sum(xp.where(m == k, z, 0.0) for k, z in enumerate(layers.target))
 
         def changes(totals: list[Array]) -> list[Array]:
-            """The change of coverage of the first two buffers, as outlines move."""
+            """Changes (H, W, 5) of the buffers with sums `totals`, as outlines move; 0.0 each without rims."""
             if not (self.rims and differentiates):
                 return [0.0, 0.0]
             moved = rims.gains(self, layers, shift, splats.parts, crossed)
@@ -131,13 +131,13 @@ class Visible(Kernel):
         )
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.Splatter`: as `Kernel`, and possible ends of chords, and two layers near lines of crossing."""
+        """See `rts.Splatter`: as `Kernel`, possible ends of chords, and the first two layers near lines of crossing."""
         kept = super().needed(covered, depth)
         kept = kept | rims.chords(covered) if self.rims else kept
         return kept | crossings.sheets(covered, depth) if self.crossings else kept
 
     def plain(self, depths: Depths, margin: float) -> Array:
-        """See `Kernel`: targets with no source whose hidden layers matter."""
+        """See `Kernel`: empty targets, and targets whose front pairs with the front of every covered source."""
         conditions = []
         for n in NEIGHBOURS:
             pair, off = depths.fronts_pair(*n, margin)

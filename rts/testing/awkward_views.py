@@ -37,7 +37,7 @@ def claim_unseen_is_nothing(part: Part, sampler: Any, engine: Engine) -> None:
 
 
 def claim_awkward_views_are_finite(part: Part, sampler: Any, engine: Engine) -> None:
-    """Fail unless views from inside, cut by planes, or edge-on give finite images and gradients."""
+    """Fail unless views from inside, cut by planes, and along the axes give finite images in [0, 1] and gradients."""
     views = {"from inside": scenes.INSIDE, "cut by the near plane": scenes.NEAR}
     for view, camera in {**views, **{f"along axis {i}": c for i, c in enumerate(scenes.AXES)}}.items():
         with no_error(f"{view}, in {engine.name}"):

@@ -91,7 +91,7 @@ def _is_of_triangles(part: Part, sampler: Any) -> bool:
 
 
 def _check_image(actual: np.ndarray, part: Part) -> None:
-    """Refuse an image that is not the one of the sampler `reference`, in NumPy."""
+    """Refuse an image with more than `SHARE` of its pixels off those of the sampler `reference`, in NumPy."""
     part = part.replace(theta=map_leaves(single, part.theta))
     expected = render(part, CAMERA, SIZE, sampler="reference", splatter="single", layers=LAYERS, capacity=CAPACITY)
     differing = (np.abs(actual - expected) > DIFFERING).any(axis=-1)

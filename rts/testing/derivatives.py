@@ -127,7 +127,7 @@ def derivatives(engine: Engine, f: Callable, at: list, along: list, weights: np.
 
 
 def compiled(engine: Engine, f: Callable, at: Sequence, along: Sequence, weights: np.ndarray) -> Derivatives:
-    """`derivatives`, compiled as a whole if the engine compiles."""
+    """The result of `derivatives`, compiled as a whole if the engine compiles."""
     at, along, weights = on(engine, list(at)), on(engine, list(along)), on(engine, weights)
     xp = engine.namespace
 

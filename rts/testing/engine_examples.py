@@ -18,7 +18,7 @@ N = 6
 
 
 def numbers(*shape: int, seed: int = 0) -> np.ndarray:
-    """Random float32 numbers from −1 to 1."""
+    """Random float32 numbers from −1 to 1, an array of this shape."""
     return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
 
 

@@ -38,7 +38,7 @@ class EngineConformance(Conformance):
     # ------------------------------------------------------------------------------------------- arrays
 
     def test_it_owns_its_arrays_alone(self, engine: Any) -> None:
-        """`owns` holds for results of `constant`, but not for lists, numbers or other frameworks' arrays."""
+        """`owns` holds for results of `constant`, but not for lists, numbers, None or another engine's NumPy arrays."""
         chosen = _instance(engine)
         claim(chosen.owns(chosen.constant(np.ones(3))), "it does not own the array that `constant` gives")
         strangers = [1.0, [1.0], None, *([] if chosen.name == "numpy" else [np.ones(3)])]
@@ -46,7 +46,7 @@ class EngineConformance(Conformance):
             claim(not chosen.owns(x), f"it owns a {type(x).__name__}")
 
     def test_constants_keep_their_values(self, engine: Any) -> None:
-        """`constant` gives floats in the dtype of `like`; integers and booleans keep theirs."""
+        """`constant` keeps values; floats get the dtype of `like`, integers and booleans stay such."""
         chosen = _instance(engine)
         single = chosen.constant(np.ones(2, np.float32))
         for value in (np.array([1.5, -2.0]), np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), 0.5):
@@ -61,7 +61,7 @@ class EngineConformance(Conformance):
 
     @pytest.mark.parametrize("name", NAMESPACE)
     def test_its_namespace_is_that_of_the_array_api(self, engine: Any, name: str) -> None:
-        """Functions of `namespace` return NumPy's results."""
+        """Functions of `namespace` return NumPy's results, to 1e-5."""
         chosen, x, f = _instance(engine), numbers(N, 4, seed=4), NAMESPACE[name]
         from array_api_compat import numpy as xp
 
@@ -115,7 +115,7 @@ class EngineConformance(Conformance):
     # ------------------------------------------------------------------------------------------- sums, loops
 
     def test_segments_are_summed(self, engine: Any) -> None:
-        """`segment_sum` returns the sums, zero for an empty segment, and has their derivatives."""
+        """`segment_sum` returns the sums, zero for an empty segment, and has their gradient."""
         chosen, values, segments = _instance(engine), numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
         expected = np.zeros((5, 3), np.float32)
         np.add.at(expected, segments, values)
@@ -148,7 +148,7 @@ class EngineConformance(Conformance):
                 claim_close(result, np.array(expected), 0, f"what repeat of at most {most} times{how} gives")
 
     def test_loops_have_no_derivative(self, engine: Any) -> None:
-        """The result of `repeat` is a constant for derivatives, in both modes, compiled or not."""
+        """The result of `repeat` is a constant for the gradient, compiled or not."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, chosen.constant(np.array([8.0, 1.0], np.float32))
 
@@ -352,7 +352,7 @@ class EngineConformance(Conformance):
     # ----------------------------------------------------------------------------------------- a render
 
     def test_a_render_is_numpys(self, engine: Any) -> None:
-        """The image of a shaded ball is NumPy's; forward and reverse mode agree."""
+        """The image of an unlit ball is NumPy's, to 1e-4; forward and reverse mode agree, with a gradient in θ."""
         chosen = _instance(engine)
         part = scenes.ball(transform=np.asarray(rigid([0.2, 0.3, 0.1, 0.05, 0.1, 0.0]), np.float32))
         expected = scenes.render(part, scenes.CAMERA, scenes.SIZE, sampler="reference")

@@ -58,7 +58,10 @@ def moves(part: Part, samples: Samples) -> Iterator[Move]:
 
 
 def claim_followed(part: Part, sampler: Any) -> None:
-    """Fail unless the points of kept samples stay on the surface when θ moves."""
+    """Fail if, as θ moves, points of kept samples end off the surface by more than `BEHIND` of its motion.
+
+    Distances are along normals. Surfaces without normals, and motions that few samples show, are not judged.
+    """
     part = part.replace(theta=map_leaves(derivatives.single, part.theta))
     before = scenes.find(part, sampler=sampler)
     start = _points(part, before.samples[0])

@@ -31,7 +31,10 @@ SPREAD, TILT = 0.6, 0.1
 
 
 def claim_upright(part: Part, sampler: Any) -> None:
-    """Fail if normals are zero or, where the surface is not made of triangles, not perpendicular to it."""
+    """Fail if normals, but for `FEW`, are zero, or not perpendicular to a surface that is not made of triangles.
+
+    Surfaces without normals pass.
+    """
     surface = scenes.checked(part).surface
     flat = isinstance(surface, TriangleSurface) and not (surface.refines and surface.refine_moves)
     part = part.replace(theta=map_leaves(derivatives.single if flat else wide, part.theta))
@@ -61,7 +64,9 @@ def claim_upright(part: Part, sampler: Any) -> None:
 
 
 def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Fail if the mean normal of a triangle's corners leans from the triangle's own by more than neighbours differ.
+    """Fail if the mean normals of triangles' corners lean too far, in the median, from the triangles' own normals.
+
+    They may lean by a share `SPREAD` of the angle between neighbours.
 
     Args:
         normals: (3, T, 3), at the corners of the triangles; of any length.
@@ -123,7 +128,10 @@ def _by_parameters(part: Part, samples: Samples) -> np.ndarray:
 
 
 def _perpendicular(part: Part, sampler: Any, samples: Samples) -> np.ndarray | None:
-    """`_by_parameters`; without two parameters, normals from slightly shifted images; None if not at pixel centres."""
+    """Unit normals (N, 3) by `_by_parameters` or, without two parameters, of fronts in slightly shifted images.
+
+    Zero where unknown; None for samples that have neither two parameters nor the centres of pixels.
+    """
     if samples.params.shape[1] == 2:
         return _by_parameters(part, samples)
     if not samples.centered:

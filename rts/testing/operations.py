@@ -58,7 +58,7 @@ class OperationConformance(Conformance):
     def test_push_is_the_derivative_of_the_specification(
         self, operation: Operation, operands: Sequence, params: dict
     ) -> None:
-        """`push` fills `out` with derivatives along tangents of any of the operands, for each direction."""
+        """`push` fills `out` with derivatives along tangents of each operand, and of all, in two directions at once."""
         engine = _most_precise()
         at = [engine.to_numpy(x) for x in _constants(engine, _of(operands, np.float64))]
         varied, kept = at[: operation.differentiable], _value(operation, at, params)[1]
@@ -74,7 +74,7 @@ class OperationConformance(Conformance):
     def test_pull_is_the_transpose_of_push(
         self, operation: Operation, operands: Sequence, params: dict, dtype: Any
     ) -> None:
-        """`pull` is the transpose of `push`: ⟨g, J t⟩ = ⟨Jᵀ g, t⟩ for each operand."""
+        """`pull` is the transpose of `push`: ⟨g, J t⟩ = ⟨Jᵀ g, t⟩ for each operand, and for all together."""
         at = _of(operands, dtype)
         varied, (value, kept) = at[: operation.differentiable], _value(operation, at, params)
         g = read_only(np.random.default_rng(2).standard_normal(value.shape).astype(dtype))
@@ -109,7 +109,7 @@ class OperationConformance(Conformance):
     def test_rows_are_computed_by_themselves(
         self, operation: Operation, operands: Sequence, params: dict, share: float
     ) -> None:
-        """The first rows alone, or no rows, have the same value and derivatives as among all."""
+        """Half of the rows alone, or none, have the value that they have among all; without rows gradients are zero."""
         if not (operation.packed and operation.packed_result):
             pytest.skip("its result has no row for each sample")
         whole = _of(operands, np.float64)

@@ -32,7 +32,10 @@ def inputs_of(part: Part, surface: TriangleSurface) -> Tree:
 
 
 def claim_corners(part: Part, surface: TriangleSurface, when: str) -> None:
-    """Fail unless triangles' corners evaluate to themselves, normals face as triangles do, and `face_count` holds."""
+    """Fail unless triangles' corners evaluate to themselves, most normals face as triangles do, and `face_count` holds.
+
+    Skipped after `face_count` for surfaces whose `refine` makes samples of another form.
+    """
     proxy = surface.proxy(inputs_of(part, surface), scenes.CAMERA, scenes.SIZE)
     count = surface.face_count
     claim(count in (None, len(proxy.faces)), f"face_count is {count}; proxy gives {len(proxy.faces)} triangles{when}")
@@ -56,7 +59,7 @@ def claim_corners(part: Part, surface: TriangleSurface, when: str) -> None:
 
 
 def claim_keys_tell_views(part: Part, surface: TriangleSurface) -> None:
-    """Fail unless two views have the same triangles, or different keys."""
+    """Fail if triangles differ between two of `VIEWS`, each in two sizes, with one key."""
     inputs = inputs_of(part, surface)
     given = {
         f"{view} of {scale * scenes.SIZE[0]} rows": (camera, (scale * scenes.SIZE[0], scale * scenes.SIZE[1]))

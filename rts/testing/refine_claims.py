@@ -36,7 +36,7 @@ MISSED = 0.01
 
 
 def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: str) -> None:
-    """Fail unless `refine` leaves each sample on its ray, at its depth, or drops it."""
+    """Fail unless `refine` drops each sample, or leaves it at its depth on its ray, to within `RESIDUAL` pixels."""
     local = camera.within(part.transform).map(lambda m: np.asarray(m, np.float64))
     inputs = inputs_of(part, surface)
     off = _off_rays(part, surface, inputs, surface.proxy(inputs, local, GRID), local, view)
@@ -67,7 +67,7 @@ def _off_rays(part: Part, surface: TriangleSurface, inputs: Tree, proxy: Proxy, 
 
 
 def claim_misses_dropped(part: Part, surface: TriangleSurface) -> None:
-    """Fail unless `refine` drops samples whose rays pass beside the surface, on triangles that are too large."""
+    """Fail unless `refine` drops samples whose rays meet triangles, enlarged by `GROWN`, but miss the surface."""
     local = scenes.CAMERA.within(part.transform).map(lambda m: np.asarray(m, np.float64))
     inputs = inputs_of(part, surface)
     proxy = surface.proxy(inputs, local, GRID)
@@ -91,7 +91,7 @@ def _rays_of(part: Part, camera: Camera) -> tuple[Tree, np.ndarray, np.ndarray]:
 
 
 def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
-    """Fail unless rays that begin just before hits hit there again."""
+    """Fail unless rays that begin just before hits hit there again, all but a share `MISSED`."""
     theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, LAYERS)
     hit, distance = np.asarray(hits.hit), np.asarray(hits.distance)
@@ -116,7 +116,7 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
 
 
 def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
-    """Fail unless rays cast back, from behind all hits, hit at the same places."""
+    """Fail unless rays cast back, from behind all hits, hit at the same places, all but a share `FEW`."""
     theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, DEEP)
     hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)
@@ -126,7 +126,7 @@ def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, vie
     back = surface.intersect(theta, origins[chosen] + last[:, None] * directions[chosen], -directions[chosen], DEEP)
     there = np.where(hit[:, chosen], distance[:, chosen], NOWHERE)
     again = np.where(np.asarray(back.hit), last - np.asarray(back.distance), NOWHERE)
-    again = np.where(again < 0, NOWHERE, again)  # Hits before the near plane, where the first rays began, do not count.
+    again = np.where(again < 0, NOWHERE, again)  # Hits nearer than the near plane, where the first rays began.
     wrong = np.any(np.abs(np.sort(there, axis=0) - np.sort(again, axis=0)) > 1e-2, axis=0)
     claim(
         wrong.sum() <= FEW * len(wrong),

@@ -22,7 +22,10 @@ FEW = 0.03
 
 
 def claim_reprojected(part: Part, sampled: Sampled, camera: Camera, view: str) -> None:
-    """Fail unless the part, evaluated at its samples, lies at the centres of their pixels, at their depth."""
+    """Fail unless the part, evaluated at its samples, lies at the centres of their pixels, at their depth.
+
+    `FEW` may be off by more than `REPROJECTION`, none by more than `RESIDUAL`. Samples that are not centred pass.
+    """
     samples = sampled.samples[0]
     if not samples.centered:
         return
@@ -59,7 +62,7 @@ def claim_ordered(sampled: Sampled, view: str) -> None:
 
 
 def claim_empty_where_empty(sampled: Sampled, view: str) -> None:
-    """Fail unless each sample has one row, and empty cells have row −1 and depth 0."""
+    """Fail unless no two cells share a row, empty cells have row −1 and depth 0, and samples a positive depth."""
     samples = sampled.samples[0]
     row, depth = np.asarray(samples.row), np.asarray(samples.depth)
     claim(row.min() >= -1, f"{view}: row holds {row.min()}; expected −1 where a cell is empty")

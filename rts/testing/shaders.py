@@ -192,7 +192,7 @@ class ShaderConformance(Conformance):
     # ------------------------------------------------------------------------------------------- errors
 
     def test_what_is_missing_is_refused_in_one_line(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """A shader without an entry of θ or the G-buffer works, or raises an `rts.InputError` that says what to do."""
+        """A shader without an entry of θ or the G-buffer works, or raises an `rts.RtsError` of one line."""
         for name in theta:
             fewer = {k: v for k, v in theta.items() if k != name}
             refusal(lambda fewer=fewer: _shaded(shader, fewer, gbuffer), f"theta without {name!r}")

@@ -74,7 +74,7 @@ class SplatterConformance(Conformance):
         claim_close(image, np.broadcast_to([0.5, 0.5, 0, 1], image.shape), TOLERANCE, "the colour of two layers")
 
     def test_empty_cells_stay_empty(self, splatter: Any) -> None:
-        """The image is zero where no cell within reach has a sample: row −1 is no sample."""
+        """The image is zero where no cell within reach has a sample; a lone sample shows most in its own cell."""
         splats = everywhere(LAYERS)
         image = _splat(splatter, splats.replace(row=np.full_like(splats.row, -1)))
         claim((image == 0).all(), "an image without samples is not zero; row −1 means that there is none")
@@ -88,7 +88,7 @@ class SplatterConformance(Conformance):
         claim(0 < own == most, f"a sample shows with {own:.3g} in its own cell, and with {most:.3g} in another")
 
     def test_colors_stay_premultiplied(self, splatter: Any) -> None:
-        """Images of any layers have 0 ≤ colour ≤ alpha ≤ 1."""
+        """The image of scattered samples has 0 ≤ colour ≤ alpha ≤ 1."""
         image = _splat(splatter, scattered())
         low, alpha = image.min(), image[..., 3].max()
         claim(low >= -TOLERANCE and alpha <= 1 + TOLERANCE, f"values from {low:.3g}, alpha to {alpha:.3g}")
@@ -112,7 +112,7 @@ class SplatterConformance(Conformance):
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
 
     def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
-        """Samples that `needed` leaves out affect neither image nor derivative."""
+        """Samples that `needed` leaves out affect neither the image nor its derivative in positions."""
         chosen = _instance(splatter)
         if not overrides(chosen, "needed", Splatter):
             pytest.skip("the splatter does not say which samples it needs")
@@ -188,7 +188,7 @@ class SplatterConformance(Conformance):
 
     @pytest.mark.parametrize("engine", ENGINES)
     def test_every_engine_gives_the_same_image(self, splatter: Any, engine: str) -> None:
-        """Every engine's image is NumPy's, to 1e-5."""
+        """The image of every engine with derivatives is NumPy's, to 1e-5."""
         chosen = differentiating(engine)
         for splats in (everywhere(LAYERS), scattered()):
             with no_error(f"splatting in {engine}"):
@@ -203,7 +203,7 @@ class SplatterConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
-        """Rows of no cell have a gradient of zero, as have all rows of an empty image; none is NaN."""
+        """Rows of no cell have a gradient of zero, not NaN; so have all rows of an empty image."""
         chosen, splats = differentiating(engine), scattered()
         for row in (splats.row, np.full_like(splats.row, -1)):
             f = _of_positions_and_colors(splatter, row)

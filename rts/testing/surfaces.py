@@ -48,7 +48,7 @@ class SurfaceConformance(Conformance):
     # ------------------------------------------------------------------------------------------ samples
 
     def test_samples_lie_on_the_centres_of_their_pixels(self, part: Part, sampler: Any) -> None:
-        """Each sample, evaluated and projected, lies on its pixel's centre, at its depth."""
+        """Samples, evaluated and projected, lie on their pixels' centres, at their depths: 97 % to 0.02 pixels."""
         for view, camera in scenes.VIEWS.items():
             claim_reprojected(part, scenes.find(part, camera, sampler), camera, view)
 
@@ -129,15 +129,15 @@ class SurfaceConformance(Conformance):
         claim_keys_tell_views(part, triangles_of(part))
 
     def test_triangles_are_made_anew_for_every_array_that_moves_them(self, part: Part, sampler: Any) -> None:
-        """`proxy_inputs` holds all of θ that the surface depends on."""
+        """`proxy_inputs` changes with each array of θ that moves the surface."""
         claim_inputs_change(part, triangles_of(part), sampler)
 
     def test_normals_stand_upright(self, part: Part, sampler: Any) -> None:
-        """Normals are not zero; they are perpendicular to the surface, unless it consists of its triangles."""
+        """Normals, if any, are not zero; they are perpendicular to the surface, unless it consists of its triangles."""
         claim_upright(part, sampler)
 
     def test_the_surface_follows_theta(self, part: Part, sampler: Any) -> None:
-        """Points at kept samples stay on the surface while θ changes a little."""
+        """Points at kept samples follow the surface as θ changes a little: at most 35 % of its motion is left."""
         claim_followed(part, sampler)
 
     def test_tessellate_gives_a_mesh_on_the_surface(self, part: Part, sampler: Any) -> None:
@@ -152,7 +152,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
-        """`evaluate` can be traced: it reads no values of θ, and uses functions of its namespace alone."""
+        """`evaluate` can be traced, as it reads no values of θ: positions of a compiled call are NumPy's, to 1e-5."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
         samples = derivatives.on(chosen, sampled)
@@ -216,7 +216,7 @@ class SurfaceConformance(Conformance):
         derivatives.claim_engines_agree(image, values, image([derivatives.single(v) for v in values]), "the image")
 
     def test_the_image_depends_on_the_surface(self, part: Part, sampler: Any) -> None:
-        """The image's gradient is not zero at the outline, in at least one entry of θ."""
+        """The image of the silhouette has a gradient that is not zero in at least one entry of θ."""
         values, join = split(part.theta)
         sampled = scenes.frozen(part.replace(shader="silhouette"), sampler=sampler)
         weights = np.random.default_rng(0).random((*scenes.SIZE, 4))
@@ -243,7 +243,7 @@ class SurfaceConformance(Conformance):
         claim_awkward_views_are_finite(part, sampler, differentiating(engine))
 
     def test_wrong_theta_is_refused_in_one_line(self, part: Part, sampler: Any) -> None:
-        """A missing entry, or one of a wrong shape, raises an `rts.InputError` that says what to do."""
+        """An empty θ, or an entry of a wrong shape, raises an `rts.RtsError` of one line; a missing entry may."""
         reads = scenes.checked(part).surface.reads(part.theta)
         part = part.replace(shader="silhouette")
 

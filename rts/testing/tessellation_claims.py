@@ -30,7 +30,10 @@ OFF = 0.02
 
 
 def claim_tessellated(part: Part, surface: TriangleSurface, sampler: Any) -> None:
-    """Fail unless `tessellate` gives meshes on the surface, and finer ones at higher rates."""
+    """Fail unless `tessellate` gives sound meshes: at more cuts nearer to the surface, of more triangles or as many.
+
+    Skipped for surfaces without a `tessellate` that refine samples or depend on the view.
+    """
     if not overrides(surface, "tessellate", TriangleSurface) and (surface.refines or surface.depends_on_view):
         pytest.skip("the surface has no tessellate")
     part = part.replace(theta=map_leaves(derivatives.single, part.theta))
@@ -57,7 +60,7 @@ def claim_tessellated(part: Part, surface: TriangleSurface, sampler: Any) -> Non
 
 
 def claim_rates(part: Part, sampler: Any) -> None:
-    """Fail unless each of `rates` gives a form of the surface, and more work comes nearer to it."""
+    """Fail unless each of `rates` gives a form of the surface, and twice the work or more comes nearer to it."""
     part = part.replace(theta=map_leaves(derivatives.single, part.theta))
     depths, off = _front(part, sampler), []
     for rate in part.surface.rates(part.theta):

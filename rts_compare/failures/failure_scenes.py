@@ -1,4 +1,4 @@
-"""The scenes of the rows, made by formulas; what moves in them moves about a pixel a unit."""
+"""The scenes of the table's rows, most made by formulas. One unit along a direction moves parts by about a pixel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE = (96, 96)
 SMALL = (64, 64)
 WHITE, RED, GREEN, BLUE = (0.95, 0.95, 0.95), (0.85, 0.25, 0.15), (0.2, 0.75, 0.3), (0.2, 0.4, 0.9)
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
-"""A rotation vector about the middle of what moves, and a translation."""
+"""Names of motions: the components of a rotation vector, about the middle of what moves, and of a translation."""
 ARM = 0.4
 """The distance from the middle at which a rotation of one unit moves by a pixel."""
 
@@ -43,7 +43,7 @@ class _Posed(NamedTuple):
     center: np.ndarray
 
     def __call__(self, parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
-        """The parts at a pose (6,)."""
+        """All parts, with those that move at the pose (6,) in `parameters`, and the camera."""
         transform = rigid(parameters["pose"], self.center)
         return [p.replace(transform=transform) if i in self.moves else p for i, p in enumerate(self.parts)], self.camera
 
@@ -82,7 +82,15 @@ def posed(
 
 
 def card(center: Sequence[float], half: Sequence[float], depth: float, color: Any, size: tuple[int, int]) -> Part:
-    """A card that faces the camera, by the pixels of its middle and half its width and height; slightly turned."""
+    """A card parallel to the image plane, turned there by 0.05 radians.
+
+    Args:
+        center: its middle, pixels.
+        half: half of its width and of its height, pixels.
+        depth: its camera depth.
+        color: its colour.
+        size: (height, width) of the image, which is square.
+    """
     c, s = np.cos(0.05), np.sin(0.05)
     corners = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * half @ np.array([[c, s], [-s, c]])
     return unlit(on_screen(corners + center, depth, size[0]), QUAD, color)
@@ -96,7 +104,7 @@ def sphere(radius: float = 0.6, center: Any = (0, 0, 0), color: Any = GREEN, det
 
 
 def backdrop(depth: float = CARD_DEPTH + 1.0, color: Any = BLUE) -> Part:
-    """A card that fills the image."""
+    """A card that fills the image, at a camera depth."""
     return unlit(np.array([[-4, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0.0]]) + [0, 0, DISTANCE - depth], QUAD, color)
 
 
@@ -104,7 +112,7 @@ def backdrop(depth: float = CARD_DEPTH + 1.0, color: Any = BLUE) -> Part:
 
 
 def box_pose() -> Scene:
-    """A box with a colour a face, before a card with a pattern."""
+    """A box with a colour a face, in front of a card with a pattern."""
     return posed("box pose", scene_shapes.turned_box(), AXES, size=SMALL)
 
 
@@ -135,25 +143,25 @@ def square_behind_open_bunny() -> Scene:
 
 
 def far_card() -> Scene:
-    """A card on black, to be found from where nothing overlaps."""
+    """A card on black; fits start where the card's image does not overlap that of the target."""
     return posed("far card", card((32, 32), (8, 6), DISTANCE, WHITE, SMALL), ("tx", "ty"), size=SMALL)
 
 
 def hidden_card() -> Scene:
-    """A card beside a larger one that is nearer; fits begin behind that."""
+    """A card that moves, beside a larger one that is nearer; fits start with the first behind the larger one."""
     near = card((20, 32), (14, 16), 2.6, RED, SMALL)
     far = card((48, 32), (6, 8), CARD_DEPTH, WHITE, SMALL)
     return posed("hidden card", [near, far], ("tx", "ty"), moves=[1], size=SMALL)
 
 
 def turning_card() -> Scene:
-    """An upright silhouette of a card that is turned about its upright axis by 0.5."""
+    """A white card on black that is turned about its upright axis by 0.5 radians, and turns further."""
     flat = np.array([[-0.5, -0.3, 0], [0.5, -0.3, 0], [0.5, 0.3, 0], [-0.5, 0.3, 0]])
     return posed("turning card", unlit(flat @ scene_shapes.rotation_xy(0, 0.5).T, QUAD, WHITE), ("ry",), size=SMALL)
 
 
 def facing_card() -> float:
-    """The amount at which that card faces the camera."""
+    """The amount of the mode "ry" at which the card of `turning_card` faces the camera."""
     return -0.5 / (pixel(DISTANCE, SMALL[0]) / ARM)
 
 
@@ -161,13 +169,13 @@ def facing_card() -> float:
 
 
 def stack(count: int) -> Scene:
-    """Cards one behind the other; the one in the middle moves."""
+    """`count` cards, at least 2, one behind the other; the one in the middle moves."""
     parts, depths = scene_shapes.cards(count)
     return posed(f"stack of {count}", parts, moves=[count // 2], depth=depths[count // 2])
 
 
 def shells() -> Scene:
-    """A closed sphere, both of its sides drawn, before a card that moves: it is the third layer."""
+    """A closed sphere, both of its sides drawn, in front of a card that moves: the card is the third layer."""
     far = card((50, 46), (34, 24), CARD_DEPTH, RED, SIZE)
     return posed("card behind a shell", [sphere(0.45), far], moves=[1], depth=CARD_DEPTH)
 
@@ -184,13 +192,13 @@ def behind_glass() -> Scene:
 
 
 def coplanar(apart: float = 0.0) -> Scene:
-    """Two cards in one plane, or some way apart, which overlap; the nearer one slides."""
+    """Two cards that overlap, in one plane or `apart` in depth, world units; the farther one slides."""
     cards = [card((40, 44), (22, 18), DISTANCE, RED, SIZE), card((58, 54), (20, 22), DISTANCE + apart, GREEN, SIZE)]
     return posed("coplanar cards", [*cards, backdrop()], moves=[1])
 
 
 def crossing() -> Scene:
-    """Two spheres that pass through one another."""
+    """Two spheres that pass through one another; the nearer one moves."""
     parts = sphere(0.5, (0.32, -0.05, 0.1), BLUE, 4), sphere(0.6, (-0.28, 0.05, -0.05), RED, 4)
     return posed("crossing spheres", parts, moves=[0])
 
@@ -199,12 +207,12 @@ def crossing() -> Scene:
 
 
 def wires(width: float) -> Scene:
-    """Seven slanted wires over black, some pixels wide."""
+    """Seven slanted wires over black, `width` pixels wide."""
     return posed("wires", scene_shapes.wires(SIZE[0], [width] * 7), ("tx",))
 
 
 def gap(width: float) -> Scene:
-    """Two cards with a slanted gap between them, before a card that shows through; the right one moves."""
+    """Two cards with a slanted gap of `width` pixels, in front of a card that shows through; the right one moves."""
     turn = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
 
     def half(left: float, right: float) -> Part:
@@ -215,7 +223,7 @@ def gap(width: float) -> Scene:
 
 
 def comb() -> Scene:
-    """Teeth of 0.7 pixels, 1.3 pixels apart: several edges in every pixel."""
+    """Slanted teeth 0.7 pixels wide, one every 1.3 pixels: many pixels have several edges."""
     vertices, faces = [], []
     for i in range(40):
         x = 22 + 1.3 * i
@@ -243,18 +251,18 @@ def grazing() -> Scene:
 
 
 def leaving() -> Scene:
-    """A sphere that reaches beyond three sides of the image."""
+    """A sphere that reaches beyond two sides of the image, the upper and the right one."""
     return posed("leaving the image", sphere(0.95, (0.55, 0.35, 0), detail=4))
 
 
 def through_near() -> Scene:
-    """A slanted card of which the near plane cuts off a part; sideways, and towards the camera."""
+    """A slanted card of which the near plane cuts off a part. One mode moves it sideways, one towards the camera."""
     corners = np.array([[-0.15, -0.13, -0.35], [0.3, -0.13, -1.0], [0.3, 0.12, -1.0], [-0.15, 0.12, -0.35]])
     return posed("near plane", unlit(corners + [0, 0, DISTANCE], QUAD, RED), ("tx", "tz"), depth=0.6)
 
 
 def past_camera() -> Scene:
-    """A band on the floor that goes on behind the camera."""
+    """A quadrilateral on the floor that goes on behind the camera."""
     points = np.array([[-0.18, -0.3, 6.0], [0.12, -0.3, 6.0], [0.2, -0.3, 0.0], [-0.25, -0.3, 0.0]])
     return posed("behind the camera", unlit(points, [(0, 1, 2), (0, 2, 3)], RED), depth=1.5)
 
@@ -265,7 +273,7 @@ def empty() -> Scene:
 
 
 def covered() -> Scene:
-    """A sphere wholly behind a card; the other mode moves the card."""
+    """A sphere wholly behind a card. The mode "hidden" moves the sphere, the mode "card" the card."""
     parts = [sphere(0.3, (0, 0, -1.0)), card((48, 48), (30, 30), 2.6, RED, SIZE)]
     hidden, both = posed("hidden", parts, moves=[0]), posed("hidden", parts, moves=[1])
 
@@ -283,7 +291,7 @@ def covered() -> Scene:
 
 
 def turning_ball() -> Scene:
-    """A sphere of one colour, which turns about its middle: nothing changes. The other mode moves it."""
+    """A sphere of one colour. The first mode turns it about its middle: nothing changes. The other moves it."""
     vertices, faces = example_shapes.icosphere(5)
     return posed("turning ball", unlit(0.6 * vertices, faces, GREEN), ("ry", "tx"))
 
@@ -292,12 +300,12 @@ def turning_ball() -> Scene:
 
 
 def plain() -> Scene:
-    """A sphere, culled, before a card."""
+    """A sphere, culled, that moves in front of a card."""
     return scaled(1.0)
 
 
 def scaled(factor: float, away: float = 0.0) -> Scene:
-    """The scene `plain` with all lengths times a factor, in float64, and moved by `away` from the origin."""
+    """The scene `plain` with all lengths times a factor, in float64, then moved by `away` along x, camera and all."""
     offset = np.array([away, 0.0, 0.0])
 
     def moved(part: Part) -> Part:
@@ -312,7 +320,7 @@ def scaled(factor: float, away: float = 0.0) -> Scene:
 
 
 def offset(away: float) -> Scene:
-    """The scene `plain`: vertices lie near their parts' origins, and transforms move the parts far from the world's."""
+    """The scene `plain`, camera and all, moved by `away` along x: by transforms, while vertices stay as they are."""
     scene, still = plain(), np.eye(4)
     still[0, 3] = away
 

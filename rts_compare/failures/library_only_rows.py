@@ -1,4 +1,7 @@
-"""Rows about isosurfaces, poses with directions that change nothing, and float32: what only the library itself has."""
+"""Rows that only the library itself can measure: isosurfaces, poses with directions that change nothing, float32.
+
+Each function measures one cell; for another renderer the outcome is "cannot".
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ SIZE = (64, 64)
 
 
 def _points() -> np.ndarray:
-    """Lattice points (n, n, n, 3)."""
+    """The points (n, n, n, 3) of a lattice in [−1, 1]³, `COUNT` along each axis."""
     line = np.linspace(-1, 1, COUNT)
     return np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
 
@@ -46,7 +49,10 @@ def _image(values: Array, method: Method, shader: str = "lambert") -> Array:
 
 
 def _gradient(values: np.ndarray, method: Method) -> tuple[float, int]:
-    """The largest derivative of the image's mean square by a lattice value; and how many derivatives are not finite."""
+    """The largest derivative of the image's mean square by a lattice value; and the number of NaN and infinite ones.
+
+    Over images with the shaders "lambert" and "silhouette".
+    """
     engine = engine_named("torch")
     largest, nan = 0.0, 0
     for shader in ("lambert", "silhouette"):
@@ -74,20 +80,20 @@ def _of_values(values: np.ndarray, usual: np.ndarray, limits: tuple[float, float
 
 
 def lattice_ties(method: Method, context: Context) -> Outcome:
-    """A box whose faces pass exactly through lattice points: values of exactly zero, and of −0."""
+    """Compare gradients of a box whose faces pass exactly through lattice points, where values are −0."""
     distances = np.round(np.abs(_points()).max(axis=-1) * (COUNT - 1)) - 9.0  # Odd multiples of half a cell.
     return _of_values(np.where(distances == 0, -0.0, distances), distances + 0.4, (3.0, 30.0), method)
 
 
 def singular_crossings(method: Method, context: Context) -> Outcome:
-    """Two balls that all but touch: at the saddle between them the field has no slope."""
+    """Compare gradients of two balls that all but touch: at the saddle between them the field has no slope."""
     x, y, z = np.moveaxis(_points(), -1, 0)
     saddle = (x**2 - 0.3) ** 2 + y**2 + z**2 - 0.3**2
     return _of_values(saddle + 1e-7, saddle - 0.05, (30.0, 300.0), method)
 
 
 def density_grid(name: str, rate: float, method: Method, context: Context) -> Outcome:
-    """The values of a lattice fitted to an egg from a ball, by "adam" or "sgd" at a learning rate."""
+    """Fit the values of a lattice, which show a ball, to the image of an egg, by "adam" or "sgd" at a learning rate."""
     if method.peer:
         return cannot("it has no isosurfaces")
     engine = engine_named("torch")
@@ -109,7 +115,7 @@ def density_grid(name: str, rate: float, method: Method, context: Context) -> Ou
 
 
 def gauge_freedom(method: Method, context: Context) -> Outcome:
-    """A pose made of two poses, fitted by Levenberg–Marquardt: six combinations of twelve numbers change nothing."""
+    """Fit a product of two poses by Levenberg–Marquardt: six combinations of its twelve numbers change nothing."""
     if method.peer:
         return cannot("it offers no Jacobian")
     scene, engine = failure_scenes.box_pose(), engine_named("torch")
@@ -146,7 +152,7 @@ def gauge_freedom(method: Method, context: Context) -> Outcome:
 
 
 def precision(method: Method, context: Context) -> Outcome:
-    """The derivative of a scene in float32 beside that in float64."""
+    """Compare the derivative image of a scene in float32 with that in float64."""
     if method.peer:
         return cannot("it has one precision only: " + ("float64" if method.peer == "DEODR" else "float32"))
     scene = failure_scenes.plain()
@@ -160,14 +166,14 @@ def precision(method: Method, context: Context) -> Outcome:
 
 
 def swept_trap(method: Method, context: Context) -> Outcome:
-    """A sphere swept along a circle, fitted to a torus that is seen from its axis: the hole never opens (§4.5)."""
+    """Fit a sphere swept along a circle to a torus that is seen from its axis: the hole never opens (paper §4.5)."""
     if method.peer:
         return cannot("it has no isosurfaces")
     return _swept(method, context, ((0, 3.4, 0), (0, 0, -1)))
 
 
 def swept_turned(method: Method, context: Context) -> Outcome:
-    """The fit of `swept_trap` seen obliquely, where symmetry no longer hides the hole."""
+    """Repeat the fit of `swept_trap`, seen obliquely: symmetry no longer hides the hole."""
     if method.peer:
         return cannot("it has no isosurfaces")
     return _swept(method, context, ((0.9, 2.2, 2.4), (0, 1, 0)))

@@ -1,4 +1,4 @@
-"""Renderers of methods, as rows ask for them: derivative images, and slopes of losses, by us and by others."""
+"""Renderers of the table's methods: derivative images and slopes of losses, by this library and by others."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ class Renderer(abc.ABC):
 
     @abc.abstractmethod
     def derivative(self, mode: str) -> np.ndarray:
-        """The derivative image (H, W, 3) along a mode, where the scene is at rest."""
+        """The derivative image (H, W, 3) along a mode, per unit, where the scene is at rest."""
 
     @abc.abstractmethod
     def slopes(self, amounts: np.ndarray, weigh: Weigh) -> np.ndarray:
         """The derivatives (modes,) of a loss along all modes, with the scene moved by amounts (modes,)."""
 
     def broken(self) -> int:
-        """The number of values of the image and of gradients that are not finite."""
+        """The number of NaN and infinite values of a loss and its gradients; 0 where these are not computed."""
         return 0
 
 
@@ -130,7 +130,7 @@ class Own(Renderer):
         return self.engine.to_numpy(found).astype(np.float64)
 
     def broken(self) -> int:
-        """See `Renderer`; gradients of a loss in all numbers of all parts."""
+        """See `Renderer`; gradients in all numbers of the θ of all parts."""
         parts, camera = self.scene.at(self.scene.parameters)
         parts = parts_of((parts, camera))
         engine, weights = self.engine, loss_weights(*self.scene.size)[0]
@@ -172,7 +172,11 @@ class Other(Renderer):
             raise Unable(str(error)) from None
 
     def derivative(self, mode: str) -> np.ndarray:
-        """See `Renderer`."""
+        """See `Renderer`.
+
+        Raises:
+            Unable: DEODR refuses the mesh, or its images jump.
+        """
         try:
             found = self.peer.derivative(mode)
         except AssertionError:

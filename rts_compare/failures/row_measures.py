@@ -29,7 +29,11 @@ SEEDS_OF_MITSUBA = 5
 
 
 def pixel_of(scene: Scene, mode: str) -> float:
-    """The step along a mode that moves the fastest point by a pixel."""
+    """The step along a mode that moves the fastest vertex by a pixel; 1 if nothing moves.
+
+    Raises:
+        Unsuited: the scene's parts are no coloured triangles, see `renderer_input`.
+    """
     return 1.0 / (renderer_input(scene).fastest(mode) or 1.0)
 
 
@@ -38,7 +42,7 @@ class Derivative(NamedTuple):
 
     Attributes:
         scene: () → the scene, at rest where the derivative is taken.
-        reference: () → another scene of the same image, whose truth is compared with; None for the scene's own.
+        reference: () → another scene of the same image, whose true derivative is taken; None for the scene's own.
         pixel: the step that moves the fastest point by a pixel; None to compute it by `pixel_of`.
         double: whether the library computes in float64.
         mode: the scene's mode to measure; None for the first.
@@ -51,7 +55,7 @@ class Derivative(NamedTuple):
     mode: str | None = None
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The error of the method."""
+        """The cell of a method: its error, see `numbers`, and the verdict by `ERRORS`."""
         try:
             numbers = self.numbers(method, context)
         except Unable as reason:
@@ -64,10 +68,13 @@ class Derivative(NamedTuple):
         """Measure the derivative of a method.
 
         Returns:
-            error: relative L2 through the low-pass of `scores`.
-            largest: the largest derivative of a pixel's colour, over the truth's.
-            nan: values that are not finite.
-            truth_error: of the truth itself.
+            error: relative L2 through `low_pass`.
+            largest: the largest derivative of a pixel's colour, over that of the true derivative.
+            nan: the number of values of the derivative, and of `Renderer.broken`, that are not finite.
+            truth_error: the estimated error of the true derivative.
+
+        Raises:
+            Unable: the method does not apply.
         """
         scene = self.scene()
         mode = next(iter(scene.directions)) if self.mode is None else self.mode
@@ -99,7 +106,7 @@ class Several(NamedTuple):
     derivatives: tuple[Derivative, ...]
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The error of each derivative."""
+        """The cell of a method: the error of each derivative, and the verdict on the largest."""
         try:
             found = [d.numbers(method, context) for d in self.derivatives]
         except Unable as reason:
@@ -111,7 +118,7 @@ class Several(NamedTuple):
 
 
 class Vanishing(NamedTuple):
-    """A row in which the image does not change: its false derivative, relative to that along another mode.
+    """A row in which the image does not change: the false derivative, relative to that along another mode if any.
 
     Attributes:
         scene: () → the scene. Its first mode changes nothing; the second, if any, gives the derivative by a pixel of
@@ -123,7 +130,7 @@ class Vanishing(NamedTuple):
     limits: tuple[float, float]
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The norm of the false derivative, through the low-pass, over that of the other mode."""
+        """The cell of a method: the norm of the false derivative, through `low_pass`, over that of the other mode."""
         scene = self.scene()
         try:
             drawn = renderer(scene, method)
@@ -146,9 +153,9 @@ class Fitted(NamedTuple):
     """A row of fits by Adam, along all modes of a scene, to an image of the scene at rest.
 
     Attributes:
-        scene: () → the scene, with directions of about a pixel each; at the truth all amounts are zero.
+        scene: () → the scene, with directions of about a pixel each; in the target all amounts are zero.
         start: random numbers → amounts (modes,) to start from.
-        rate: Adam's at the start; it falls along a cosine to a twentieth.
+        rate: Adam's learning rate at the start; it falls along a cosine to a twentieth.
         blur: standard deviation, pixels, of a Gaussian on the images at the start; it shrinks to zero in the first two
             thirds of the steps.
     """
@@ -159,7 +166,10 @@ class Fitted(NamedTuple):
     blur: float = 0.0
 
     def __call__(self, method: Method, context: Context) -> Outcome:
-        """The share of fits that converge, and the verdict by `SHARES`; "failed" if any slope is not finite."""
+        """The cell of a method: how many fits converge, and the verdict by `SHARES`.
+
+        "failed" if any slope is not finite.
+        """
         scene = self.scene()
         still = parts_of(scene.at(scene.parameters)), scene.at(scene.parameters)[1]
         with quiet():
@@ -183,7 +193,10 @@ class Fitted(NamedTuple):
         return Outcome("failed" if nan else verdict, text, {**numbers, "nan": nan})
 
     def _fit(self, drawn: Any, first: np.ndarray, target: np.ndarray, steps: int) -> tuple[np.ndarray, int, float]:
-        """The amounts at the end, the number of steps whose slope was not finite, and the largest slope."""
+        """The amounts (modes,) at the end, the number of slopes that were not finite, and the largest of the others.
+
+        Slopes that are not finite count as zero.
+        """
         import torch
         from scipy.ndimage import gaussian_filter
 
@@ -210,7 +223,7 @@ class Fitted(NamedTuple):
 
 
 def distance(scene: Scene, amounts: np.ndarray) -> float:
-    """The distance of vertices from their places at rest: pixels, root mean square over the parts that move."""
+    """The distance of vertices from their places at rest: pixels, root mean square over parts that moved; else 0."""
     total = []
     zero = np.zeros(len(amounts))
     for a, b in zip(_on_screen(scene, amounts), _on_screen(scene, zero), strict=True):
@@ -220,7 +233,7 @@ def distance(scene: Scene, amounts: np.ndarray) -> float:
 
 
 def _on_screen(scene: Scene, amounts: np.ndarray) -> list[np.ndarray]:
-    """Pixels (V, 2) of the vertices of each part."""
+    """The pixel coordinates (V, 2) of the vertices of each part, moved by amounts (modes,)."""
     parts, camera = scene.at(shifted(scene, amounts))
     points_of = []
     for part in parts_of((parts, camera)):
@@ -235,7 +248,7 @@ def own(method: Method) -> None:
     """Refuse methods that are other renderers.
 
     Raises:
-        Unable: the method is one.
+        Unable: the method is another renderer.
     """
     if method.peer:
         raise Unable("the row is about what only we have")

@@ -29,7 +29,7 @@ class Stability(NamedTuple):
 
     Attributes:
         methods: the names of the columns.
-        rows: name, note, why, and the cells of each row, in the order of `methods`.
+        rows: each row, and its cells in the order of `methods`.
         environment: when and where it was measured.
 
     Printed, it is a table in Markdown.
@@ -48,13 +48,13 @@ class Stability(NamedTuple):
         return cells[self.methods.index(method)]
 
     def markdown(self) -> str:
-        """A table; ~ is degraded, ✗ failed, – cannot."""
+        """The table in Markdown; ~ is degraded, ✗ failed, – cannot."""
         lines = [["", *self.methods], ["---"] * (len(self.methods) + 1)]
         lines += [[row.name, *(in_words(cell) for cell in cells)] for row, cells in self.rows]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
     def data(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it."""
+        """The environment, the methods and the rows with their cells, in types that JSON has."""
         rows = [
             {"name": row.name, "note": row.note, "why": row.why, "cells": [_plain(cell._asdict()) for cell in cells]}
             for row, cells in self.rows
@@ -76,7 +76,7 @@ class Stability(NamedTuple):
 
 
 def in_words(cell: Outcome) -> str:
-    """A cell in Markdown."""
+    """The text of a cell in Markdown, after the mark of its verdict."""
     return MARKS["cannot"] if cell.verdict == "cannot" else MARKS[cell.verdict] + cell.text
 
 
@@ -92,7 +92,7 @@ def stability(
     more: Sequence[Row] = (),
     progress: bool | None = None,
 ) -> Stability:
-    """Try every method on every way to fail that is known; for torch.
+    """Try methods on ways to fail, with the library on torch.
 
     Rows are scenes and fits that are hard, columns the library's splatters and two other renderers, which the extra
     `bench` brings. Each cell says how it went, by a figure; a row's `note` says which figure, and from where on it
@@ -103,14 +103,15 @@ def stability(
         methods: names; None for all.
         seeds: how many starts fits have; Mitsuba has at most 5.
         steps: of each fit.
-        truth_samples: of true derivatives, along each side of a pixel.
-        output: a folder for the table, and for what a run that is interrupted goes on from; None to write nothing.
-        fresh: whether to forget what earlier runs have measured; cells do not know of changes of the code.
+        truth_samples: the square root of the number of points a pixel on each grid of true derivatives.
+        output: a folder for the table and its measurements, from which an interrupted run goes on; None for neither.
+        fresh: whether to measure all cells anew. Otherwise cells in `output` are taken, even if the code has changed.
         more: further rows, before the others.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
         InputError: there is no such row or method, or an argument is wrong; before anything is measured.
+        PluginError: torch is not installed.
     """
     if not isinstance(more, (list, tuple)) or not all(isinstance(row, Row) for row in more):
         raise InputError(f"more is {quoted(more)}; expected a list of rows")
@@ -142,7 +143,11 @@ def stability(
 
 
 def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) -> list[Any]:
-    """The values of `known` under the names `wanted`, all for None; refused, as `what`, if a name is unknown."""
+    """The values of `known` under the names `wanted`, or under one name; all for None.
+
+    Raises:
+        InputError: a name is unknown, or `wanted` is no list of names; the message calls `wanted` by `what`.
+    """
     if wanted is None:
         return list(known.values())
     wanted = [wanted] if isinstance(wanted, str) else wanted
@@ -159,7 +164,7 @@ def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) ->
 
 
 def _measured(row: Row, method: Method, context: Context, measured: KeptMeasurements) -> Outcome:
-    """A cell, measured, or read from what an earlier run has kept."""
+    """A cell, measured now, or by an earlier run that kept it; "cannot" where a data file is missing."""
     key = (row.name, method.name, context.seeds, context.steps, context.samples)
     kept = measured.get(*key)
     if kept is None:
@@ -174,7 +179,7 @@ def _measured(row: Row, method: Method, context: Context, measured: KeptMeasurem
 
 
 def _plain(value: Any) -> Any:
-    """A value that JSON can hold: numbers to four digits, those that are not finite as words."""
+    """A value in types that JSON has: reals to four digits, NaN and infinity as words, arrays as lists."""
     if isinstance(value, Mapping):
         return {key: _plain(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):

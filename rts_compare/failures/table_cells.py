@@ -1,4 +1,4 @@
-"""Cells of the table, and its rows."""
+"""Records of the table of failures: its cells and its rows, each a way to fail."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Outcome(NamedTuple):
 
     Attributes:
         verdict: "ok", "degraded", "failed", or "cannot" where the method does not apply.
-        text: the figure that tells, a few characters; for "cannot" the reason, a clause.
+        text: the row's figure, a few characters; for "cannot" the reason, a clause.
         numbers: what was measured, by name; `nan` counts values that are not finite.
     """
 
@@ -32,8 +32,8 @@ class Context(NamedTuple):
 
     Attributes:
         seeds: how many starts fits have.
-        samples: of the truth, along each side of a pixel.
-        folder: where truths are kept; None for the folder of caches.
+        samples: the square root of the number of points a pixel on each grid of true derivatives.
+        folder: where true derivatives are kept; None for the folder of caches.
         steps: of fits.
     """
 
@@ -65,7 +65,10 @@ def cannot(reason: str) -> Outcome:
 
 
 def graded(value: float, ok: float, degraded: float, nan: int = 0) -> str:
-    """The verdict on a figure that should be small."""
+    """The verdict on a figure that should be small: "ok" and "degraded" up to these limits, else "failed".
+
+    Also "failed" if the figure is not finite, or `nan` is not zero.
+    """
     if nan or not np.isfinite(value) or value > degraded:
         return "failed"
     return "ok" if value <= ok else "degraded"

@@ -1,4 +1,4 @@
-"""The columns of the table."""
+"""The columns of the table of failures: methods, which are ways to render."""
 
 from __future__ import annotations
 

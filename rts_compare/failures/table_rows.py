@@ -28,18 +28,18 @@ COARSE = "An error of one sample a pixel, which tells only between which two cen
 
 
 def _spread(sizes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Amounts up to so many units in either direction."""
+    """Random amounts (n,), each up to its one of `sizes` (n,) in either direction."""
     return rng.uniform(-1, 1, len(sizes)) * sizes
 
 
 def _ring(near: float, far: float, rng: np.random.Generator) -> np.ndarray:
-    """(2,) somewhere between two distances."""
+    """A random offset (2,) whose length is between `near` and `far`."""
     angle = rng.uniform(0, 2 * np.pi)
     return rng.uniform(near, far) * np.array([np.cos(angle), np.sin(angle)])
 
 
 def _at(*middle: float, spread: float = 2.0):
-    """A start near a place."""
+    """A function, random numbers → amounts that differ from `middle` by at most `spread` each."""
     return partial(_near, np.array(middle), spread)
 
 

@@ -30,7 +30,7 @@ class Deodr(Peer):
 
     Raises:
         ImportError: DEODR is not installed.
-        Unsuited: DEODR cannot render the scene.
+        Unsuited: a vertex is nearer than the near plane.
     """
 
     name = "DEODR"
@@ -61,7 +61,7 @@ class Deodr(Peer):
         return self._render(self.vertices, self.colors)
 
     def _render(self, vertices: np.ndarray, colors: np.ndarray) -> np.ndarray:
-        """The image (H, W, 3)."""
+        """The image (H, W, 3) with these vertices (V, 3) and colours (V, 3), which the scene then keeps."""
         self.scene.mesh.set_vertices(vertices)
         self.scene.mesh.set_vertices_colors(colors)
         with warnings.catch_warnings():
@@ -69,7 +69,7 @@ class Deodr(Peer):
             return self.scene.render(self.camera)
 
     def derivative(self, mode: str, seed: int = 0) -> np.ndarray:
-        """See `Peer`."""
+        """See `Peer`. Each value is the smaller one of two one-sided differences; `seed` has no effect."""
         move, change = self._velocity(mode)
         step = STEP / (self.given.fastest(mode) or 1.0)
         rest = self._render(self.vertices, self.colors)
@@ -93,7 +93,7 @@ class Deodr(Peer):
         return slope
 
     def _velocity(self, mode: str) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities (V, 3) of all vertices, and of their colours."""
+        """Velocities (V, 3) of all vertices, and velocities (V, 3) of their colours; zero at rest."""
         pairs = list(zip(self.given.parts, self.given.velocity(mode), strict=True))
         moves = [np.zeros_like(p.vertices) if v.vertices is None else v.vertices for p, v in pairs]
         changes = [np.zeros_like(p.colors) if v.colors is None else v.colors for p, v in pairs]

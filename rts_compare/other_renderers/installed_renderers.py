@@ -16,15 +16,15 @@ SPP = (1, 4, 16)
 
 
 def peers(scene: Scene, spp: Sequence[int] = SPP, engine: Engine | None = None) -> tuple[list[Peer], list[str]]:
-    """The renderers that can render a scene, and why others cannot.
+    """The renderers that can render a scene, and the reasons why others cannot.
 
     Args:
-        scene: of unlit or white parts without textures, and a perspective camera.
-        spp: samples a pixel; Mitsuba is there once for each.
+        scene: of unlit parts or silhouettes without textures, seen by a perspective camera; see `renderer_input`.
+        spp: numbers of samples a pixel; the result has Mitsuba once for each.
         engine: of the scene's parameters; None for NumPy.
 
     Returns:
-        The renderers, and a line for each that is left out.
+        The renderers; and a line for each that is left out, or one line for both if neither can take the scene.
     """
     try:
         given = renderer_input(scene, engine)

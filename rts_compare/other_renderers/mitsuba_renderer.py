@@ -21,10 +21,10 @@ from rts_compare.other_renderers.renderer_input import Peer, RendererInput
 
 @cache
 def mitsuba() -> Any:
-    """The package, in the variant for processors.
+    """The module `mitsuba`, set once to its variant for CPUs, with log messages below errors silenced.
 
     Raises:
-        ImportError: it is not installed, or finds no LLVM that will do.
+        ImportError: Mitsuba is not installed, or finds no LLVM of version 16 or newer.
     """
     found, drjit = import_module("mitsuba"), import_module("drjit")
     found.set_variant("llvm_ad_rgb")
@@ -40,13 +40,13 @@ def mitsuba() -> Any:
 def sensor(
     size: tuple[int, int], fov: float, planes: tuple[float, float], distance: float = 0.0, pixel_format: str = "rgb"
 ) -> dict[str, Any]:
-    """A camera that looks along −z with +y up.
+    """The dict from which Mitsuba makes a camera that looks along −z with +y up.
 
     Args:
         size: (height, width) of the image.
         fov: vertical field of view, degrees.
         planes: depths of the near and the far plane.
-        distance: where it stands on the z axis.
+        distance: the camera's z; its x and y are 0.
         pixel_format: "rgb" or "luminance".
     """
     film = {
@@ -71,14 +71,20 @@ def sensor(
 
 
 def integrator() -> Any:
-    """Derivatives with visibility; nothing is lit by anything, so there are no indirect boundaries to sample."""
+    """The integrator with derivatives of visibility. Nothing lights anything: indirect boundaries get no samples."""
     return mitsuba().load_dict({"type": "direct_projective", "sppi": 0})
 
 
 def emitter(vertices: np.ndarray, faces: np.ndarray, path: str, colors: np.ndarray | None = None) -> dict[str, Any]:
-    """A mesh that emits its vertex colours, white where there are none, on a black material.
+    """The dict of a mesh that emits its vertex colours on a black material.
 
-    By way of a PLY file at the path, the only road by which a mesh gets both colours and an emitter.
+    Writes a PLY file, which Mitsuba reads with the scene: only so a mesh gets both colours and an emitter.
+
+    Args:
+        vertices: (V, 3).
+        faces: (T, 3).
+        path: of the PLY file.
+        colors: (V, 3); None for white.
     """
     mi = mitsuba()
     mesh = mi.Mesh("mesh", len(vertices), len(faces))
@@ -124,7 +130,7 @@ class MitsubaScene:
         self.moved: dict[str, Any] = {}
 
     def moving(self, mode: str) -> dict[str, tuple[Any, Any]]:
-        """Name of a parameter that a mode changes → its value at rest, and its velocity."""
+        """Name of a parameter that a mode changes → its value at rest and its velocity, as flat `mitsuba.Float`."""
         found = {}
         for index, velocity in enumerate(self.given.velocity(mode)):
             for entry, change in (("vertex_positions", velocity.vertices), ("vertex_color", velocity.colors)):
@@ -135,11 +141,11 @@ class MitsubaScene:
         return found
 
     def render(self, values: Mapping[str, Any], rest: Mapping[str, Any], spp: int, seed: int) -> Any:
-        """The image (H, W, 3).
+        """The image (H, W, 3), a tensor of Mitsuba.
 
         Args:
-            values: of the parameters that differ from the scene at rest.
-            rest: what they are at rest.
+            values: name of each parameter that is not at rest → its value.
+            rest: the same names → values at rest, which the next call restores.
             spp: samples a pixel.
             seed: of the samples.
         """
@@ -151,7 +157,7 @@ class MitsubaScene:
 
 
 class Mitsuba(Peer):
-    """A scene with a number of samples.
+    """Mitsuba with a scene and a number of samples.
 
     Args:
         scene: the scene.
@@ -164,7 +170,7 @@ class Mitsuba(Peer):
         self.scene, self.spp, self.settings = scene, spp, {"spp": spp}
 
     def derivative(self, mode: str, seed: int = 0) -> np.ndarray:
-        """See `Peer`; by forward mode."""
+        """See `Peer`; by forward mode. Zero if the mode changes nothing."""
         dr = import_module("drjit")
         moving = self.scene.moving(mode)
         if not moving:
@@ -177,7 +183,7 @@ class Mitsuba(Peer):
         return np.array(dr.grad(image), np.float64)
 
     def slopes(self, modes: Sequence[str], weigh: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """dL/dt (modes,) along several modes, by one pass in reverse mode.
+        """dL/dt (modes,) float64 along several modes, by one pass in reverse mode; always of the same samples.
 
         Args:
             modes: keys of the scene's `directions`.

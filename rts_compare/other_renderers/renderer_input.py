@@ -21,7 +21,7 @@ from rts.plugin_api.arrays import map_leaves
 from rts_compare.moving_scenes import Scene
 
 EDGE = 4.0
-"""The longest edge of triangles that a surface is cut into, pixels."""
+"""Surfaces are cut more finely until the edges of their triangles are shorter than this, pixels."""
 CUTS = (1, 2, 4, 8, 16, 32, 64)
 """Cuts along each side of a patch, to choose from."""
 TRIAL = 1e-3
@@ -39,7 +39,7 @@ class Colored(NamedTuple):
 
     Attributes:
         faces: (T, 3) integers, counter-clockwise as seen from the front.
-        vertices: (V, 3) float64: x right, y up; the camera looks along −z.
+        vertices: (V, 3) float64, in the camera's space: x right, y up; the camera looks along −z.
         colors: (V, 3) float64.
     """
 
@@ -82,7 +82,7 @@ class RendererInput:
         """Velocities of all parts, in one mode.
 
         Raises:
-            InputError: the mode moves no triangles in a way that has a velocity.
+            InputError: the mode has no velocities; the message is the reason.
         """
         velocity = self.velocities[mode]
         if isinstance(velocity, str):
@@ -95,7 +95,10 @@ class RendererInput:
         return float(np.degrees(2 * np.arctan(self.size[0] / (2 * self.focal))))
 
     def fastest(self, mode: str) -> float:
-        """The speed of the fastest vertex in a mode: pixels per unit of t, colours in units of `COLOR_STEP`."""
+        """The largest speed in a mode, per unit of t: of vertices in pixels, or of colours in units of `COLOR_STEP`.
+
+        Vertices nearer than the near plane do not count.
+        """
         return _fastest(self.parts, self.velocity(mode), self.focal, self.planes[0])
 
 
@@ -127,17 +130,19 @@ class Peer(abc.ABC):
 
         Args:
             mode: a key of the scene's `directions`.
-            weights: (H, W, 3); None for the first of `scores.loss_weights`.
+            weights: (H, W, 3); None for the first of `derivative_scores.loss_weights`.
         """
 
 
 def renderer_input(scene: Scene, engine: Engine | None = None) -> RendererInput:
-    """A scene at rest, and its velocities in every mode.
+    """A scene at rest, and its velocities in every mode, or the reason why a mode has none.
 
-    Velocities are central differences over a pixel: exact up to rounding where vertices move along straight lines.
+    Velocities are central differences over a pixel to each side: exact up to rounding where vertices and colours are
+    linear in t.
 
     Raises:
-        Unsuited: other renderers cannot render it.
+        Unsuited: the camera is orthographic, a part is no mesh and cannot be made one, its look is other than `unlit`
+            or `silhouette` with opaque colours of vertices, or no mode has velocities.
     """
     first = next(iter(scene.directions))
     parts, camera = _on_host(scene, first, 0.0, engine)
@@ -173,7 +178,7 @@ def _on_host(scene: Scene, mode: str, t: float, engine: Engine | None) -> tuple[
 
 
 def _snapshot(scene: Scene, engine: Engine | None, focal: float, cuts: list[int], mode: str, t: float) -> list[Colored]:
-    """The parts at t, with their own winding."""
+    """The parts at t as triangles, wound as in the scene; `cuts` as of `_cuts`, one a part."""
     parts, camera = _on_host(scene, mode, t, engine)
     to_camera = _to_camera(camera, focal, scene.size)
     colored = []
@@ -202,7 +207,7 @@ def _is_mesh(part: Part) -> bool:
 
 
 def _mesh(part: Part, rate: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 of a part in its local space, and faces (T, 3)."""
+    """Vertices (V, 3) float64 of a part in its local space, and faces (T, 3); patches are cut `rate` times a side."""
     if _is_mesh(part):
         return np.asarray(part.theta["vertices"], np.float64), part.surface.faces
     vertices, faces = part.surface.tessellate(part.theta, rate)
@@ -210,7 +215,7 @@ def _mesh(part: Part, rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cuts(index: int, part: Part, to_camera: np.ndarray, focal: float) -> int:
-    """The cuts along each side of a patch that make edges short on screen."""
+    """The first of `CUTS` that makes all edges shorter than `EDGE` on screen, or adds no faces; else the last."""
     if not hasattr(part.surface, "tessellate"):
         raise Unsuited(f"part {index} is no mesh, and cannot be made one")
     before = 0
@@ -259,7 +264,7 @@ def _of_vertices(index: int, part: Part, rate: int) -> np.ndarray:
 
 
 def _rgb(index: int, part: Part, colors: np.ndarray) -> np.ndarray:
-    """RGB colours (V, 3) of colours (V, C) for the shader `unlit`."""
+    """RGB colours (V, 3) of colours (V, C) for the shader `unlit`; alpha is refused unless the shader is opaque."""
     if colors.shape[1] == 4 and not part.shader.opaque:
         raise Unsuited(f"part {index} is translucent")
     return colors[:, :3] if colors.shape[1] >= 3 else np.repeat(colors[:, :1], 3, axis=1)
@@ -276,7 +281,10 @@ def _joints(part: Colored) -> tuple[np.ndarray, np.ndarray]:
 def _joined(
     at: Callable[[str, float], list[Colored]], joints: list[tuple[np.ndarray, np.ndarray]], mode: str, t: float
 ) -> list[Colored]:
-    """The parts at t with vertices joined by place and colour: otherwise edges of patches would count as outlines."""
+    """The parts at t, vertices joined that share place and colour at rest: edges of patches are then no outlines.
+
+    Parts that have another number of vertices than at rest are left as they are.
+    """
     return [
         Colored(became[part.faces], part.vertices[first], part.colors[first])
         if len(part.vertices) == len(became)
@@ -286,9 +294,9 @@ def _joined(
 
 
 def _check_joined(index: int, part: Colored) -> None:
-    """Refuse a part that faces both ways, and whose triangles meet without shared vertices.
+    """Refuse a part that shows fronts and backs, and has triangles that meet without shared vertices.
 
-    An edge between its front and back faces would count as two outlines.
+    An edge between a front and a back would count as two outlines.
     """
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -301,7 +309,10 @@ def _check_joined(index: int, part: Colored) -> None:
 
 
 def _turned(part: Colored) -> Colored:
-    """A part that is drawn from both sides, with back faces rewound for renderers that draw only fronts."""
+    """A part that is drawn from both sides, for renderers that draw fronts alone: all faces rewound if inside out.
+
+    A closed part is inside out if its volume is negative; an open one, if none of its triangles faces the camera.
+    """
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c))  # Negative for a triangle that faces the camera.
     edges = np.concatenate([part.faces[:, [0, 1]], part.faces[:, [1, 2]], part.faces[:, [2, 0]]])
@@ -339,7 +350,7 @@ def _slope(ahead: np.ndarray, behind: np.ndarray, step: float) -> np.ndarray | N
 
 
 def _fastest(parts: Sequence[Colored], velocities: Sequence[Velocity], focal: float, near: float) -> float:
-    """See `RendererInput.fastest`; vertices before the near plane do not count."""
+    """See `RendererInput.fastest`."""
     speed = 0.0
     for part, velocity in zip(parts, velocities, strict=True):
         if velocity.colors is not None:

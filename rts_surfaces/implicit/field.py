@@ -140,7 +140,10 @@ class Field(ScalarField):
         return gradient(partial(self.level, theta), points)
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The points in the widest floating dtype among the entries that `f` reads, float32 at least."""
+        """The points in the widest floating dtype among the entries that `f` reads, float32 at least.
+
+        Unchanged if `f` reads no floating entry.
+        """
         xp, bits = namespace(points), 0
         for x in leaves({name: theta[name] for name in self.names(theta)}):
             if hasattr(x, "dtype") and namespace(x).isdtype(x.dtype, "real floating"):
@@ -212,7 +215,11 @@ class Implicit(Surface):
 
 
 def check_isovalue(isovalue: Any) -> float:
-    """The isovalue as a float; refused if it exceeds `LARGEST`, or is an array whose derivative would be lost."""
+    """The isovalue as a float.
+
+    Raises:
+        InputError: it is no number, beyond ±`LARGEST`, or a torch or jax array, whose derivative would be lost.
+    """
     value = known_number("isovalue", check_numbers("isovalue", isovalue, ()))
     if exemplar(isovalue) is not None:
         raise InputError(
@@ -225,7 +232,7 @@ def check_isovalue(isovalue: Any) -> float:
 
 
 def known_number(name: str, value: np.ndarray | None) -> float:
-    """The float of a checked number, as `check_numbers` returns it; refused if it is traced, which None says."""
+    """The float of a number that `check_numbers` has returned; an InputError for None, which is a traced number."""
     if value is None:
         raise InputError(f"{name} is traced; expected a known number: surfaces do not change with theta")
     return float(value)
@@ -249,7 +256,7 @@ def check_function(name: str, f: Any) -> None:
 
 
 def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:
-    """Refuse a function's result for points (M, 3) that is not (M,), or (M, C), in their engine and dtype."""
+    """Refuse a result for points (M, 3) that is not (M,), or (M, C) with `columns`, in the points' engine and dtype."""
     engine, count = engine_of(points), points.shape[0]
     expected = f"({count}, C)" if columns else f"({count},)"
     try:

@@ -22,13 +22,13 @@ BLOCK = 2048
 
 
 def sphere(theta: Mapping[str, Tree], points: Array) -> Array:
-    """The distance (M,) of points (M, 3) to a sphere: θ["center"] (3,), θ["radius"] ()."""
+    """The signed distance (M,) of points (M, 3) to a sphere: θ["center"] (3,), θ["radius"] ()."""
     center, radius = _entry(theta, "center", (3,)), _entry(theta, "radius", ())
     return _length(points - center) - radius
 
 
 def swept_sphere(theta: Mapping[str, Tree], points: Array) -> Array:
-    """The distance (M,) of points (M, 3) to a torus: a sphere that is swept along a circle about the origin (§4.5).
+    """The signed distance (M,) of points (M, 3) to a torus: a sphere swept along a circle about the origin (§4.5).
 
     θ["radii"] (2,) are the radius of the circle, which lies in the plane y = 0, and that of the sphere.
     """
@@ -38,7 +38,7 @@ def swept_sphere(theta: Mapping[str, Tree], points: Array) -> Array:
 
 
 def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
-    """The least distance (M,) of points (M, 3) to n spheres, whose centers lie in the plane y = 0.
+    """The least signed distance (M,) of points (M, 3) to n spheres, whose centres lie in the plane y = 0.
 
     θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. The search
     for it has no derivatives, and goes by blocks of `BLOCK` points, or sphere by sphere: memory is of the order of M.
@@ -69,7 +69,7 @@ def union(*fields: Function) -> Function:
 def smooth_union(sharpness: float, *fields: Function) -> Function:
     """The `union` of n fields with a fillet where they meet: −log(Σ exp(−s fᵢ)) / s for a sharpness s.
 
-    It is at most log(n) / s less than the union, and its slope nowhere exceeds that of the steepest field.
+    It is less than the union by at most log(n) / s, and its slope nowhere exceeds that of the steepest field.
 
     Args:
         sharpness: s, in units of one over those of the fields; positive.

@@ -44,7 +44,7 @@ def _cells(
 
 
 def _corners(shape: Sequence[int], lowest: Sequence[Array], shares: Sequence[Array]) -> tuple[Array, Array]:
-    """Numbers and weights (M, 8) of the corners of cells, for interpolation that is linear along each axis."""
+    """Numbers (M, 8) in the lattice of the corners of cells, and their weights (M, 8), products of linear ones."""
     xp = namespace(lowest[0])
     first = (lowest[0] * shape[1] + lowest[1]) * shape[2] + lowest[2]
     ids, weights = [], []

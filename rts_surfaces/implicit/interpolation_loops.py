@@ -11,7 +11,7 @@ Numbers = tuple[float, ...]
 
 
 def forward(values: np.ndarray, points: np.ndarray, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
-    """Fill the differences (N, 3) at points (N, 3)."""
+    """Fill `out` (N, 3) with the differences of values (X, Y, Z) at points (N, 3); NaN where these are not finite."""
     parallel(_value, len(points), values, points, low, step, out, work=150 * len(points))
 
 
@@ -25,7 +25,10 @@ def push(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    """Fill the differences' derivatives (N, 3) along tangents of values (X, Y, Z) and points; None for zeros."""
+    """Fill `out` (N, 3) with derivatives of the differences along `t_values` (X, Y, Z) and `t_points` (N, 3).
+
+    A tangent that is None counts as zeros.
+    """
     out[...] = 0
     if t_values is not None:
         forward(t_values, points, out, low=low, step=step)
@@ -43,7 +46,10 @@ def pull(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    """Pull back the gradient `g` (N, 3): add to that of the values, and fill that of the points, where wanted."""
+    """Pull back g (N, 3), the gradient of the differences: add to `g_values` (X, Y, Z), and fill `g_points` (N, 3).
+
+    One that is None is not wanted.
+    """
     if g_values is not None:
         _pull_values(points, g, low, step, g_values)
     if g_points is not None:
@@ -52,9 +58,10 @@ def pull(
 
 @compiled(inline="always")
 def _place(point, shape, low, step, lowest, near, slopes):
-    """Fill the lowest corner of a point's cell, the weights (3, 2) of both ends along each axis, and their slopes (3,).
+    """Fill `lowest` (3,), `near` (3, 2) and `slopes` (3,) for the cell of a point.
 
-    Returns False if the point is NaN.
+    They are its lowest corner, the weights of both ends along each axis, and the derivatives of the upper end's weight.
+    Returns False if the point is not finite: the arrays are then unfinished.
     """
     for axis in range(3):
         at = (point[axis] - low[axis]) / step[axis]
@@ -83,7 +90,7 @@ def _difference(values, at, axis, step):
 
 @loop
 def _value(start, stop, values, points, low, step, out):
-    """Fill the differences (N, 3) at points `start` to `stop`."""
+    """Fill `out` (N, 3) with the differences at points from `start` to before `stop`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     for n in range(start, stop):
         out[n] = 0
@@ -102,7 +109,7 @@ def _value(start, stop, values, points, low, step, out):
 
 @compiled(inline="always")
 def _share_slopes(i, near, slopes, out):
-    """Fill the derivatives (3,) of the share of corner i in the coordinates of the point."""
+    """Fill `out` (3,) with the derivatives of corner i's weight by the point's coordinates; see `_place`."""
     for along in range(3):
         slope = slopes[along] if i >> along & 1 else -slopes[along]
         for axis in range(3):
@@ -113,7 +120,7 @@ def _share_slopes(i, near, slopes, out):
 
 @loop
 def _push_points(start, stop, values, points, tangents, low, step, out):
-    """Add the derivatives along tangents (N, 3) of the points."""
+    """Add to `out` (N, 3) the derivatives of the differences along tangents (N, 3) of points; NaN as in `forward`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
     for n in range(start, stop):
@@ -131,7 +138,7 @@ def _push_points(start, stop, values, points, tangents, low, step, out):
 
 @loop
 def _pull_points(start, stop, values, points, g, low, step, results):
-    """Fill the gradients (N, 3) of the points, from the gradients of the differences."""
+    """Fill `results` (N, 3) with the gradients of the points, from g (N, 3), those of the differences."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
     for n in range(start, stop):
@@ -151,7 +158,7 @@ def _pull_points(start, stop, values, points, g, low, step, results):
 
 @loop
 def _pull_values(points, g, low, step, results):
-    """Add the gradients (X, Y, Z) of the values, from the gradients of the differences."""
+    """Add to `results` (X, Y, Z), the gradient of the values, from g (N, 3), that of the differences."""
     shape = results.shape
     lowest, near, slopes = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3)
     at, up, down = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)

@@ -27,7 +27,7 @@ class Lattice:
         step: (3,) float64, the distance of neighbours along each axis.
 
     Raises:
-        InputError: there is no such lattice.
+        InputError: bounds without extent along an axis, or a wrong shape.
     """
 
     def __init__(self, bounds: Any, shape: Any):
@@ -37,13 +37,13 @@ class Lattice:
 
     @classmethod
     def of(cls, shape: tuple[int, ...], low: tuple[float, ...], step: tuple[float, ...]) -> Lattice:
-        """The lattice with these attributes, which `fixed` returns."""
+        """The lattice with these attributes, in the form that `fixed` returns; unchecked."""
         self = cls.__new__(cls)
         self.shape, self.low, self.step = shape, np.array(low), np.array(step)
         return self
 
     def of_shape(self, shape: tuple[int, ...]) -> Lattice:
-        """A lattice of another shape between its first and its last point."""
+        """A lattice of another shape with the same first and last point."""
         extent = self.step * (np.array(self.shape) - 1)
         return Lattice((self.low, self.low + extent), shape)
 
@@ -72,7 +72,7 @@ class Lattice:
 
 
 def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and the upper corner (3,) of a box, in float64; refused where they are none."""
+    """The lower and the upper corner (3,) float64 of a box; an InputError unless all of the first is lower."""
     known = check_numbers("bounds", bounds, (2, 3))
     if known is None:
         raise InputError("bounds are traced; expected known numbers ((x0, y0, z0), (x1, y1, z1))")
@@ -83,7 +83,7 @@ def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_shape(shape: Any) -> tuple[int, int, int]:
-    """(X, Y, Z) as integers, refused where there is no such lattice."""
+    """(X, Y, Z) as Python's integers; an InputError unless each is at least 2, and their product ≤ `MOST_POINTS`."""
     try:
         counts = () if isinstance(shape, (str, bytes)) else tuple(shape)
     except TypeError:

@@ -43,7 +43,7 @@ class LatticeField(ScalarField):
         return ("values",)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ without values of three axes, of at least two points each."""
+        """Refuse θ without floating values of the lattice's shape; or, if it has none, of three axes of two points."""
 
         def expected(shape: tuple[int, ...]) -> str | None:
             if len(shape) != 3:
@@ -66,7 +66,7 @@ class LatticeField(ScalarField):
                 yield Resampled(shape, field, partial(_every, stride))
 
     def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """θ["values"], since nothing needs to be evaluated."""
+        """θ["values"] as they are, with 0 evaluations, whether the surface is closed or not."""
         return Looked({"values": theta["values"]}, 0)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
@@ -84,7 +84,7 @@ class LatticeField(ScalarField):
         return points, tables
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """All values (M,), and for each sample the indices (N, 6) of its six values among them."""
+        """All values (M,), float32 at least, and the indices (N, 6) among them of the six values of each sample."""
         values = self.suited(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 
@@ -112,5 +112,5 @@ class LatticeField(ScalarField):
 
 
 def _every(stride: int, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-    """θ with every value of number `stride` along each axis."""
+    """θ with the first value along each axis, and every `stride`-th one after it."""
     return {**theta, "values": theta["values"][::stride, ::stride, ::stride]}

@@ -46,9 +46,9 @@ class Triangles(NamedTuple):
 
 @functools.cache
 def cases() -> tuple[np.ndarray, np.ndarray]:
-    """The number of triangles (256,) uint8 of a cell, and the edges (256, 5, 3) int8 that their corners lie on.
+    """For each case, the number of triangles (256,) uint8, and the edges (256, 5, 3) int8 that their corners lie on.
 
-    Bit i of the number of a case says whether corner i is inside.
+    Bit i of the number of a case says whether corner i is inside. Places without a triangle hold −1.
 
     Raises:
         PluginError: PyMCubes is not installed.
@@ -81,6 +81,9 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
         isovalue: points are inside where `sign * (value - isovalue)` is below zero.
         sign: 1 or −1.
         closed: True to cap the inside at the bounds.
+
+    Raises:
+        PluginError: see `cases`.
     """
     from rts_surfaces.implicit import marching_cubes_loops as loops
 
@@ -120,7 +123,10 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
 
 
 def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
-    """The isosurface in the cells of a band, of a level that is negative inside; see `of_lattice`."""
+    """The isosurface in the cells of a band, whose values are negative inside; see `of_lattice`.
+
+    `Triangles.ends` and `cells` are rows of the band.
+    """
     from rts_surfaces.implicit import marching_cubes_loops as loops
     from rts_surfaces.implicit.distinct_loops import distinct
 

@@ -14,7 +14,11 @@ from rts.plugin_api.loops import compiled, loop
 
 @compiled(inline="always")
 def _signs(values, isovalue, sign, closed, x, out):
-    """Fill `out` with 1 for each point of plane x that is inside, else 0, and with the border of cells around it."""
+    """Fill `out` with 1 for each point of plane x that is inside, else 0.
+
+    With the border of cells: if closed, a frame of zeros around the points, and planes beyond the lattice are zero; if
+    not, one row and one column more, which repeat the last ones, as does a plane after the last.
+    """
     shape_x, shape_y, shape_z = values.shape
     outside = x < 0 or x >= shape_x
     if closed and outside:
@@ -48,7 +52,10 @@ def _codes(low, high, y, count, out):
 
 @compiled
 def _mixed(codes, count, found):
-    """Fill `found` with the cells of a row whose corners differ in sign; returns their number. Eight a test."""
+    """Fill `found` with the places of cells in a row whose corners differ in sign. Returns the number of such cells.
+
+    `codes` holds the cases of `count` cells, and zeros up to a multiple of eight: eight are tested at once.
+    """
     words, full, many = codes.view(np.uint64), np.uint64(0xFFFFFFFFFFFFFFFF), 0
     for w in range(len(words)):
         if words[w] == 0 or words[w] == full:
@@ -61,20 +68,33 @@ def _mixed(codes, count, found):
 
 @compiled
 def _crossed(code):
-    """Bits of the axes along which the edge that a cell owns is crossed, from the cell's case `code`."""
+    """A bit for each axis along which the edge that a cell owns is crossed, from the cell's case `code`."""
     own = code & 1
     return (own != code >> 1 & 1) | np.int64(own != code >> 2 & 1) << 1 | np.int64(own != code >> 4 & 1) << 2
 
 
 @compiled(inline="always")
 def _is_real(x, y, z, shape, closed):
-    """True if a cell, counted with the border, has triangles."""
+    """True if a cell, counted with the border, may have triangles; those of an open surface's border have none."""
     return closed or (x < shape[0] - 1 and y < shape[1] - 1 and z < shape[2] - 1)
 
 
 @loop
 def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
-    """Count mixed cells, vertices and triangles of layers `start` to `stop` into `tally` (layers, 3)."""
+    """Fill `tally` (layers, 3) with the numbers of mixed cells, vertices and triangles of each layer.
+
+    A mixed cell is one whose corners differ in sign.
+
+    Args:
+        start: the first layer.
+        stop: the layer after the last.
+        values: (X, Y, Z).
+        isovalue: see `of_lattice`.
+        sign: see `of_lattice`.
+        closed: see `of_lattice`.
+        triangles_of: (256,), the number of triangles of each case.
+        tally: (layers, 3) to be filled.
+    """
     shape = values.shape
     border = 2 if closed else 1
     planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
@@ -146,7 +166,10 @@ def vertices(
 
 @compiled
 def _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart):
-    """Fill in the vertices on the edges that a cell owns, from number `vertex` on. Returns the next free number."""
+    """Fill `ends`, `places` and `apart` of the vertices on the edges that a cell owns, from number `vertex` on.
+
+    Returns the next free number.
+    """
     shape = values.shape
     ax, ay, az = max(own[0], 0), max(own[1], 0), max(own[2], 0)
     for axis in range(3):
@@ -174,7 +197,10 @@ def _bit_count(x):
 def faces(
     start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
 ):
-    """Fill the triangles `out` (T, 3) of layers, and the cell and the caps of each; see `Triangles`."""
+    """Fill `out` (T, 3), `owners` (T,) and `caps` (T,): `Triangles.faces`, `cells` and `caps` of layers.
+
+    Other arguments are those of `vertices`, which fills them, and of `edges_of_cells`.
+    """
     cells_z = first_of.shape[2]
     shift = 1 if closed else 0
     for x in range(start, stop):
@@ -209,10 +235,10 @@ def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys,
         corners: (C, 8) int32, rows of points.
         virtual: (C,) uint8, a bit for each corner that lies beyond the lattice, next to the point in `corners`.
         codes: (C,) uint8, the case of each cell.
-        triangles_of: (256,).
-        edges_of: (256, 5, 3).
-        edges: (12, 2).
-        keys: (3 T,) to be filled: a number for each edge, the same in all cells that share the edge.
+        triangles_of: (256,), the number of triangles of each case.
+        edges_of: (256, 5, 3), the edge on which each corner of each of these triangles lies.
+        edges: (12, 2), see `EDGES` of `marching_cubes`.
+        keys: (3 T,) to be filled, T triangles: a number for each edge, the same in all cells that share the edge.
         pairs: (3 T, 2) to be filled: the rows of the edge's ends; twice the same row if one end is virtual.
     """
     n = 0

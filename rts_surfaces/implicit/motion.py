@@ -15,7 +15,7 @@ from rts.plugin_api.operations import Operation, combine, take
 from rts_surfaces.implicit.lattice import Lattice
 
 Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
-"""Shape, first point and step of a lattice."""
+"""Shape (X, Y, Z), first point and step of the lattice whose edges samples move along, as `Lattice.fixed`."""
 
 _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
 """Columns of a sample's parameters: the weights of the six values, its position, and its motion for a unit of level."""
@@ -84,7 +84,10 @@ def _by_crossings(
 
 
 def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """The place (N,) along an edge, 0 to 1, where the level is zero; derivatives are as if ends differed by `least`."""
+    """The place (N,) along an edge, 0 to 1, where the level is zero; 0 if both ends are equal.
+
+    Derivatives are as if the ends differed by `least` where they differ by less.
+    """
     engine = engine_of(f_a)
     xp, apart = engine.namespace, f_b - f_a
     same = apart == 0

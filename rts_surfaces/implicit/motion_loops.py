@@ -1,4 +1,8 @@
-"""Motion of samples with the field, and its derivatives, compiled. See `rts_surfaces.implicit.motion`."""
+"""Motion of samples with the field, and its derivatives, compiled.
+
+Arguments are as in `rts_surfaces.implicit.motion`: values (M,), params (N, P), rows (N, 6), numbers (N, 6). A lattice
+is its shape, first point and step.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from rts.plugin_api.threads import parallel
 def along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, out: np.ndarray, *, isovalue: float, sign: float
 ) -> None:
-    """Fill positions (N, 3) of samples that move along the gradient."""
+    """Fill `out` (N, 3) with the positions of samples that move along the gradient."""
     real = values.dtype.type
     parallel(_move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
 
@@ -19,7 +23,7 @@ def along(
 def push_along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, moved: np.ndarray, out: np.ndarray, **given: float
 ) -> None:
-    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
+    """Fill `out` (N, 3) with the derivatives of the positions of `along`; `moved` (M,) are tangents of the values."""
     sign = values.dtype.type(given["sign"])
     parallel(_push, len(rows), moved, params, rows, sign, out, work=30 * len(rows))
 
@@ -27,33 +31,42 @@ def push_along(
 def pull_along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, g: np.ndarray, result: np.ndarray, **given: float
 ) -> None:
-    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
+    """Add to `result` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `along`."""
     _pull(g, params, rows, values.dtype.type(given["sign"]), result)
 
 
 def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
-    """Fill positions (N, 3) of samples whose corners slide along edges."""
+    """Fill the last of `rest`, out (N, 3), with positions of samples in triangles whose corners slide along edges.
+
+    Before it are params, rows and numbers.
+    """
     *given, out = rest
     count, level = len(out), values.dtype.type(isovalue)
     parallel(_cross, count, values, *given, level, *lattice, out, work=60 * count)
 
 
 def push_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
-    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
+    """Fill the last of `rest`, out (N, 3), with the derivatives of the positions of `crossing`.
+
+    Before it are params, rows, numbers, and the tangents (M,) of the values.
+    """
     *given, moved, out = rest
     count, level = len(out), values.dtype.type(isovalue)
     parallel(_push_crossings, count, values, moved, *given, level, *lattice, out, work=60 * count)
 
 
 def pull_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
-    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
+    """Add to the last of `rest`, result (M,), the gradient of the values.
+
+    Before it are params, rows, numbers, and the gradient (N, 3) of the positions of `crossing`.
+    """
     *given, g, result = rest
     _pull_crossings(values, g, *given, values.dtype.type(isovalue), *lattice, result)
 
 
 @loop
 def _move(start, stop, values, params, rows, isovalue, sign, out):
-    """Fill the positions (N, 3) of samples `start` to `stop`."""
+    """Fill `out` (N, 3) with the positions of samples from `start` to before `stop`; see `along`."""
     for n in range(start, stop):
         level = -params[n, 15]
         for i in range(6):
@@ -64,7 +77,7 @@ def _move(start, stop, values, params, rows, isovalue, sign, out):
 
 @loop
 def _push(start, stop, tangents, params, rows, sign, out):
-    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
+    """Fill `out` (N, 3) with the derivatives of the positions of `_move` along tangents (M,) of the values."""
     for n in range(start, stop):
         level = tangents.dtype.type(0)
         for i in range(6):
@@ -75,7 +88,7 @@ def _push(start, stop, tangents, params, rows, sign, out):
 
 @loop
 def _pull(g, params, rows, sign, results):
-    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
+    """Add to `results` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `_move`."""
     for n in range(len(rows)):
         along = g[n, 0] * params[n, 12] + g[n, 1] * params[n, 13] + g[n, 2] * params[n, 14]
         if along != 0:
@@ -85,9 +98,11 @@ def _pull(g, params, rows, sign, results):
 
 @compiled(inline="always")
 def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
-    """The axis and length of edge k of sample n, and the place along the edge where the isovalue is crossed.
+    """Edge k, 0 to 2, of sample n.
 
-    Then the number that the derivative divides by; zero for an edge whose ends are one point.
+    Returns:
+        Its axis; its length, negative if it runs against the axis; the place along it, 0 to 1, where the isovalue is
+        crossed; and the number that derivatives divide by. All are zero for an edge whose ends are one point.
     """
     a, b = np.int64(numbers[n, 2 * k]), np.int64(numbers[n, 2 * k + 1])
     if a == b:
@@ -106,7 +121,7 @@ def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
 
 @loop
 def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
-    """Fill the positions (N, 3) of samples `start` to `stop` whose corners slide along edges."""
+    """Fill `out` (N, 3) with the positions of samples from `start` to before `stop`; see `crossing`."""
     for n in range(start, stop):
         x = y = z = 0.0
         for k in range(3):
@@ -120,7 +135,7 @@ def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, ste
 
 @loop
 def _push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
-    """Fill the derivatives (N, 3) of the positions along tangents (M,) of the values."""
+    """Fill `out` (N, 3) with the derivatives of the positions of `_cross` along tangents (M,) of the values."""
     for n in range(start, stop):
         out[n] = 0
         for k in range(3):
@@ -132,7 +147,7 @@ def _push_crossings(start, stop, values, tangents, params, rows, numbers, isoval
 
 @loop
 def _pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
-    """Add to the gradient (M,) of the values, from the gradient (N, 3) of the positions."""
+    """Add to `results` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `_cross`."""
     for n in range(len(rows)):
         if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
             continue

@@ -21,7 +21,7 @@ BRICK = 1 << SHIFT
 
 
 RELATIVE = 1e-9
-"""By how much reaches are longer, for their own rounding."""
+"""The share by which reaches, the most that a level can change over a distance, are enlarged for their rounding."""
 
 
 # ------------------------------------------------------------------------------------------------- blocks
@@ -61,7 +61,7 @@ def halved(blocks, counts):
 
 @loop
 def centres(start, stop, blocks, side, shape, low, step, places):
-    """Fill places (B, 3) float64, the centres of blocks."""
+    """Fill `places` (B, 3) float64 with the centres of blocks (B, 3), from `start` to before `stop`."""
     for b in range(start, stop):
         for a in range(3):
             first = blocks[b, a] * side
@@ -88,16 +88,16 @@ def near(blocks, values, side, shape, step, lipschitz, slack, closed):
 
     Args:
         blocks: (B, 3) int32.
-        values: (B,) the levels; where they are NaN a block stays.
-        side: cells.
-        shape: the points of the lattice along each axis.
-        step: their distances.
-        lipschitz: how fast the level changes at most.
+        values: (B,) the levels at centres; where they are NaN a block stays.
+        side: cells along each side of a block.
+        shape: the number of points of the lattice along each axis.
+        step: the distances of neighbours along each axis.
+        lipschitz: how fast the level changes at most, per unit of length.
         slack: how far a level may be off by rounding.
-        closed: True if the surface is capped at the lattice's boundary.
+        closed: True if the surface is capped at the lattice's boundary: blocks inside and at the boundary then stay.
 
     Returns:
-        (B,) bool.
+        (B,) bool, True for a chosen block.
     """
     kept = np.empty(len(blocks), np.bool_)
     for b in range(len(blocks)):
@@ -136,7 +136,7 @@ def widened(blocks, margin, counts):
 
 @compiled
 def _grown(array, count):
-    """A longer copy of an array, whose first rows are the array's."""
+    """A longer copy of an array: its first `count` rows, and unset ones."""
     longer = np.empty((2 * count + 64, *array.shape[1:]), array.dtype)
     longer[:count] = array[:count]
     return longer
@@ -155,17 +155,17 @@ def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, coun
 
     Args:
         blocks: (B, 3) int32.
-        side: cells.
-        shape: the points of the lattice along each axis.
+        side: cells along each side of a block.
+        shape: the number of points of the lattice along each axis.
         counts: the number of blocks along each axis.
-        directory: (D,) int32, written to.
-        bricks: (·, 64) int32, written to.
-        used: the number of bricks.
-        numbers: (·,) int64, the numbers in the lattice of the corners that have rows, written to.
-        count: their number.
+        directory: (D,) int32, changed.
+        bricks: (·, 64) int32, changed, or replaced by a longer copy where it is full.
+        used: the number of bricks in use.
+        numbers: (·,) int64, the numbers in the lattice of the corners that have rows; changed or replaced, too.
+        count: the number of corners that have rows.
 
     Returns:
-        The rows (B, 8) int32; then `bricks`, `used`, `numbers` and `count`, as they are now.
+        The rows (B, 8) int32 of the blocks' corners; then `bricks`, `used`, `numbers` and `count` as they are now.
     """
     rows = np.empty((len(blocks), 8), np.int32)
     for b in range(len(blocks)):
@@ -193,7 +193,7 @@ def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, coun
 
 @loop
 def given_rows(known, side, shape, counts, directory, bricks, used, numbers, count):
-    """Give rows to lattice points `known` (M,), by number, all different and without rows; see `numbered`."""
+    """Give rows to corners, by numbers `known` (M,), all different and new. As `numbered`, but returns no `rows`."""
     for m in range(len(known)):
         number = known[m]
         xy = number // shape[2]
@@ -217,7 +217,7 @@ def given_rows(known, side, shape, counts, directory, bricks, used, numbers, cou
 
 @loop
 def places_of(start, stop, numbers, shape, low, step, places):
-    """Fill places (M, 3) float64 of points of the lattice by number."""
+    """Fill `places` (M, 3) float64 with the points of the lattice that have the numbers (M,)."""
     for m in range(start, stop):
         number = numbers[m]
         xy = number // shape[2]
@@ -333,7 +333,7 @@ def crossed(blocks, rows, values, counts, closed):
 
 @compiled
 def _mark(x, y, z, counts, directory, bricks, used):
-    """Mark a block; there is room for one brick more. Returns True if it was not marked, and the new `used`."""
+    """Mark a block; `bricks` must have room for one more. Returns True if it was not marked before, and `used`."""
     place, at = _brick(x, y, z, counts)
     brick = directory[place]
     if brick < 0:
@@ -347,7 +347,7 @@ def _mark(x, y, z, counts, directory, bricks, used):
 
 @loop
 def marked(blocks, counts, directory, bricks, used):
-    """Mark blocks (B, 3), by ones in bricks of bytes (·, 64). Returns the new `bricks` and `used`."""
+    """Mark blocks (B, 3) by ones in `bricks` (·, 64) uint8. Returns `bricks`, perhaps a longer copy, and `used`."""
     for b in range(len(blocks)):
         if used == len(bricks):
             bricks = _grown(bricks, used)
@@ -366,8 +366,8 @@ def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
         counts: the number of blocks along each axis.
         closed: True if the surface is capped at the lattice's boundary.
         directory: (D,) int32, of `marked`.
-        bricks: (·, 64) uint8, of `marked`.
-        used: the number of bricks.
+        bricks: (·, 64) uint8, of `marked`; changed, or replaced by a longer copy where it is full.
+        used: the number of bricks in use.
 
     Returns:
         Blocks (K, 3) int32; then `bricks` and `used`, as they are now.
@@ -395,10 +395,10 @@ def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
 
 @loop
 def compact(rows, numbers, values):
-    """Drop the points that no cell has, and renumber rows (C, 8) accordingly.
+    """Drop the points that no cell has, and renumber `rows` (C, 8) accordingly, in place.
 
     Returns:
-        Numbers (M,) int64 and values (M,), in order of first appearance in `rows`.
+        Numbers (M,) int64 and values (M,) of the points that are left, in order of first appearance in `rows`.
     """
     new = np.full(len(numbers), -1, np.int32)
     kept, levels, count = np.empty_like(numbers), np.empty_like(values), 0

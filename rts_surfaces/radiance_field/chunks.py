@@ -23,6 +23,7 @@ def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
 
     Returns:
         (N, ·). From value to gradient only results stay in memory, if the engine supports that (`Engine.checkpoint`).
+        For N ≤ `rows` this is a plain call of `f`.
     """
     count = arrays[0].shape[0]
     if count <= rows:

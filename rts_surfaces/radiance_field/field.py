@@ -107,7 +107,7 @@ def load_radiance_field(path: Any) -> RadianceField:
         `lattice(bounds, shape)`, its density at points; and `save(path)`.
 
     Raises:
-        InputError: there is no such file, it is no .npz, holds pickles, or something other than real finite numbers; a
+        InputError: there is no such file, it is no .npz, holds pickles, or other than finite floating-point numbers; a
             layer is missing, unknown, or its shape does not fit.
     """
     if not isinstance(path, (str, os.PathLike)):
@@ -149,7 +149,7 @@ def load_radiance_field(path: Any) -> RadianceField:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz by name, as float32; an error is raised if one is not of finite floating numbers."""
+    """The arrays of an .npz by name, as float32; an InputError if one is not of finite floating-point numbers."""
     arrays = {}
     try:
         # NumPy leaves files open that are damaged, if it opens them.

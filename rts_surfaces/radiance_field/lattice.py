@@ -41,7 +41,8 @@ def lattice(
         shape: (X, Y, Z), at least 2 each.
         network: "fine" or "coarse".
         keep: where to keep the densities, and to look for them: True for the user's cache, a folder, or False for
-            nowhere. Weights, bounds and shape make the file's name. A damaged file is computed anew.
+            nowhere. Weights, bounds and shape make the file's name. A damaged file is computed anew. If the folder
+            cannot be written to, nothing is kept.
         progress: True to show a progress bar; None to do so in a terminal.
 
     Returns:
@@ -97,7 +98,7 @@ def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
 
 
 def _keep(path: Path, values: np.ndarray) -> None:
-    """Write densities, in one step: readers find them whole or not at all. If writing fails, no file is left."""
+    """Write densities, in one step: readers find them whole or not at all. If writing fails, no error and no file."""
     draft = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

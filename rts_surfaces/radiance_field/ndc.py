@@ -16,7 +16,8 @@ from rts.plugin_api.arrays import Array, constants, exemplar, from_numbers, shap
 from rts.plugin_api.checks import check_positive, is_count, quoted
 
 NEAREST, FARTHEST = 1e-6, 1e6
-"""Depths, in multiples of the near plane's, at which points behind the camera and points at infinity are placed."""
+"""Depths, in multiples of the near plane's: nearer points, such as those behind the camera, are placed at the first;
+farther ones, such as those at infinity, at the second."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,9 @@ class Ndc:
     Attributes:
         scale: (x, y), focal length over half the width and half the height of the image.
         near: depth of the near plane, 1 in the frame of NeRF's forward-facing scenes (`rts.load_views(frame="nerf")`).
+
+    Raises:
+        InputError: a number is not positive.
     """
 
     scale: tuple[float, float]
@@ -40,7 +44,7 @@ class Ndc:
         """NDC of images of a size (height, width) in pixels, with a focal length in pixels.
 
         Raises:
-            InputError: an argument is not positive.
+            InputError: an argument is not positive, or the size is not two integers.
         """
         height, width = checked_size(size)
         check_positive("focal", focal)
@@ -48,7 +52,7 @@ class Ndc:
         return cls((2 * float(focal) / width, 2 * float(focal) / height), float(near))
 
     def from_world(self, points: Array) -> Array:
-        """NDC (N, 3) of world points (N, 3); points behind the camera count as just before it."""
+        """NDC (N, 3) of world points (N, 3); depths less than `NEAREST` near planes count as that."""
         points = _checked("points", points)
         xp = namespace(points)
         depth = _at_least(-points[:, 2], NEAREST * self.near)
@@ -56,7 +60,7 @@ class Ndc:
         return xp.stack([x, y, 1 - 2 * self.near / depth], axis=1)
 
     def to_world(self, points: Array) -> Array:
-        """World points (N, 3) of NDC (N, 3); those at infinity and beyond get the depth of a million near planes."""
+        """World points (N, 3) of NDC (N, 3); depths of more than `FARTHEST` near planes, and z ≥ 1, count as that."""
         points = _checked("points", points)
         xp = namespace(points)
         depth = 2 * self.near / _at_least(1 - points[:, 2], 2 / FARTHEST)
@@ -67,7 +71,7 @@ class Ndc:
         """Rays in NDC of world rays: t = 0 at the near plane, t = 1 at infinity.
 
         Args:
-            origins: (N, 3) world, before or behind the near plane.
+            origins: (N, 3) world, on either side of the near plane.
             directions: (N, 3) world, towards −z, of any length.
 
         Returns:
@@ -88,7 +92,11 @@ class Ndc:
 
 
 def checked_size(size: Any) -> tuple[int, int]:
-    """The size (height, width) of an image as integers; an error is raised if it is not two positive integers."""
+    """(height, width) as Python's integers, from a tuple, list or array of two positive integers.
+
+    Raises:
+        InputError: the size is anything else.
+    """
     sides = tuple(size) if isinstance(size, (tuple, list, np.ndarray)) else ()
     if len(sides) != 2 or not all(map(is_count, sides)):
         raise InputError(f"size is {quoted(size)}; expected (height, width), two positive integers")
@@ -96,7 +104,7 @@ def checked_size(size: Any) -> tuple[int, int]:
 
 
 def _checked(name: str, points: Any) -> Array:
-    """The array (N, 3) of points; an error is raised if it has another shape."""
+    """The array (N, 3) of points, from an array or nested lists of numbers; an InputError for another shape."""
     points = from_numbers(points, name)
     if len(shape_of(points)) != 2 or points.shape[1] != 3:
         raise InputError(f"{name} has shape {shape_of(points)}; expected (N, 3)")

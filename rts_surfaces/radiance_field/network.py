@@ -10,7 +10,8 @@ as in Mildenhall et al. 2020 (NeRF), in the smaller form of krrish94/nerf-pytorc
 "bias": (out,)}, and maps x to weight x + bias. The weights tell the number and widths of layers, and how many
 frequencies encode positions and directions.
 
-Weights that are NumPy arrays are constants beside points of any engine. Results have the dtype of the points.
+NumPy weights are constants beside points of torch or jax, in the dtype of the points; so are NumPy points beside
+weights of torch or jax.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Architecture(NamedTuple):
 
 
 def check_network(weights: Any, name: str = "the network") -> Architecture:
-    """The architecture of a network; an error is raised if layers are missing, or their shapes do not fit together.
+    """The architecture of a network, after a check of its layers and their shapes; numbers are not looked at.
 
     Args:
         weights: {"layer1": layer, "layers_xyz": [layer, …], "fc_alpha", "fc_feat", "layers_dir": [layer, …],

@@ -56,7 +56,7 @@ class Projected(TriangleSurface):
 
     @classmethod
     def example(cls) -> Part:
-        """A ball two units before the camera at the origin, as an isosurface in NDC."""
+        """A ball, as an isosurface in NDC: two units in front of the eye of NDC, and moved to the origin."""
         from rts_surfaces.implicit.isosurface import Isosurface
 
         ndc = Ndc((1.5, 1.5), near=1.0)
@@ -82,7 +82,10 @@ class Projected(TriangleSurface):
         return self.surface.proxy_inputs(theta)
 
     def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
-        """The surface's triangles in the world; the last three ids of each are depths of corners, as bits of floats."""
+        """The surface's triangles in the world, without those deeper than `DEEPEST`.
+
+        The last three ids of each are the depths of its corners, float32, their bits read as int32.
+        """
         inner = self.surface.proxy(inputs, camera, size)
         vertices = np.asarray(inner.vertices, np.float64)
         world = self.ndc.to_world(vertices)
@@ -95,7 +98,7 @@ class Projected(TriangleSurface):
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """One piece: an isosurface winds all its triangles by which side is inside."""
+        """(1,), one piece for all triangles: an isosurface winds them alike, by the side that is inside."""
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:

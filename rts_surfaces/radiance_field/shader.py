@@ -28,6 +28,9 @@ class RadianceShader(Shader):
         ndc: the map from the world to the network's space; None if the network's space is the world.
         chunk: number of samples evaluated at a time. In torch and jax only their colours are kept for the gradient,
             which computes the rest anew, so that memory stays bounded.
+
+    Raises:
+        InputError: an attribute is of another kind.
     """
 
     ndc: Ndc | None = None

@@ -50,9 +50,10 @@ def volume_render(
 ) -> VolumeImage:
     """The image of a radiance field by quadrature along rays, without noise and derivatives, as in NeRF's test mode.
 
-    The coarse network is evaluated at N_c equal steps of depth. Its samples' weights are a distribution along the ray,
-    by whose inverse N_f more samples are placed. The fine network is evaluated at all samples (Mildenhall et al. 2020,
-    §4 and 5). Surface light fields are compared with this image. Computed by torch if installed, else by NumPy.
+    The coarse network is evaluated at N_c equal steps of depth (of disparity with `ndc`). Its samples' weights are a
+    distribution along the ray, by whose inverse N_f more samples are placed. The fine network is evaluated at all
+    N_c + N_f samples (Mildenhall et al. 2020, §4 and 5). Surface light fields are compared with this image. Computed
+    by torch if installed, else by NumPy.
 
     Args:
         field: the result of `load_radiance_field`; its weights may be arrays of any engine.
@@ -62,7 +63,7 @@ def volume_render(
         near: depth at which rays begin; default 2, as in NeRF's Blender scenes; with `ndc`, always its near plane.
         far: depth at which rays end; default 6; with `ndc`, always infinity.
         samples: (N_c, N_f), at least 3 and 1.
-        background: the colour behind the field: "white", "black" or (3,); None for transparency.
+        background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.
         ndc: the map from the world to the field's space; None if the field's space is the world.
         progress: whether to show a progress bar; None to do so in a terminal.
 
@@ -132,7 +133,7 @@ def _planes(near: float | None, far: float | None, ndc: Ndc | None) -> tuple[flo
 
 
 def _color(background: Any) -> np.ndarray:
-    """(3,) float32 of "white", "black" or three numbers in [0, 1]."""
+    """The colour (3,) float32 of "white", "black" or three numbers in [0, 1]; an InputError for all else."""
     if isinstance(background, str) and background not in BACKGROUNDS:
         raise InputError(f"background is {quoted(background)}; expected 'white', 'black' or a colour (3,)")
     value = BACKGROUNDS[background] if isinstance(background, str) else background
@@ -143,7 +144,7 @@ def _color(background: Any) -> np.ndarray:
 
 
 def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
-    """A function (origins, directions, unit directions (R, 3) each, depths (R, S)) → colours and density (R, S, 4)."""
+    """A function of origins, directions, unit directions (R, 3) each, and t (R, S) → colours and density (R, S, 4)."""
     engine = fast_engine()
     weights = constants(field.on_host()[name], engine, None)
     xp = engine.namespace
@@ -162,7 +163,7 @@ def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
 
 
 def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied RGBA (R, 4) of rays, and the weight (R, S) of each sample in it, from radiance (R, S, 4)."""
+    """Premultiplied RGBA (R, 4) of rays, and each sample's weight (R, S) in it, from colours and density (R, S, 4)."""
     lengths = np.concatenate([np.diff(t, axis=1), np.full_like(t[:, :1], LAST)], axis=1)
     lengths = lengths * np.linalg.norm(directions, axis=1, keepdims=True)
     passed = np.exp(-radiance[..., 3] * lengths)
@@ -173,7 +174,10 @@ def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> 
 
 
 def _placed(t: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
-    """Depths (R, count) at equal steps of the cumulative distribution of the weights (R, S) of samples at t (R, S)."""
+    """Places t (R, count) at equal steps of the cumulative distribution of the weights (R, S) of samples at t (R, S).
+
+    The first and the last weight do not count.
+    """
     edges = (t[:, 1:] + t[:, :-1]) / 2
     share = weights[:, 1:-1] + np.float32(1e-5)
     total = np.cumsum(share / share.sum(axis=1, keepdims=True), axis=1)

@@ -81,7 +81,7 @@ class Limit:
         table: (F, W) int32, the vertices on which each face depends, padded with one of them; read-only.
         uv_table: (F, W') int32, the rows of face-varying data on which each face depends; None without such data.
         kinds: (F,) int32, `NONE`, `QUAD`, `TRIANGLE` or `SUBFACES`.
-        used: int32, the vertices that faces refer to, in order; read-only.
+        used: (U,) int32, the vertices that faces refer to, in increasing order; read-only.
         corners: (H, 2) float64, parameters at the corners of each face; for sub-faces their least parameters.
 
     Raises:
@@ -222,7 +222,10 @@ class Points:
 
     Args:
         limit: the limit surface.
-        vertices: (V, 3) float.
+        vertices: (V, 3) float, all to which faces refer.
+
+    Raises:
+        InputError: vertices of another shape.
     """
 
     def __init__(self, limit: Limit, vertices: np.ndarray):
@@ -246,7 +249,7 @@ class Points:
         parallel(some, len(limit.kinds), work=10_000 * len(limit.kinds))
 
     def evaluate(self, faces: np.ndarray, params: np.ndarray, derivatives: int = 0) -> np.ndarray:
-        """Points and derivatives (N, 1, 3 or 6, 3) float64: the point; along u, v; along uu, uv, vv.
+        """Points and derivatives (N, D, 3) float64, D = 1, 3 or 6: the point; in u, v; in uu, uv, vv.
 
         Args:
             faces: (N,) integers.
@@ -289,7 +292,8 @@ class Points:
                 face, both in units of the face or sub-face; and the number of edges that may be crossed.
 
         Returns:
-            Faces (N,) int32, parameters (N, 2) float64, depth (N,) float64, and (N,) bool, True for a hit.
+            Faces (N,) int32, parameters (N, 2) float64, depth (N,) float64, and (N,) bool, True for a hit. Without a
+            hit the first three mean nothing.
         """
         faces, params = (x.copy() for x in self.limit._samples(faces, params))
         rays = [np.ascontiguousarray(x, np.float64) for x in (origins, directions, spread, limits)]

@@ -74,7 +74,8 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), 
         holes: numbers of faces.
 
     Raises:
-        InputError: the cage has no limit surface; one line names the fault and its place.
+        InputError: an argument is malformed, or OpenSubdiv could not compute the cage's limit surface; one line names
+            the fault and its place.
     """
     if not isinstance(scheme, str) or scheme not in ("catmark", "loop"):
         raise InputError(f"scheme is {quoted(scheme)}; expected 'catmark' or 'loop'")
@@ -107,7 +108,7 @@ def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
     """Lengths (F,) of lists of indices, and their indices (H,), one list after the other; both int32.
 
     Raises:
-        InputError: the lists are empty, too short, or hold something other than integers from 0 on.
+        InputError: there is no list, all lists are empty, or one holds other than integers from 0 to 2**27 − 1.
     """
     wrong = InputError(f"{name} is {quoted(lists)}; expected lists of integers, one for each face, or an array (F, n)")
     if isinstance(lists, (list, tuple)):
@@ -179,7 +180,7 @@ def _sorted_edges(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """`Cage.twins` (H,), from the result of `_sorted_edges`; an error is raised if the cage is no oriented manifold."""
+    """`Cage.twins` (H,), from the result of `_sorted_edges`; an InputError if the cage is no oriented manifold."""
     same = keys[1:] == keys[:-1]
     thrice = np.flatnonzero(same[1:] & same[:-1])
     (a, b), owner = _ends(cage), cage.faces()
@@ -202,7 +203,7 @@ def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
 
 
 def _check_pairs(cage: Cage) -> None:
-    """Refuse cages with two faces that share two edges: around a vertex between the faces, or elsewhere."""
+    """Refuse cages with two faces that share more than one edge: around a vertex between them, or elsewhere."""
     owner, inner = cage.faces(), cage.twins >= 0
     pairs = owner * len(cage.sizes) + np.where(inner, owner[cage.twins], 0)
     pairs, count = np.unique(pairs[inner], return_counts=True)
@@ -261,7 +262,7 @@ def _check_sizes(cage: Cage) -> None:
 
 
 def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, len(columns) − 1) int64 and sharpness (n,) float32 of rows, whose last column is the sharpness."""
+    """Indices (n, len(columns) − 1) int64 of rows, and sharpness (n,) float32, the last column, at most `INFINITE`."""
     expected = f"rows ({', '.join(columns)})"
     if shape_of(rows)[:1] == (0,) or (isinstance(rows, (list, tuple)) and not rows):
         return np.zeros((0, len(columns) - 1), np.int64), np.zeros(0, np.float32)
@@ -284,7 +285,7 @@ def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, n
 
 
 def _checked_holes(holes: Any, faces: int) -> np.ndarray:
-    """Numbers of faces (E,) int32."""
+    """Numbers of faces (E,) int32, each once, in increasing order; an InputError for anything else."""
     if isinstance(holes, (list, tuple)) and not holes:
         return np.zeros(0, np.int32)
     wrong = InputError(f"holes is {quoted(holes)}; expected numbers of faces, from 0 to {faces - 1}")

@@ -78,7 +78,10 @@ def _lists(indices: np.ndarray, sizes: np.ndarray) -> list[list[int]]:
 
 
 def _material(mesh: Any, theta: dict[str, Any]) -> bool:
-    """Add colour and texture of the material to θ. Returns True if neither can be transparent."""
+    """Add texture and colour of the material to θ: a texture only beside uv, a colour only if it is not white.
+
+    Returns True if neither can be transparent.
+    """
     color = mesh.color
     opaque = color is None or len(color) < 4 or color[3] >= 1
     if mesh.texture is not None and "uv" in theta:

@@ -48,7 +48,9 @@ class Baseline(NamedTuple):
 def nearest(
     subject: Subject, number: Number, parts: Sequence[int] | None, options: Mapping[str, Any]
 ) -> Baseline | None:
-    """The sphere or the box whose outline is most like that of the moving parts; None if no motion is seen.
+    """The sphere or the box whose outline is most like that of the moving parts.
+
+    None if the parts show in fewer than `FEWEST` pixels, or if forward mode fails through the splatter.
 
     Args:
         subject: the scene.

@@ -1,4 +1,4 @@
-"""Reasons why the derivative of an image disagrees with the truth: experiments that make it agree."""
+"""Reasons why the derivative of an image disagrees with the truth, finite differences: experiments that mend it."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class _Case:
         return derivative * self.number.slope.step
 
     def try_connected(self) -> _Error | None:
-        """`try_out` with derivatives for the arrays that no derivative reaches."""
+        """The result of `try_out` with derivatives for the arrays that no derivative reaches."""
         self.connected = True
         before = self.try_out()
         self.connected = before is not None
@@ -127,7 +127,7 @@ class _Case:
         return before
 
     def gained(self, before: _Error) -> float:
-        """The share of the whole error that the last experiment removed."""
+        """The share of the whole error, squared, that the last experiment removed; `before` is the error before it."""
         return (before.norm**2 - self.error.norm**2) / self.whole.norm**2
 
 
@@ -147,7 +147,7 @@ def _constants(case: _Case, touched: Touched) -> None:
 
 
 def _outlines(case: _Case, touched: Touched) -> None:
-    """Name the splatter, if it gives outlines no derivative, or if a better one removes the error."""
+    """Name the splatter if the splatter "visible", in its place, makes the error much smaller."""
     splatter = case.subject.options.get("splatter", "auto")
     if case.subject.splats_as("visible"):
         return
@@ -160,7 +160,7 @@ def _outlines(case: _Case, touched: Touched) -> None:
 
 
 def _transparent(case: _Case, touched: Touched) -> None:
-    """Name shaders that are not opaque under a splatter that takes them to be."""
+    """Name shaders that are not opaque, if the splatter "visible" in place of another makes the error much smaller."""
     if case.subject.opaque or case.subject.splats_as("visible"):
         return
     before, advice = case.try_out(splatter="visible"), "Say splatter='visible'."
@@ -189,7 +189,7 @@ def _layers(case: _Case, touched: Touched) -> None:
 
 
 def _bounded(case: _Case, touched: Touched) -> None:
-    """Name surfaces that bound near-singular derivatives."""
+    """Name surfaces that bound near-singular derivatives, if much of the error is where the bounds matter."""
     if all(part.surface.unbounded() is None for part in case.subject.parts):
         return
     change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
@@ -205,7 +205,7 @@ def _bounded(case: _Case, touched: Touched) -> None:
 
 
 def _crossing(case: _Case, touched: Touched) -> None:
-    """Name lines where parts pass through one another."""
+    """Name lines where parts pass through one another, if much of the error is beside them."""
     subject = case.subject
     if len(subject.parts) < 2:
         return
@@ -292,7 +292,10 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
 
 
 def _bias(case: _Case, touched: Touched) -> None:
-    """Name a bias of the library that a sphere or a box shows, too; otherwise the cause is unknown."""
+    """Name a bias of the library that a sphere or a box shows, too; otherwise the cause is unknown.
+
+    Does nothing if other findings leave less than half of the error.
+    """
     if case.findings and case.error.norm < HALVED * case.whole.norm:
         return
     off = _off(case.pushed, case.number.true)

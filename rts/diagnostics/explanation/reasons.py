@@ -1,4 +1,4 @@
-"""Reasons why a derivative disagrees with the truth, or vanishes, in words and as marks in a picture."""
+"""Reasons why a derivative disagrees with the truth (finite differences), or vanishes, in words and as marks."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Reason(NamedTuple):
 
 
 def merged(findings: Sequence[tuple[str, Finding]], size: tuple[int, int]) -> list[Reason]:
-    """Reasons merged over the numbers with equal findings, the largest share first.
+    """Reasons merged over the numbers with equal findings, the largest share first; no share counts as all.
 
     Args:
         findings: each with the name of its number.

@@ -26,7 +26,7 @@ FEW_SAMPLES = 2
 
 
 class Clock:
-    """A budget of seconds."""
+    """A budget of seconds, which begins when the clock is made; an InputError unless it is positive."""
 
     def __init__(self, budget: float):
         if not (is_real(budget) and 0 < budget):
@@ -43,7 +43,7 @@ class Clock:
         return self.spent < share * self.budget
 
     def turn(self, count: int) -> Callable[[], bool]:
-        """A function that is true during the next of `count` equal turns in the rest of the budget."""
+        """A function that is true while the next turn lasts: 1 / `count` of what is left of the budget now."""
         end = self.spent + (self.budget - self.spent) / count
         return lambda: self.going() and self.spent < end
 
@@ -63,7 +63,7 @@ class Looked(NamedTuple):
 
 
 def looked_at(subject: Subject, entries: int, samples: int, clock: Clock, phase: Phase) -> Looked:
-    """Measure at most `entries` numbers of each array: the first of every array, then the second ones, and so on.
+    """Measure at most `entries` numbers of each array, at least one in all: a first of each array, then second ones, ….
 
     If time does not suffice for all with `samples`, all are measured with few samples before any is with more.
     """

@@ -24,7 +24,7 @@ class Slope(NamedTuple):
     Attributes:
         name: the number's place in the parameters, such as "pose[2]".
         autodiff: the derivative through the splatter.
-        difference: the central finite difference of area-sampled hard renders.
+        difference: the central finite difference of renders without splatting, of many samples a pixel.
         error: bound on the error of `difference`: the disagreement of two sampling grids and two steps, and rounding.
         step: the step of the difference, in units of the number.
     """
@@ -101,7 +101,10 @@ def differenced(subject: Subject, number: Number, samples: int) -> Number:
 
 
 def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
-    """A step that moves hidden parts by a pixel, or arrays that no derivative reaches; None if neither move."""
+    """The step that moves the changed parts, drawn alone, by a pixel, or else changes their colour; None if neither.
+
+    Arrays that no derivative reaches move by differences; see `connect` of `Subject.step`.
+    """
     touched = subject.touched(direction, STEP_UNSEEN)
     connect = bool(touched.constant or touched.cut)
     kept = touched.parts
@@ -115,7 +118,7 @@ def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
 
 
 def chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Indices, sorted, of `count` entries: half are the largest or NaN, the others at random, by a fixed seed."""
+    """Sorted indices of `count` entries, or all: half are the largest or NaN, the others random, by a fixed seed."""
     if gradient.size <= count:
         return list(range(gradient.size))
     largest = np.argsort(-np.nan_to_num(np.abs(gradient), nan=np.inf), kind="stable")[: (count + 1) // 2]

@@ -263,7 +263,7 @@ class Subject:
         return gradients
 
     def touched(self, direction: Tree, step: float) -> Touched:
-        """The arrays of the scene that change with a step along a direction."""
+        """The arrays of the scene that change with a step along a direction, those held by shaders and surfaces too."""
         scenes = [self.shown(self.moved(direction, by)) for by in (-step / 2, step / 2)]
         before, after = map(self._placed, scenes)
         changed, constant, cut = [], [], []

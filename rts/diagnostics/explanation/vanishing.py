@@ -1,4 +1,4 @@
-"""Reasons why a number changes nothing: experiments that make it change the image."""
+"""Reasons why a number changes nothing, why a loss is flat, and which numbers an image does not determine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OPEN_TRUE = 0.1
 
 
 def is_quiet(derivative: np.ndarray) -> bool:
-    """True if a step leaves the image unchanged."""
+    """True if no pixel changes by `QUIET` or more, from the change (H, W, 4) of an image by a step."""
     return bool(np.abs(derivative).max(initial=0.0) < QUIET)
 
 
@@ -234,7 +234,7 @@ def _seen_by_blur(subject: Subject, number: Number) -> int | None:
 
 
 def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str, Finding]]:
-    """Combinations of numbers along which the image does not change, though each number alone changes it."""
+    """At most one finding, named "": combinations of numbers that leave the image as it is, though each changes it."""
     numbers = [n for n in numbers if np.isfinite(n.pushed).all() and not is_quiet(n.pushed)]
     if len(numbers) < 2:
         return []

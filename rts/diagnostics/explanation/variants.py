@@ -86,7 +86,7 @@ def all_of(*changes: Any) -> Change:
 
 
 def names(indices: Sequence[int], word: str = "and") -> str:
-    """Parts in words, such as "parts 0 and 2"."""
+    """Parts in words, such as "parts 0 and 2"; of more than three the first three."""
     if len(indices) == 1:
         return f"part {indices[0]}"
     if len(indices) > 3:
