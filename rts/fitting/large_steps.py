@@ -31,7 +31,7 @@ class LargeSteps:
     neighbours j of vertex i. A vertex of no face stays as it is, v = u.
 
     The matrix is factorised once, here, in float64 (SciPy). `decode` solves with it on the host. On other devices, and
-    for second derivatives, array code takes Chebyshev's iteration to the precision of the dtype.
+    for second derivatives, array code takes Chebyshev's iteration, whose time and rounding grow with λ.
 
     Args:
         faces: (T, 3) integers into vertices; copied.
