@@ -35,6 +35,7 @@ from rts.files.models import load
 from rts.files.posed_images import load_views
 from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.large_steps import LargeSteps
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.fitting.view_residuals import ViewResiduals
@@ -97,6 +98,7 @@ __all__ = [
     "GBuffer",
     "ImageResiduals",
     "InputError",
+    "LargeSteps",
     "Loss",
     "Ndc",
     "Part",

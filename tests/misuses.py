@@ -21,6 +21,7 @@ POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 SAMPLES = SAMPLED.samples[0]
 NDC = rts.Ndc((1.0, 1.0))
+STEPS = rts.LargeSteps(FACES, 4)
 DOUBLE = Operation(
     "misuses.double",
     lambda x: 2 * x,
@@ -177,6 +178,11 @@ GROUPS = {
     "ImageResiduals": open_in(
         residuals, "background", "sampler", "splatter", "layers", "supersample", "capacity", "channels"
     ),
+    "LargeSteps": open_in(
+        lambda **o: rts.LargeSteps(**{"faces": FACES, "count": 4, **o}), "faces", "count", "smoothness"
+    ),
+    "LargeSteps.encode": {"vertices": STEPS.encode},
+    "LargeSteps.decode": {"u": STEPS.decode},
     "Loss": open_in(lambda **o: rts.Loss(**{"name": "huber", **o})(np.ones((2, 2))), "name", "f_scale"),
     "Ndc": open_in(lambda **o: rts.Ndc(**{"scale": (1.0, 1.0), **o}).from_world(POINTS), "scale", "near"),
     "Ndc.of_images": open_in(rts.Ndc.of_images, "size", "focal", "near", size=SIZE, focal=20.0),
