@@ -96,8 +96,9 @@ class Engine(Plugin):
     ) -> Callable[[Tree, Tree], Tree]:
         """A function `(parameters, gradient) -> new parameters`, a step of a first-order optimiser.
 
-        It keeps state, perhaps the parameters too: call it with the parameters that it returned last. To be kept in checkpoints, the function is an object with two more methods: `state() -> bytes`, and
-        `restore(state, parameters)`, which goes on from there.
+        It keeps state, perhaps the parameters too: call it with the parameters that it returned last. To be kept in
+        checkpoints, the function is an object with two more methods: `state() -> bytes`, and `restore(state,
+        parameters)`, which goes on from there.
 
         Args:
             method: "adam", "sgd", or an optimiser object of the framework.
