@@ -1,4 +1,7 @@
-"""Hits of a rasterizer that rounds vertices, made exact: each goes to the triangle that truly covers the pixel."""
+"""Hits of a rasterizer that rounds vertices, made exact: each goes to the triangle that truly covers the pixel.
+
+A hit for which no such triangle is found nearby is dropped.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,15 @@ from rts.plugin_api.loops import compiled, loop
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 WALK = 16
-"""The most steps from triangle to triangle, in search of one that covers the pixel."""
+"""The most steps from triangle to triangle, in search of one that covers the pixel's centre."""
 
 
 @loop
 def corner_lists(faces, count):
-    """Offsets (V + 1,) and members (3 T,): `members[offsets[v] : offsets[v + 1]]` are the triangles around vertex v."""
+    """Offsets (V + 1,) and members (3 T,): `members[offsets[v] : offsets[v + 1]]` are the triangles around vertex v.
+
+    `count` is V.
+    """
     offsets = np.zeros(count + 1, np.int32)
     for t in range(len(faces)):
         for c in range(3):
@@ -31,7 +37,7 @@ def corner_lists(faces, count):
 
 @loop
 def places(vertices, faces):
-    """(T, 3) `faces` with vertices at one position replaced by the first of them, so that triangles there connect."""
+    """A copy of `faces` (T, 3) with vertices at one position replaced by the first, so that triangles there connect."""
     size = 4
     while size < 2 * len(vertices):
         size *= 2
@@ -62,7 +68,8 @@ def places(vertices, faces):
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Test triangle `t` at a pixel position: True if it covers it; least barycentric, depth, first two barycentrics.
 
-    The least barycentric is −∞ if the triangle is culled or has no area, or lies behind the eye or is clipped there.
+    If the triangle is culled or has no area, or lies behind the eye or is clipped there, the least barycentric is −∞
+    and the rest is 0. `corners` (3, 4) is working memory.
     """
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -93,7 +100,8 @@ def holds(triangles, count, t):
 def _walk(t, x, y, hits, count, scene, around, offsets, members):
     """Go from triangle `t` to its neighbours, towards one that covers a pixel and is not among the first `count` hits.
 
-    Returns True if it is reached, the last triangle, its depth and its first two barycentrics.
+    Neighbours share a corner. If `t` itself covers the pixel, it is the last triangle, even if it is among the hits.
+    Returns True if the last triangle covers the pixel, this triangle, its depth and its first two barycentrics.
     """
     inside, least, z, a, b = look(t, x, y, *scene)
     for _ in range(WALK):
@@ -124,7 +132,8 @@ def correct(
 ):  # fmt: skip
     """Correct the hits of pixel rows [first, last): fill barycentrics and depths, correct ids, drop those that miss.
 
-    `around` is the result of `places`, `offsets` and `members` are its `corner_lists`.
+    `triangle_ids` (K, H, W) are changed in place; each pixel's hits are sorted by depth, then by index, and empty
+    layers follow. `around` is the result of `places`, `offsets` and `members` are its `corner_lists`.
     """
     layers, _, width = triangle_ids.shape
     scene = matrix, row, keep, vertices, faces, np.empty((3, 4))

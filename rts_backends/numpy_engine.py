@@ -30,16 +30,16 @@ class NumpyEngine(Engine):
         return isinstance(x, np.ndarray)
 
     def constant(self, value: Any, like: Array | None = None) -> np.ndarray:
-        """`value` as an array; floats in the dtype of `like`, if given."""
+        """`value` as an array; floats in the dtype of `like`, if given, else in their own."""
         array = np.asarray(value)
         return array.astype(like.dtype, copy=False) if like is not None and array.dtype.kind == "f" else array
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[np.ndarray, ...]:
-        """Call `fn`: everything is on the host already."""
+        """The results of `fn(*args)`: everything is on the host already."""
         return fn(*args)
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
-        """The operation's result: by compiled code if `operation.fits` the dtypes, else by specification."""
+        """The operation's result: by compiled code if `operation.fits` the dtypes, else by its array code."""
         if not operation.fits(list(map(_DTYPE, operands))):
             return operation.specification(*operands, **params)
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]

@@ -13,17 +13,17 @@ from rts.plugin_api.records import ArraySpec, Cells, RayHits, Request, Samples
 from rts.plugin_api.splats import outline_cells
 
 REACH = 3.0
-"""Distance of outlines, in pixels, up to which deepest points tell how they move: beyond, a chord ends elsewhere."""
+"""Distance from a ray, in pixels, up to which an outline counts: beyond, deepest points do not tell how it moves."""
 
 ROOM = 16
-"""Rows of a capacity for each pair of rows at outlines, beside the capacity."""
+"""Rows of a capacity for which one pair of rows, at outlines, is allotted beside the capacity."""
 
 
 class Rays(Sampler):
     """Sampler that casts a ray through each pixel's centre, in array code on the device, which engines can trace."""
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
-        """See `rts.Sampler`."""
+        """See `rts.Sampler`; refuses a surface that is no `RaySurface`, a culled part, and hits of wrong shapes."""
         surface = part.surface
         if not isinstance(surface, RaySurface):
             raise InputError(
@@ -100,16 +100,17 @@ def _with_deepest(
     listed: Array | None,
     view: tuple[int, int],
 ) -> Samples:
-    """Samples with further rows, pairs beside the deepest points of rays through cells at outlines; see `Cells.exit`.
+    """Samples with two further rows for cells at outlines, beside the deepest points of their rays; see `Cells.exit`.
 
     Args:
         samples: the samples.
         surface: the surface.
         theta: its θ, constant.
-        begins: (H, W) bool, cells whose ray enters a solid at the front.
+        begins: (H, W) or (L, C) bool, cells whose ray enters a solid at the front.
         rays: points of the surface, directions, and reach, for all cells, as `RaySurface.deepest` takes them.
-        capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none.
-        listed: (L, C), `Request.cells`.
+        capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none. None
+            for as much room as there are cells.
+        listed: (L, C), `Request.cells`; None for all cells of the grid.
         view: (height, width) of the grid.
     """
     engine, xp, rows = engine_of(samples.ids, begins), namespace(begins), samples.ids.shape[0]
@@ -144,7 +145,7 @@ def _with_deepest(
 
 
 def _facing(entering: Array, row: Array) -> Array:
-    """`Cells.facing` of a solid of one piece, from `RayHits.entering` and `Cells.row`, (K, H, W) each."""
+    """`Cells.facing` of a solid of one piece, from `RayHits.entering` and `Cells.row`, all (K, H, W)."""
     xp = namespace(row)
     more = xp.concat([xp.zeros_like(row[:-1]), xp.full_like(row[-1:], Cells.MORE_BEHIND)])
     sides = xp.where(entering, 1 + more, -1 - more)
@@ -172,6 +173,6 @@ def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, 
 
 
 def _checked(view: np.ndarray, projection: np.ndarray, *transform: np.ndarray) -> tuple[np.ndarray]:
-    """Refuse a camera without rays, or a bad transform. A compiled program leaves out this call: the 0 is unused."""
+    """Refuse a camera without rays, or a bad transform. A compiled program leaves out this call: its 0 is unused."""
     check_camera(Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64)), *transform)
     return (np.asarray(0, np.int32),)

@@ -45,7 +45,7 @@ class Reference(TriangleSampler):
 
 
 def _chunks(counts: np.ndarray) -> list[np.ndarray]:
-    """Indices of non-zero counts, split where the running total passes a multiple of `CANDIDATES_AT_ONCE`."""
+    """Indices of non-zero counts, split where their running total passes a multiple of `CANDIDATES_AT_ONCE`."""
     indices = np.flatnonzero(counts)
     if not len(indices):
         return []
@@ -54,9 +54,9 @@ def _chunks(counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First and last pixel (x, y) that each triangle may cover, and marks of triangles that may cover any.
+    """First and last pixel (T, 2) that each triangle may cover, and marks (T,) of triangles that may cover any.
 
-    `corners` (T, 3, 4) are in clip space.
+    `corners` (T, 3, 4) are in clip space. A triangle with a corner whose w is not positive gets the whole image.
     """
     height, width = size
     w = corners[..., 3]
@@ -73,7 +73,7 @@ def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray
 
 
 def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """Marks of triangles whose outward normal points to the viewer's side; corners in homogeneous camera space."""
+    """Marks (T,) of triangles whose outward normal points to the viewer's side; corners (T, 3, 4) in camera space."""
     a, b, c = corners[:, 0, :3], corners[:, 1, :3], corners[:, 2, :3]
     toward = a * camera.projection[3, 2] + [0, 0, camera.projection[3, 3]]
     outward = np.cross(b - a, c - a) * np.sign(np.linalg.det(camera.view[:3, :3]))
@@ -81,7 +81,11 @@ def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _hits(triangle, x, y, corners, depth, size):
-    """Triangles, flat pixel indices, first two barycentrics and depths of those candidates that hit."""
+    """Triangles, flat pixel indices, first two barycentrics and depths of those candidates that hit.
+
+    Candidate n is triangle `triangle[n]` at pixel (x[n], y[n]); `corners` (T, 3, 4) are in clip space, `depth` is (T,
+    3).
+    """
     height, width = size
     ndc_x, ndc_y = (x + 0.5) * 2 / width - 1, 1 - (y + 0.5) * 2 / height
     c = corners[triangle]
@@ -97,7 +101,7 @@ def _hits(triangle, x, y, corners, depth, size):
     triangle, x, y, c = triangle[hit], x[hit], y[hit], c[hit]
     b = edges[hit] / total[hit, None]
     near, far = (b * (c[..., 2] + c[..., 3])).sum(1) >= 0, (b * (c[..., 3] - c[..., 2])).sum(1) >= 0
-    # Σ bᵢ wᵢ > 0 tells a point before the viewer from one behind that projects to the same pixel.
+    # Σ bᵢ wᵢ > 0 tells a point in front of the viewer from one behind that projects to the same pixel.
     seen = near & far & ((b * c[..., 3]).sum(1) > 0)
     z = (b * depth[triangle]).sum(axis=1)
     return triangle[seen], (y * width + x)[seen], b[seen, :2], z[seen]
@@ -108,7 +112,10 @@ def _cross(ax, ay, bx, by):
 
 
 def _edge_slopes(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of gᵢ × gⱼ (see `Reference`) along +x of NDC, and along −y: (T, 3) each, for the three edges."""
+    """Derivatives of gᵢ × gⱼ (see `Reference`) along +x of NDC, and along −y: (n, 3) each, for the three edges.
+
+    `c` (n, 3, 4) are the corners in clip space.
+    """
     pairs = ((1, 2), (2, 0), (0, 1))
     along_x = [c[:, i, 1] * c[:, j, 3] - c[:, i, 3] * c[:, j, 1] for i, j in pairs]
     down = [c[:, i, 0] * c[:, j, 3] - c[:, i, 3] * c[:, j, 0] for i, j in pairs]
@@ -116,7 +123,7 @@ def _edge_slopes(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(triangle, pixel, barycentrics, depth, size, layers) -> Fragments:
-    """The first `layers` hits of each pixel by depth, then by triangle."""
+    """Fragments of the first `layers` hits of each pixel, by depth, then by triangle."""
     order = np.lexsort((triangle, depth, pixel))
     triangle, pixel, barycentrics, depth = triangle[order], pixel[order], barycentrics[order], depth[order]
     starts = np.flatnonzero(np.diff(pixel, prepend=-1))

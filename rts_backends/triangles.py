@@ -18,7 +18,7 @@ from rts.plugin_api.loops import compiled, loop
 
 
 def pixel_matrix(camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """(4, 4) matrix from the proxy's space to homogeneous pixel coordinates (X, Y, clip z, w)."""
+    """(4, 4) matrix from the proxy's space to homogeneous pixels (X, Y, clip z, w); `size` is (height, width)."""
     height, width = size
     to_pixels = np.array([[width / 2, 0, 0, width / 2], [0, -height / 2, 0, height / 2], [0, 0, 1, 0], [0, 0, 0, 1]])
     return to_pixels @ camera.projection @ camera.view
@@ -36,7 +36,7 @@ def facing(camera: Camera, cull: str) -> float:
 
 @loop
 def bounding_sphere(vertices, faces):
-    """(4,) centre and radius of the sphere around the bounding box of the vertices that triangles use."""
+    """(4,) centre and radius, at least 1e-30, of the sphere around the bounding box of vertices that triangles use."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for t in range(len(faces)):
         for c in range(3):
@@ -52,7 +52,7 @@ def bounding_sphere(vertices, faces):
 
 @compiled
 def to_corner(matrix, vertices, v, corners, i):
-    """Transform vertex `v` into row `i` of `corners`."""
+    """Transform vertex `v` by `matrix` (4, 4) into row `i` of `corners` (·, 4)."""
     x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
     for r in range(4):
         corners[i, r] = matrix[r, 0] * x + matrix[r, 1] * y + matrix[r, 2] * z + matrix[r, 3]
@@ -92,7 +92,10 @@ def owns(x, y):
 
 @compiled
 def edge_values(corners, ia, ib, ic, x, y):
-    """Edge functions opposite `ia`, `ib`, `ic` at a pixel position, positive inside; True if the triangle covers it."""
+    """Edge functions opposite `ia`, `ib`, `ic` at a pixel position, positive inside; True if the triangle covers it.
+
+    Near and far planes do not count here, see `clipped`; a triangle of no area must be left out before.
+    """
     xa, ya, wa = edge(corners, ib, ic)
     xb, yb, wb = edge(corners, ic, ia)
     xc, yc, wc = edge(corners, ia, ib)
@@ -109,7 +112,7 @@ def edge_values(corners, ia, ib, ic, x, y):
 
 @compiled
 def clipped(corners, ia, ib, ic, ea, eb, ec):
-    """True if the point with barycentrics in the ratio ea : eb : ec lies before the near or beyond the far plane."""
+    """True if the point with barycentrics in the ratio ea : eb : ec is nearer than the near or beyond the far plane."""
     near = ea * (corners[ia, 2] + corners[ia, 3]) + eb * (corners[ib, 2] + corners[ib, 3])
     far = ea * (corners[ia, 3] - corners[ia, 2]) + eb * (corners[ib, 3] - corners[ib, 2])
     return near + ec * (corners[ic, 2] + corners[ic, 3]) < 0 or far + ec * (corners[ic, 3] - corners[ic, 2]) < 0

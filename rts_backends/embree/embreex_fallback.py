@@ -1,8 +1,8 @@
 """Rays cast by the public interface of the package embreex, where Embree's library cannot be found.
 
-It gives the first hit of a ray, on one core. So rays are cast again, each from just beyond its last hit, until every
-pixel has its layers. Each hit is decided in float64 as the rasterizer decides, along with all triangles around its
-corners: so edges are hit once, and layers that share a corner keep their order however close they are. Layers that
+The package gives the first hit of a ray, on one core. So rays are cast again, each from just beyond its last hit, until
+every pixel has its layers. Each hit is decided in float64 as the rasterizer decides, along with all triangles around
+its corners: so edges are hit once, and layers that share a corner keep their order however close they are. Layers that
 share none, and are closer than `STEP`, may get lost.
 """
 
@@ -20,9 +20,9 @@ from rts_backends.exact_hits import corner_lists, holds, look, places
 from rts_backends.triangles import facing, pixel_matrix
 
 STEP = 1e-6
-"""Distance from a hit to the next ray's start, a share of the object's size; float32 resolves a tenth of it."""
+"""Distance from a hit to the next ray's start, a share of the object's radius; float32 resolves a tenth of it."""
 REACH = 1.01
-"""Square of the radius of the sphere that rays start on, in units of the object's."""
+"""Square of the radius of the sphere that rays start on, in units of the object's sphere."""
 
 
 class Scene:
@@ -54,13 +54,13 @@ class Scene:
         layers: int,
         cull: str,
     ) -> Fragments:
-        """The `layers` nearest hits of each pixel.
+        """Fragments (layers, H, W): the `layers` nearest hits of each pixel.
 
         Args:
             proxy: the object.
             owners: (M,) int32, the index of each cover's triangle in the proxy.
             sphere: (4,) the object's centre and radius; the scene is the object moved and scaled to the unit sphere.
-            planes: (4,) depths; nothing is seen before the first or beyond the second.
+            planes: (4,) depths; nothing nearer than the first or beyond the second is seen.
             camera: see `TriangleSampler.rasterize`.
             size: see `TriangleSampler.rasterize`.
             layers: see `TriangleSampler.rasterize`.
@@ -112,7 +112,11 @@ class Scene:
 def _take(
     first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, nearest
 ):  # fmt: skip
-    """Put hits of each pixel's candidate triangle, and of all triangles around its corners, among the nearest."""
+    """Test each pixel's candidate triangle, and all triangles around its corners; put hits among the pixel's nearest.
+
+    Only candidates [first, last) are taken. `ids` (pixels, K) and `nearest` (pixels, K, 3), depths and barycentrics,
+    change in place.
+    """
     layers = ids.shape[1]
     corners = np.empty((3, 4))
     for n in range(first, last):
@@ -129,7 +133,7 @@ def _take(
 
 @compiled
 def _insert(ids, nearest, t, z, a, b):
-    """Insert a hit among a pixel's nearest, by depth, then by triangle; drop it if they are full and all nearer."""
+    """Insert a hit among a pixel's nearest, by depth, then by triangle; the farthest of more than K drops out."""
     at = layers = len(ids)
     while at > 0 and (ids[at - 1] < 0 or z < nearest[at - 1, 0] or (z == nearest[at - 1, 0] and t < ids[at - 1])):
         at -= 1

@@ -31,6 +31,8 @@ NEVER = 255
 class Covers(NamedTuple):
     """M covers of a proxy's T triangles: first one for each, then further ones for thin and small triangles.
 
+    Further covers that are not needed, once vertices have moved, are points.
+
     Attributes:
         corners: (3 M + 1, 3) float32, three for each cover; the last row is padding, since Embree reads 16 bytes each.
         faces: (M, 3) int32: 0, 1, 2; 3, 4, 5; and so on.
@@ -62,7 +64,7 @@ class Covers(NamedTuple):
         return covers
 
     def follow(self, vertices: np.ndarray, faces: np.ndarray, sphere: np.ndarray) -> bool:
-        """Cover the triangles of moved vertices, in place; False if they need more covers than there are."""
+        """Cover the triangles of moved vertices, in place; False, with no change, if they need more covers."""
         wanted = np.empty(len(faces), np.uint8)
         parallel(_count, len(faces), vertices, faces, sphere, wanted, work=60 * len(faces))
         if len(faces) + int(wanted.sum(dtype=np.int64)) > len(self.faces):
@@ -81,9 +83,9 @@ class Covers(NamedTuple):
 
 @compiled
 def _shape(vertices, faces, t, sphere, points):
-    """Fill `points` (3, 3) with the corners, in units of the sphere.
+    """Fill `points` (3, 3) with the corners of triangle t, in units of the sphere and about its centre.
 
-    Returns the lengths of the edges opposite them, and twice the triangle's area.
+    Returns the lengths of the edges, each opposite its corner, and twice the triangle's area: four numbers.
     """
     for c in range(3):
         for r in range(3):
@@ -109,6 +111,10 @@ def _count(start, stop, vertices, faces, sphere, wanted):
 
 @loop
 def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners, margins):
+    """Fill the corners, owners and margins of the covers of triangles [start, stop), see `Covers`.
+
+    `places` (T,) are the indices of the first further covers.
+    """
     points, along, side, across = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for t in range(start, stop):
         a, b, c, area = _shape(vertices, faces, t, sphere, points)
@@ -173,7 +179,10 @@ def _perpendicular(points, p, s, along, height, side):
 
 @compiled
 def _ribbon(corners, start, along, side, length, height):
-    """Fill `corners` with a long triangle around a segment; at the segment's end it is half as wide as at its start."""
+    """Fill `corners` (3, 3) with a long triangle around a segment, in the plane of `along` and `side`.
+
+    At the segment's end it is about half as wide as at its start.
+    """
     wide = 2 * (height + 2 * LEAST)
     for r in range(3):
         corners[0, r] = start[r] - 2 * LEAST * along[r] - wide * side[r]

@@ -65,7 +65,11 @@ def find() -> str | None:
 
 
 def load() -> ctypes.CDLL | None:
-    """The library with its signatures, or None if it is missing."""
+    """The library with its signatures, loaded once; None if it is missing.
+
+    Raises:
+        PluginError: Embree gives no device.
+    """
     global _library, _device
     with _first_use:
         if _library is None:
@@ -87,8 +91,11 @@ class Scene:
     """The acceleration structure of one triangle mesh. Released when garbage-collected.
 
     Args:
-        vertices: (V + 1, 3) float32; the last row is padding, since Embree reads 16 bytes a vertex.
-        faces: (T, 3) int32.
+        vertices: (V + 1, 3) float32, read in place; the last row is padding, since Embree reads 16 bytes a vertex.
+        faces: (T, 3) int32, read in place.
+
+    Raises:
+        PluginError: Embree reports an error, such as too little memory.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):

@@ -25,14 +25,14 @@ TILE = 8
 ACCEPT, REJECT = -1, 0
 COHERENT, INVOKE_FILTER = 1 << 16, 1 << 1
 SLACK, REACH_SLACK_SHARE = 1e-5, 1e-4
-"""Shares of the object's radius. Hits whose depths differ by less than the first are compared in float64; a ray with
-all its layers ends the second beyond its last hit."""
+"""Shares of the object's radius. Hits whose depths differ by less than the first are compared in float64. A ray that
+has found all its layers is cut off beyond its last hit, by the second."""
 
 GRAZING = 0.05
 """Cosine between ray and normal below which Embree's depth, and side, are not believed."""
 
 REACH = 1.01
-"""Square of the radius of the sphere that rays start on, in units of the object's."""
+"""Square of the radius of the sphere that rays start on, in units of the object's sphere."""
 
 # Per ray: hits so far, pixel x, y, sign of determinants to keep, slack of depths and of the ray's end, depth where the
 # ray starts, the depths between which no plane clips, and `left_out` of `cast`.
@@ -47,7 +47,7 @@ def _intrinsic(definition: Callable[..., tuple]) -> Callable[..., Any]:
 
 @_intrinsic
 def _call(typing_context, function, a, b, c):
-    """Call a C function of three pointers that returns nothing, all given as integers."""
+    """Call a C function of three pointers that returns nothing; its address and the pointers are integers."""
     signature = types.void(types.intp, types.intp, types.intp, types.intp)
 
     def generate(context, builder, signature, arguments):
@@ -72,9 +72,10 @@ def _pointer(typing_context, address):
 
 @compiled
 def _decide(t, state, work, vertices, faces):
-    """Test triangle `t` in float64: True if the ray hits it, and the hit's depth.
+    """Test triangle `t` in float64: True if the ray hits it, and the hit's depth, else 0.
 
-    `work` (8, 4) holds `matrix` and `row` of `cast`, then room for three corners.
+    `state` holds the ray's numbers (see COUNT and the others). `work` (8, 4) holds `matrix` and `row` of `cast`, then
+    room for three corners.
     """
     matrix, row, corners = work[:4], work[4], work[5:]
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
@@ -94,9 +95,10 @@ def _decide(t, state, work, vertices, faces):
 
 @compiled
 def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
-    """Insert a hit among the nearest, by depth, then by triangle; False if it is not among the nearest.
+    """Insert a hit, triangle t at depth z, among the nearest in `depths`, `ids` and `sure`, by depth, then by triangle.
 
-    Hits at nearly the same depth are tested in float64 first, unless they are `exact` or `sure` already.
+    Hits at nearly the same depth are tested in float64 first, unless they are `exact` or `sure` already; earlier ones
+    that fail are removed. Returns False if the hit fails, is there already, or is not among the nearest.
     """
     slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
     while i < count:
@@ -133,7 +135,11 @@ def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
 
 @numba.cfunc(types.void(types.CPointer(types.intp)), cache=True)
 def _keep_nearest(arguments):
-    """Embree's intersection filter; fields: valid, user, context, ray, hit."""
+    """Insert a candidate among a ray's nearest hits: Embree's intersection filter.
+
+    Fields of `arguments`: valid, user, context, ray, hit. A candidate is accepted only once all layers are full: the
+    ray then ends at the last. Others are rejected, so that Embree searches on.
+    """
     fields = carray(arguments, 5)
     valid = carray(_pointer(fields[0]), 1, np.int32)
     ray = carray(_pointer(fields[3]), 9, np.float32)
@@ -198,7 +204,8 @@ def cast(
         row: (4,) coefficients of linear depth, see `depth_of`.
         ray_space: (8, 4): the camera's projection, and the inverse of its view.
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
-        planes: (4,) depths: nothing is seen before the first or beyond the second; between the others no plane clips.
+        planes: (4,) depths: nothing nearer than the first or beyond the second is seen; between the others no plane
+            clips.
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         left_out: 1 to leave out triangles seen from behind, −1 from the front, 0 for none.
         vertices: (V, 3) of the proxy.
@@ -296,7 +303,7 @@ def cast(
 def _pixels(tile, across, width, height, cells, at, columns, lines):
     """Fill in the pixels of a tile, or of a piece of `cells`: index of output, column (−1 for none), row.
 
-    Returns the number of pixels.
+    Returns the number of pixels, at most TILE².
     """
     count = 0
     if len(cells) > 0:
@@ -316,9 +323,10 @@ def _pixels(tile, across, width, height, cells, at, columns, lines):
 
 @compiled
 def _aim(space, sphere, planes, x, y, ray, state):
-    """Write the ray through an NDC position, from where it meets the object's sphere; False if it misses.
+    """Write the ray through an NDC position to `ray`, its depth at the start to `state`; False if there is none.
 
-    Starting there, and in units of the object, float32 is fine enough however far off the camera or the origin.
+    The ray is the part within the object's sphere and between `planes`. From such a start, and in units of the object,
+    float32 is fine enough however far off the camera or the origin.
     """
     # See Camera.rays: the camera-space point at depth z is (start + z step, −z). Rows 0–3 are the projection, 4–6
     # those of the inverse view. (No slices here: each would cost an atomic count of references.)

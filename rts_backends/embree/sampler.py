@@ -19,7 +19,7 @@ from rts_backends.embree.loops import TILE, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 REFITS = 32
-"""After so many refits in a row the structure is built anew, since moved triangles loosen its boxes."""
+"""One move of vertices in so many builds the structure anew; the others refit it, which loosens its boxes."""
 
 
 class Structure:
@@ -34,7 +34,7 @@ class Structure:
         self.refits = 0
 
     def move(self, proxy: Proxy) -> bool:
-        """Refit to a proxy with the same faces and moved vertices; False if it needs a new structure."""
+        """Refit to a proxy with the same faces and moved vertices, in place; False if it needs a new structure."""
         proxy = _packed(proxy)
         sphere = bounding_sphere(proxy.vertices, proxy.faces)
         if not self.covers.follow(proxy.vertices, proxy.faces, sphere):
@@ -53,7 +53,7 @@ class Embree(TriangleSampler):
         return Structure(super().prepare(proxy))
 
     def update(self, prepared: Structure, proxy: Proxy) -> Structure | None:
-        """Refit the structure to moved vertices; None if the proxy must be prepared anew."""
+        """Refit the structure to moved vertices, in place, and return it; None if the proxy must be prepared anew."""
         return prepared if prepared.move(proxy) else None
 
     def rasterize(
@@ -69,7 +69,7 @@ class Embree(TriangleSampler):
     def rasterize_cells(
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: a ray for each of `cells`."""
+        """See `TriangleSampler.rasterize_cells`: a ray for each of `cells`; the fallback casts one for each pixel."""
         if isinstance(prepared.scene, embreex_fallback.Scene) or not cells.size:
             return super().rasterize_cells(prepared, camera, size, layers, cull, cells)
         flat = np.ascontiguousarray(cells, np.int32).reshape(-1)
@@ -79,7 +79,7 @@ class Embree(TriangleSampler):
 def _cast(
     prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, cells: np.ndarray, shape: tuple[int, ...]
 ) -> Fragments:
-    """Fragments of `shape` (K, ·, ·): of `cells`, flat indices of pixels, or of all pixels if `cells` is empty."""
+    """Fragments of `shape` (K, ·, ·) in `cells`, flat indices of pixels or −1; in all pixels if `cells` is empty."""
     scene: Any = prepared.scene
     (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(cells) // TILE**2) if len(cells) else -(-height // TILE) * -(-width // TILE)
@@ -118,9 +118,9 @@ def _packed(proxy: Proxy) -> Proxy:
 
 
 def _planes(p: np.ndarray) -> np.ndarray:
-    """(4,) depths: nothing is seen before the first or beyond the second, and all between the other two.
+    """(4,) depths: nothing nearer than the first or beyond the second is seen; between the other two no plane clips.
 
-    A slanted plane has no single depth: then every hit is left to the exact test.
+    A slanted plane has no single depth: then every hit is left to the exact test. `p` is the projection.
     """
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return np.array([-np.inf, np.inf, np.inf, -np.inf])

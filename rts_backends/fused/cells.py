@@ -1,8 +1,8 @@
 """The splatters of `rts.splatting` and their first derivatives as compiled loops on all cores, NumPy in and out.
 
 Every target collects from its nine sources, and in the reverse direction every source from its nine targets, each in
-one fixed order: results do not depend on the number of threads. Most targets are plain (`stencil.py`). Choices for
-the others, the mixed ones (`mixed_targets.py`), are made once and kept in `Cells`.
+one fixed order: results do not depend on the number of threads. Most targets are plain (`stencil.py`). The layers that
+the others, the mixed ones (`mixed_targets.py`), take from each source are chosen once and kept in `Cells`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Settings(NamedTuple):
         kind: "single", "multi" or "visible".
         sigma: standard deviation, pixels.
         epsilon: excess of the weights' sum over one.
-        gamma: the calibration.
+        gamma: the calibration, a factor of samples' offsets from their cells' centres.
         border: rows and columns at each side of the cells that are no part of the image.
         one_part: whether all samples belong to one part.
         rims: `visible` only: whether coverage moves as outlines do.
@@ -59,6 +59,8 @@ class Settings(NamedTuple):
 class Choices(NamedTuple):
     """Mixed targets, whose sources are not all paired front to front, and the layers that they take.
 
+    With translucent layers, all wanted targets that splats reach count as mixed, but for `Stacks.straight`.
+
     Attributes:
         mixed: (H, W) uint8, 1 at such targets.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
@@ -67,9 +69,9 @@ class Choices(NamedTuple):
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`uniform_cells.py`); mixed ones are EMPTY here.
-        ends: (H, W) uint16, where fronts end, and targets that outlines may cover in part (`uniform_cells.py`); or no
-            rows.
-        listed: (H,) int64, the number of these targets in each row.
+        ends: (H, W) uint16, the directions in which fronts end, and the mark LISTED of targets that are mixed, or that
+            outlines may cover in part (`uniform_cells.py`); no rows without `rims`.
+        listed: (H,) int64, the number of LISTED targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: largest less least depth of the fronts, the camera's 0 included.
         stacks: where layers are translucent, the plans of these targets, and the targets that need no plan, which are
@@ -107,7 +109,8 @@ class Cells:
         exits: (E, H, W) integers, `Cells.exit` of the records; None, or no entries, if unknown.
 
     Raises:
-        InputError: shapes that do not fit, or `row` refers to a sample that is not there.
+        InputError: positions and rgba do not fit; or, unless `choices` are given, other shapes do not fit, or `row`,
+            `settled` or `exits` refer to a sample that is not there.
     """
 
     def __init__(
@@ -156,11 +159,11 @@ class Cells:
 
     @cached_property
     def _shows_several(self) -> bool:
-        """True if settled targets show the colours of other samples than that of row 0."""
+        """True if some settled target shows the colour of another sample than sample 0."""
         return self._settled.max(initial=-1) > 0
 
     def _paint(self, colors: np.ndarray, images: np.ndarray) -> None:
-        """Give settled targets of images (T, H, W, 4) the colours (T, N, 4) of samples; zeros where N is 0."""
+        """Give settled targets of `images` (T, H, W, 4) the colours (T, N, 4) of samples; zeros where N is 0."""
         parallel(paint, images.shape[1], self.settled, self.border, read_only(colors), images, work=images.size // 8)
 
     @property
@@ -170,27 +173,27 @@ class Cells:
 
     @property
     def plain_grid(self) -> Grid:
-        """The samples for the stencil's loops. In `visible` no plain target takes a hidden layer."""
+        """The samples for the stencil's loops; in `visible` front layers alone, since plain targets take no others."""
         return self.grid._replace(row=self.row[:1]) if self.visible else self.grid
 
     @property
     def _plain_work(self) -> int:
-        """Nanoseconds that the stencil takes at least."""
+        """About how many nanoseconds the stencil takes at least."""
         return 4 * self.row.shape[1] * self.row.shape[2]
 
     @property
     def _layers_work(self) -> int:
-        """Nanoseconds that stencils of all layers take at least."""
+        """About how many nanoseconds stencils of all layers take at least."""
         return len(self.row) * self._plain_work
 
     @property
     def _mixed_work(self) -> int:
-        """Nanoseconds that the mixed targets take: nine sources of several numbers each."""
+        """About how many nanoseconds the mixed targets take: nine sources of several numbers each."""
         return 160 * len(self.choices.columns)
 
     @property
     def mixed_arguments(self) -> tuple:
-        """Arguments of the loops of mixed targets."""
+        """The grid, and `offsets`, `columns` and `ranges` of `Choices`: arguments of the loops of mixed targets."""
         choices = self.choices
         return self.grid, choices.offsets, choices.columns, choices.ranges
 
@@ -200,7 +203,7 @@ class Cells:
 
     @cached_property
     def choices(self) -> Choices:
-        """The choices for each target, made on first use."""
+        """The states of all targets, and the layers that mixed ones take: computed on first use, unless given."""
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
         # EMPTY for targets that are not settled, SETTLED for those that are.
@@ -262,7 +265,7 @@ class Cells:
 
     @cached_property
     def outlines(self) -> Outlines:
-        """Motions of outlines, and the colours that they change; empty without rims."""
+        """Motions of outlines, and the colours that they change; without rims no targets are listed."""
         _, height, width = self.row.shape
         choices, kind = self.choices, self.positions.dtype
         ends, counts = choices.ends, choices.listed
@@ -296,14 +299,14 @@ class Cells:
 
     @cached_property
     def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bits (H, W) of pairs beside lines of crossing, and the rows (H,) that have some (see `crossing_pairs.py`).
+        """Bits (H, W) of pairs beside lines of crossing, and marks (H,) of rows with some (see `crossing_pairs.py`).
 
-        No rows without pairs.
+        Both have no rows if there are no pairs.
         """
         return self._pairs_within(self.choices.extent)
 
     def _pairs_within(self, extent: float) -> tuple[np.ndarray, np.ndarray]:
-        """`_pairs` for the extent of `Choices`."""
+        """`_pairs`, for an `extent` as in `Choices`."""
         if not self.crosses:
             return crossing_pairs.nothing(self.row.shape[2])
         return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(extent))
@@ -319,7 +322,7 @@ class Cells:
 
     @cached_property
     def _seen_grid(self) -> Grid:
-        """`grid` with fronts of the colour that is seen along their rays, through translucent layers."""
+        """`grid`; with translucent layers, its fronts have the colour that is seen along their rays."""
         if not self.translucent:
             return self.grid
         seen = np.zeros((*self.row.shape[1:], 4), self.rgba.dtype)
@@ -337,7 +340,7 @@ class Cells:
         return len(self.crossings.columns) > 0
 
     def image(self, out: np.ndarray) -> None:
-        """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
+        """Fill `out` (H, W, 4) with the image, premultiplied; H and W are those of the cells less both borders."""
         if out.size:
             given = self.plain_grid, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
@@ -351,11 +354,14 @@ class Cells:
                 parallel(
                     mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
                 )
-            if self._shows_several:  # Targets without a sample of their own show that of row 0 so far.
+            if self._shows_several:  # Targets without a sample of their own show sample 0 so far.
                 self._paint(self.rgba[None], out[None])
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
-        """Fill the gradients of positions (N, 3) and rgba (N, 4), zeros or None, from the image's (H, W, 4)."""
+        """Fill the gradients of positions (N, 3) and rgba (N, 4) from the image's gradient `g` (H, W, 4).
+
+        Both hold zeros before; None if not wanted.
+        """
         if not self.row.size:
             return
         self._pull(g, g_positions, g_rgba)
@@ -376,7 +382,7 @@ class Cells:
             g_rgba[shown] += sums.sum(axis=0)
 
     def _pull(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
-        """`vjp` of the targets that are not settled."""
+        """`vjp` of the targets that are not settled: adds to the gradients."""
         height = self.row.shape[1]
         if self.choices.repeated:
             self._vjp_of_repeated(g, g_positions, g_rgba)
@@ -399,7 +405,7 @@ class Cells:
             outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
     def _pull_mixed(self, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
-        """Add mixed targets' shares to the gradients; a gradient of no rows gets none."""
+        """Add mixed targets' shares to the gradients from the image's gradient `g`; a gradient of no rows gets none."""
         count, height = len(self.choices.columns), self.row.shape[1]
         if self.choices.stacks is not None:
             self._pull_stacks(self.choices.stacks, g, g_positions, g_rgba)
@@ -431,7 +437,10 @@ class Cells:
         parallel(layered.pull, height, self.grid, *given, adjoints, g_positions, g_rgba, work=work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
-        """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
+        """Fill `out`, tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4).
+
+        None stands for tangents of zeros.
+        """
         if not out.size:
             return
         tangents = tuple(
@@ -457,7 +466,7 @@ class Cells:
             self._paint(tangents[1], out)
 
     def _push_lines(self, tangents: tuple[np.ndarray, ...], out: np.ndarray) -> None:
-        """Write the tangents of targets beside lines of crossing."""
+        """Replace, in `out`, the tangents of targets beside lines of crossing."""
         t_positions, t_rgba = tangents
         tints, choices, height = None, self.choices, out.shape[1]
         if choices.stacks is not None:
@@ -474,7 +483,7 @@ class Cells:
             out[:, rows[inside], columns[inside]] += tints[:, rows[inside], columns[inside]]
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
-        """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
+        """`_pull` with a copy of the sample for each cell, whose gradients are then added to `results` in order."""
         covered, leaves = self.row >= 0, self.exits >= 0
         index = np.concatenate([self.row[covered], self.exits[leaves]])
         own, exits = np.full(self.row.shape, -1, np.int32), np.full(self.exits.shape, -1, np.int32)
@@ -495,7 +504,7 @@ class Cells:
 
 
 def _check_grids(shape: tuple[int, ...], **given: np.ndarray | None) -> None:
-    """Refuse arrays of another shape than the grid's; None, or an empty array, stands for an absent one."""
+    """Raise an InputError for arrays of another shape than the grid's; None, or an empty array, is absent."""
     for name, x in given.items():
         if x is not None and len(x) and x.shape != shape:
             raise InputError(f"{name} has shape {x.shape}; expected {shape}, as row says")
@@ -503,14 +512,14 @@ def _check_grids(shape: tuple[int, ...], **given: np.ndarray | None) -> None:
 
 @lru_cache
 def _scale_and_peak(settings: Settings) -> tuple[float, float]:
-    """The exponent's factor, and the weight of a splat on its cell's centre along one axis."""
+    """The exponent's factor 1 / 2σ², and the weight of a splat on its cell's centre along one axis."""
     scale = 1 / (2 * settings.sigma**2)
     return scale, math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in (-1, 0, 1))
 
 
 @lru_cache
 def _reach(settings: Settings) -> float:
-    """The largest offset of samples, pixels along x and y, at which weights are sure to sum up to one."""
+    """The largest offset of samples, pixels along x and y, at which weights are sure to sum up to one; −1 if never."""
     if settings.epsilon < Visible.LEAST_EPSILON:
         return -1.0
     scale, low, high = 1 / (2 * settings.sigma**2), 0.0, 1.0

@@ -37,14 +37,17 @@ class Rules(NamedTuple):
 
     @classmethod
     def of(cls, extent: Any) -> Rules:
-        """The rules for an extent of the fronts' depths, in its dtype; it includes the camera's 0."""
+        """The rules, in the dtype of `extent`: largest less least depth of the fronts, the camera's 0 included."""
         kind = type(extent)
         least, (*numbers, slack, _) = kind(Visible.TIE) * extent, Visible.CROSSINGS
         return cls(least, *map(kind, numbers), slack=kind(slack) * least)
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
-    """Mark in `kept` (K, H, W) the samples that `rts.splatting.crossings.sheets` keeps."""
+    """Mark in `kept` (K, H, W) the samples that `rts.splatting.crossings.sheets` keeps; other marks stay.
+
+    `extent` is the largest less the least depth of the fronts, the camera's 0 included.
+    """
     _, height, width = covered.shape
     bits, some = _no_pairs(height, width)
     parallel(_find_candidates, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
@@ -60,7 +63,8 @@ def _no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> tuple[np.ndarray, np.ndarray]:
     """Bits (H, W) uint8 of the steps from each cell to the other of a pair, and marks (H,) of rows that have some.
 
-    Both have no rows if there are no pairs.
+    A pair is two neighbouring cells between which a line of crossing runs. Both arrays have no rows if there are no
+    pairs.
 
     Args:
         positions: (N, 3).
@@ -83,7 +87,7 @@ def nothing(width: int) -> tuple[np.ndarray, np.ndarray]:
 
 @loop
 def gather(start, stop, positions, row, some, z, gap):
-    """Fill the rows of depths and gaps, within [start, stop), that pairs depend on.
+    """Fill those of the rows [start, stop) of depths and gaps that pairs depend on; others stay as they are.
 
     Args:
         start: first row, an index of z.
@@ -92,7 +96,7 @@ def gather(start, stop, positions, row, some, z, gap):
         row: (K, H, W).
         some: (H,), True for rows that have pairs.
         z: (2, H + 2 BORDER, W), to be filled with depths of the first two layers, where a cell has both.
-        gap: (H + 2 BORDER, W + 2 BORDER), to be filled with their distance, or infinity.
+        gap: (H + 2 BORDER, W + 2 BORDER), to be filled with the distance of these depths, or infinity.
     """
     height = len(some)
     for at in range(start, stop):
@@ -105,7 +109,7 @@ def gather(start, stop, positions, row, some, z, gap):
 
 @loop
 def find_in_cells(start, stop, positions, row, rules, bits, some):
-    """Find pairs whose first cell lies in rows [start, stop)."""
+    """Mark pairs whose first cell lies in rows [start, stop) in `bits` (H, W), and their rows in `some` (H,)."""
     _, height, width = row.shape
     z, gap, most = _window(width, positions.dtype)
     for top in range(start, stop, ROWS):
@@ -122,7 +126,10 @@ def find_in_cells(start, stop, positions, row, rules, bits, some):
 
 @loop
 def _find_candidates(start, stop, covered, depth, rules, bits, some):
-    """Find possible pairs whose first cell lies in rows [start, stop), whichever hidden layers are left out later."""
+    """Find possible pairs whose first cell lies in rows [start, stop), whichever hidden layers are left out later.
+
+    Marks them as `find_in_cells` does.
+    """
     _, height, width = covered.shape
     z, gap, most = _window(width, depth.dtype)
     for top in range(start, stop, ROWS):
@@ -142,14 +149,14 @@ def _find_candidates(start, stop, covered, depth, rules, bits, some):
 
 @compiled
 def _window(width, kind):
-    """Empty arrays for a window of rows with its border: depths, gaps, and the largest gaps."""
+    """Arrays, not yet filled, for a window of rows with its border: depths, gaps, and the largest gaps."""
     rows = ROWS + 2 * BORDER
     return np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind), np.empty((rows, width), kind)
 
 
 @compiled
 def _load_cells(z, gap, positions, row, y):
-    """Fill depths (2, W) and gaps of a row, for its cells of two layers; return True if there are any."""
+    """Fill depths z (2, W) and gaps of row y at its cells of two layers; return True if there are any. Others stay."""
     width, some = row.shape[2], False
     for left in range(0, width, CHUNK):
         right = min(left + CHUNK, width)
@@ -192,7 +199,10 @@ def _any(flags):
 
 @compiled
 def _find(start, stop, z, gap, most, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, whose first cell lies in rows [start, stop), in a window of rows."""
+    """Mark pairs, or `candidates`, whose first cell lies in rows [start, stop), in `bits`, and their rows in `some`.
+
+    `z` and `gap` are a window that begins BORDER rows before `start`; `most` is working memory.
+    """
     width = z.shape[2]
     rows, marks = stop - start + 2 * BORDER, np.empty(width, np.uint8)
     for y in range(BORDER - 2, rows - BORDER + 2):
@@ -212,7 +222,7 @@ def _find(start, stop, z, gap, most, rules, candidates, bits, some):
 
 @compiled
 def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
-    """Find pairs, or `candidates`, of which one cell is (y, x) of a window of rows."""
+    """Mark pairs, or `candidates`, of which one cell is (y, x) of a window that begins BORDER rows before `start`."""
     rows, width = z.shape[1:]
     for n in range(8):
         u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
@@ -233,7 +243,7 @@ def _find_around(start, y, x, z, gap, rules, candidates, bits, some):
 
 @compiled
 def _largest(most, before, here, after):
-    """The largest finite gap of each cell and its neighbours in the row, or −1."""
+    """Fill `most` with the largest finite gap of each cell and its two neighbours in the row, or −1."""
     infinity, none = most.dtype.type(np.inf), most.dtype.type(-1)
     for x in range(len(most)):
         a, b, c = before[x], here[x], after[x]
@@ -259,7 +269,7 @@ def _suspect(marks, gap, above, level, below):
 
 @compiled
 def _crosses(z, gap, rules, y, x, v, u):
-    """True if a line of crossing runs between a cell and the one a step (u, v) farther on."""
+    """True if a line of crossing runs between cell (y, x) of a window and the one a step (u, v) farther on."""
     ratio = _ratio(z, gap, rules, y, x, v, u)
     if not ratio < rules.largest:
         return False
@@ -270,7 +280,8 @@ def _crosses(z, gap, rules, y, x, v, u):
 def _grows(b, h, t, a, candidates):
     """True if the gap grows beyond two cells as that of a pair must (see `_suspect`), rounding allowed for.
 
-    It must grow on both sides; of `candidates`, on one.
+    h and t are the gaps of the two cells, b and a of those before and after. The gap must grow on both sides; of
+    `candidates`, on one.
     """
     infinity, most = np.float32(np.inf), np.float32(0.52) * (h + t)
     before, after = abs(b - h - h - t), abs(a - t - t - h)
@@ -283,7 +294,7 @@ def _grows(b, h, t, a, candidates):
 
 @compiled
 def has_two(gap, y, x):
-    """True if a cell has two layers."""
+    """True if cell (y, x) has two layers; `gap` has a border of columns."""
     return gap[y, x + BORDER] < np.inf
 
 

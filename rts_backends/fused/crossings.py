@@ -49,12 +49,12 @@ class Crossings(NamedTuple):
         return np.repeat(rows, np.diff(self.offsets))[own], self.columns[own]
 
     def still(self, offsets: np.ndarray, columns: np.ndarray, changes: np.ndarray) -> None:
-        """Clear the changes of these targets in a list of `Outlines`: lines of crossing replace them.
+        """Clear the changes of these targets in a list of L `Outlines`: lines of crossing replace them.
 
         Args:
             offsets: (H + 1,), where the targets of each row begin in that list.
-            columns: (M,) of that list.
-            changes: (M, 2, 4) of that list, changed in place.
+            columns: (L,) of that list.
+            changes: (L, 2, 4) of that list, changed in place.
         """
         parallel(_still, len(offsets) - 1, *self[:2], offsets, columns, changes, work=4 * len(columns))
 
@@ -77,7 +77,7 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
 
 
 def listed(grid: Grid, choices: Any, extent: np.floating, bits: np.ndarray, some: np.ndarray) -> Crossings:
-    """The targets beside lines of crossing.
+    """The targets beside lines of crossing, and the terms of their derivatives.
 
     Args:
         grid: the samples.
@@ -137,7 +137,7 @@ def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, 
 
 @compiled
 def _place(columns, m, mixed, y, x):
-    """The index of a mixed target in the list of mixed targets, searched from m on; any index if it is not mixed."""
+    """The index of a mixed target in the list of mixed targets, searched from m on; m itself if it is not mixed."""
     while mixed[y, x] and columns[m] < x:
         m += 1
     return m
@@ -174,7 +174,7 @@ def _fill(
 
 @compiled
 def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
-    """Sort the sources of a target into sheets, and fill in the sheets' slopes; True if both succeed."""
+    """Sort the sources of a target into `sheets` (9,), and fill the sheets' `slopes` (4,); True if both succeed."""
     _sort(sheets, row, mixed[y, x], ranges, m, around, y, x)
     at = y + BORDER, x
     return _incline(slopes, sheets, z, gap, *at) and _complete(sheets, slopes, z, gap, rules.fit, *at)
@@ -196,7 +196,10 @@ def _sort(sheets, row, mixed, ranges, m, around, y, x):
 
 @compiled
 def _incline(slopes, sheets, z, gap, y, x):
-    """Fill the slopes of sheets a and b, each along x and y; False if no sorted neighbour along an axis has both."""
+    """Fill the slopes (4,) of sheets a and b, each along x and y.
+
+    Returns False if along one axis no neighbour is both sorted and has two layers.
+    """
     for axis in range(2):
         # The sources ahead and behind.
         ahead, behind = (3, 5) if axis == 0 else (1, 7)
@@ -218,7 +221,10 @@ def _incline(slopes, sheets, z, gap, y, x):
 
 @compiled
 def _complete(sheets, slopes, z, gap, fit, y, x):
-    """Sort unsorted sources of two layers by the sheets' planes through the target; True if all get sorted."""
+    """Sort sources left in neither sheet, if they have two layers, by the sheets' planes through the target.
+
+    Returns True if all get sorted.
+    """
     kind = slopes.dtype.type
     gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
     square = gx * gx + gy * gy
@@ -243,7 +249,7 @@ def _complete(sheets, slopes, z, gap, fit, y, x):
 
 @compiled
 def _weigh(d, result, slopes, grid, y, x):
-    """Fill entry d of `result`, the terms of a target's derivative."""
+    """Fill entry d of `result`, the terms of a target's derivative; its column becomes −1 if a sheet has no weight."""
     rgba, row, kind = grid.rgba, grid.row, grid.positions.dtype.type
     zero, one, slope = kind(0), kind(1), kind(2) * grid.scale * grid.gamma
     weights, colors, sheets = result.weights[d], result.colors[d], result.sheets[d]
@@ -308,7 +314,7 @@ def change_of(pixel, d, lines, grid, ranges, sums, y, t_positions, t_rgba):
 
 @loop
 def push(start, stop, grid, ranges, sums, lines, t_positions, t_rgba, border, out):
-    """Write the derivatives of listed targets into rows [start, stop) of the tangents (T, H, W, 4)."""
+    """Write the derivatives of listed targets into rows [start, stop) of `out`, the tangents (T, H, W, 4)."""
     for y in range(start + border, stop + border):
         for d in range(lines.offsets[y], lines.offsets[y + 1]):
             x = lines.columns[d] - border
@@ -319,9 +325,9 @@ def push(start, stop, grid, ranges, sums, lines, t_positions, t_rgba, border, ou
 
 @loop
 def pull(rgba, row, lines, border, g, g_positions, g_rgba):
-    """Add listed targets' shares to the gradients of positions (N, 3) and rgba (N, 4); one of no rows is not wanted.
+    """Add listed targets' shares to the gradients of positions (N, 3) and rgba (N, 4), from the image's `g` (H, W, 4).
 
-    Mixed targets add nothing to the gradient of rgba here.
+    A gradient of no rows is not wanted. Mixed targets add nothing to the gradient of rgba here.
     """
     zero = g.dtype.type(0)
     for y in range(border, len(g) + border):

@@ -28,7 +28,7 @@ def specification(
     *,
     settings: Settings,
 ) -> Array:
-    """The image, with the border cut off, in array code; operands without rows are absent."""
+    """The image (H, W, 4) less the border, in array code; operands without rows are absent. `wanted` is not read."""
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
@@ -89,12 +89,12 @@ def _pull(
 
 
 def used(operands: Sequence[np.ndarray]) -> int:
-    """The number of rows in use: one more than the last row that cells refer to."""
+    """The number of rows in use: one more than the last row that cells refer to, at least 1."""
     return rows_of(operands[2], *operands[6:8])
 
 
 def rows_of(*cells: np.ndarray | None) -> int:
-    """One more than the last row of samples that cells refer to; at least 1."""
+    """One more than the largest number in arrays of cells, the last row of samples that they refer to; at least 1."""
     return 1 + max(int(x.max(initial=0)) for x in cells if x is not None)
 
 

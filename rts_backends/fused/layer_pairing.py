@@ -1,7 +1,7 @@
 """Pairing of layers where those of different surfaces meet.
 
-A target is mixed where one of its sources is not paired front to front. Few are. Each has a table of its own: for
-every source and each of the buffers in front, at the surface and behind, a range of the source's layers.
+A target is mixed where one of its sources is not paired front to front. Few targets are mixed. Each has a table of its
+own: for every source and each of the buffers in front, at the surface and behind, a range of the source's layers.
 
 Depths are compared in the dtype of the positions and in the order of `rts.splatting`, so that ties fall alike.
 """
@@ -55,17 +55,17 @@ def _any(states):
 
 @loop
 def narrow(start, stop, mixed, wanted, kept, counts):
-    """Leave out mixed targets of rows [start, stop) that decide nothing for wanted ones.
+    """Copy the marks `mixed` of rows [start, stop) to `kept`, without targets that decide nothing for wanted ones.
 
-    The motion of an outline depends on pairs up to two cells away.
+    Those have no wanted target within two cells: the motion of an outline depends on pairs so far away.
 
     Args:
         start: first row.
         stop: end of the rows.
-        mixed: (H, W) of `find`.
-        wanted: (H, W) uint8.
+        mixed: (H, W) uint8, of `find` or `uniform_cells.survey`.
+        wanted: (H, W) uint8, 1 for wanted targets.
         kept: (H, W) uint8, to be filled.
-        counts: (H,), to be filled.
+        counts: (H,), to be filled with the number of marks kept in each row.
     """
     height, width = mixed.shape
     for y in range(start, stop):
@@ -97,8 +97,9 @@ def choose(
 ):
     """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`.
 
-    Marks go by depths alone; with `facing` (K, H, W), which may have no layers, more fronts may pair. The directions
-    in which fronts end before others are added to `ends` (H, W) of `survey`, which may have no rows.
+    `choices` are the ranges. Marks go by depths alone; with `facing` (K, H, W), which may have no layers, more fronts
+    may pair. States of listed targets become EMPTY. The directions in which fronts end before others are added to
+    `ends` (H, W) of `survey`, which may have no rows.
     """
     positions, row = grid.positions, grid.row
     layers, height, width = row.shape
@@ -147,7 +148,7 @@ def choose(
 
 @compiled
 def _sides(sides, facing, y, x):
-    """Fill the sides (K, 9) that the layers of a target and its sources show; 0 beyond the image."""
+    """Fill `sides` (K, 9) with the sides that the layers of a target's nine sources show; 0 beyond the image."""
     layers, height, width = facing.shape
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
@@ -160,7 +161,8 @@ def _sides(sides, facing, y, x):
 def _pairing(z, n, target, sides):
     """The number s of `rts.splatting.Visible` before `continues`, and the distance of the depths that it pairs.
 
-    `sides` (K, 9) are those of the layers of all sources; 0 if unknown, and everywhere in `Multi`.
+    `z` (K, 9) are depths of all sources, `target` (K,) of the target; `sides` (K, 9) those of all sources' layers, 0 if
+    unknown, and everywhere in `Multi`.
     """
     a, b = 0, 0
     front = z[0, n]
@@ -177,7 +179,10 @@ def _pairing(z, n, target, sides):
 
 @compiled
 def opposite_sides(hidden, front, behind):
-    """True if a hidden layer shows the other side of a front's piece, and does not stand for layers behind it."""
+    """True if a hidden layer shows the other side of a front's piece; both are entries of `Cells.facing`.
+
+    The last of K covered layers may stand for layers behind it: False for it if the front lies `behind` it.
+    """
     if front == 0 or (hidden > 0) == (front > 0):
         return False
     return hidden == -front or (not behind and abs(hidden) == abs(front) + MORE_BEHIND)
@@ -185,7 +190,10 @@ def opposite_sides(hidden, front, behind):
 
 @compiled
 def _continues(positions, row, y, x, n, fronts, limit):
-    """True if one of two fronts lies within a limit of where the other's line leads: the source's or the target's."""
+    """True if a front, of source n or of the target, continues the other's line within a limit.
+
+    The line leads through the other front and that of the cell beyond it.
+    """
     _, height, width = row.shape
     v, u = n // 3 - 1, n % 3 - 1
     for steps, end, start in ((-1, fronts[n], fronts[4]), (2, fronts[4], fronts[n])):
@@ -198,7 +206,10 @@ def _continues(positions, row, y, x, n, fronts, limit):
 
 @compiled
 def _choose_visible(choice, shift, z, row, y, x, target):
-    """Ranges of `rts.splatting.Visible` for a covered target."""
+    """Fill the ranges `choice` (9, 3, 2), zeros before, that `rts.splatting.Visible` gives a target.
+
+    `shift` (9,) are the numbers s of its sources, 0 for an empty target.
+    """
     layers, height, width = row.shape
     m = layers
     for n in range(9):
@@ -224,7 +235,7 @@ def _choose_visible(choice, shift, z, row, y, x, target):
 
 @compiled
 def _ends_before_others(choice, row, y, x):
-    """Directions in which neighbours of a target are covered, and not paired front to front, as bits."""
+    """Directions in which neighbours of a target are covered, and not paired front to front, as bits of DIRECTIONS."""
     _, height, width = row.shape
     bits = 0
     for n in range(9):

@@ -20,7 +20,7 @@ def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:
 
 @compiled
 def cost_and_weight(residual, loss):
-    """Cost s² ρ((r / s)²) of a residual r, for a loss ρ of scale s; and the weight ρ'."""
+    """Cost s² ρ((r / s)²) of a residual r, for a loss ρ of scale s, given `in_numbers`; and the weight ρ' there."""
     place, scale = loss
     one = type(scale)(1)
     if place == LINEAR or residual == 0:
@@ -39,7 +39,7 @@ def cost_and_weight(residual, loss):
 
 @compiled
 def curvature(weight, loss):
-    """The weight of a residual in the Hessian, the second result of `Loss.weights`."""
+    """The weight of a residual in the Hessian, the second result of `Loss.weights`, from its weight ρ'."""
     place, scale = loss
     share, one = weight, type(scale)(1)
     if place == SOFT_L1:

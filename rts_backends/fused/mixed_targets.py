@@ -9,7 +9,10 @@ from rts_backends.fused.rows import Grid, compiled, exp, loop
 
 @compiled
 def splat(grid, i, y, x, u, v):
-    """Weight of sample i of cell (y, x) at the target (u, v) farther on, and the offset from sample to target."""
+    """Weight of sample i of cell (y, x) at the target (u, v) farther on, and the offset x, y from sample to target.
+
+    The sample's own offset from its cell's centre is scaled by the calibration.
+    """
     positions, peak, gamma = grid.positions, grid.peak, grid.gamma
     kind, half = positions.dtype.type, positions.dtype.type(0.5)
     dx = kind(u) - gamma * (positions[i, 0] - (kind(x) + half))
@@ -19,7 +22,10 @@ def splat(grid, i, y, x, u, v):
 
 @compiled
 def sums_of(total, grid, y, x, choice):
-    """Fill `total` (3, 5) with a target's buffers: colours over the weight, taken as at least one; and the weight."""
+    """Fill `total` (3, 5) with a target's buffers: colours over the weight, taken as at least one; and the weight.
+
+    `choice` (9, 3, 2) are the target's `Choices.ranges`.
+    """
     rgba, row = grid.rgba, grid.row
     _, height, width = row.shape
     one = total.dtype.type(1)
@@ -60,7 +66,10 @@ def forward(start, stop, offsets, columns, sums, border, image):
 
 @loop
 def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
-    """Fill adjoints (M, 3, 5) of the sums of mixed targets, from the image's; zero for targets in the border."""
+    """Fill `adjoints` (M, 3, 5), gradients of mixed targets' sums before normalisation, from the image's `g` (H, W, 4).
+
+    They are zero for targets in the border.
+    """
     zero, one = g.dtype.type(0), g.dtype.type(1)
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
@@ -87,7 +96,7 @@ def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
 
 @compiled
 def _any(adjoints, d):
-    """True if any adjoint of a target's sums is not zero; beside wanted targets, many have zeros alone."""
+    """True if any adjoint of the sums of target d is not zero; beside wanted targets, many have zeros alone."""
     some = False
     for b in range(3):
         for c in range(5):
@@ -97,7 +106,10 @@ def _any(adjoints, d):
 
 @loop
 def pull(start, stop, grid, offsets, columns, choices, adjoints, g_positions, g_rgba):
-    """Add mixed targets' shares to the gradients of the samples of source rows [start, stop)."""
+    """Add mixed targets' shares to the gradients of the samples of source rows [start, stop), from `adjoints`.
+
+    `choices` are the ranges. A gradient of no rows is not wanted.
+    """
     height = grid.row.shape[1]
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
@@ -108,7 +120,7 @@ def pull(start, stop, grid, offsets, columns, choices, adjoints, g_positions, g_
 
 @compiled
 def _pull_target(d, column, v, grid, y, choices, adjoints, g_positions, g_rgba):
-    """`pull` from one target, v rows farther on, to the sources of row y."""
+    """`pull` from target d, which lies v rows farther on, to the sources of row y."""
     rgba, row, slope = grid.rgba, grid.row, grid.positions.dtype.type(2) * grid.scale * grid.gamma
     for u in range(-1, 2):
         x, n = column - u, 3 * (v + 1) + u + 1
@@ -132,7 +144,10 @@ def _pull_target(d, column, v, grid, y, choices, adjoints, g_positions, g_rgba):
 
 @loop
 def push(start, stop, grid, offsets, columns, choices, sums, tangents, border, out):
-    """Fill mixed targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
+    """Fill mixed targets of rows [start, stop) of `out` (T, H, W, 4).
+
+    `choices` are the ranges; `tangents` are those of positions (T, N, 3) and rgba (T, N, 4), without samples for zeros.
+    """
     changes = np.empty((len(out), 3, 5), out.dtype)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
@@ -156,7 +171,7 @@ def composited(total, change, c):
 
 @compiled
 def tint_of(pixel, total, grid, y, x, choice, t_rgba):
-    """Add to a pixel (4,) the change of a target along a tangent (N, 4) of colours."""
+    """Add to a pixel (4,) the change of target (y, x) along a tangent (N, 4) of colours."""
     # Weights do not change with colours: tangents are summed as colours are.
     change = np.empty((3, 5), total.dtype)
     tinted = Grid(grid.positions, t_rgba, grid.row, grid.scale, grid.peak, grid.gamma)
@@ -167,7 +182,10 @@ def tint_of(pixel, total, grid, y, x, choice, t_rgba):
 
 @compiled
 def changes_of(changes, total, grid, y, x, choice, t_positions, t_rgba):
-    """Fill `changes` (T, 3, 5), tangents of `total`, the normalised sums of a target's buffers."""
+    """Fill `changes` (T, 3, 5), tangents of `total`, the normalised sums of a target's buffers and their weights.
+
+    Tangents of positions (T, N, 3) and rgba (T, N, 4) may have no samples: then they are zeros.
+    """
     rgba, row = grid.rgba, grid.row
     _, height, width = row.shape
     zero, one = total.dtype.type(0), total.dtype.type(1)

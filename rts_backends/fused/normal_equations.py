@@ -53,7 +53,8 @@ OPACITY = 3 * PITCH
 def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tuple[Array, ...] | None:
     """`normal_equations` of arrays of any engine on the host, traced or not.
 
-    None for arrays on other devices or of several dtypes, or if a pixel has more cells than a tile.
+    None for arrays on other devices, for positions and rgba that are not both float32 or both float64, or if a pixel
+    has more cells than a tile along an axis.
 
     Args:
         settings: the splatter, as numbers.
@@ -93,13 +94,13 @@ def normal_equations(
     background: np.ndarray | None,
     loss: Loss,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean loss of the n residuals weight · (image − target), JᵀSJ / n and JᵀWr / n, float64.
+    """Mean loss of the n residuals r = weight · (image − target); JᵀSJ / n (T, T); and JᵀWr / n (T,), float64.
 
     Args:
         cells: the samples, s · H times s · W without their border; a pixel of the image is the mean of s² of them.
         t_positions: (T, N, 3), tangents of their positions along T directions.
         t_rgba: (T, N, 4) of their colours; None for zeros.
-        target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
+        target: (H, W, C), of alpha (C = 1), colours (3) or both (4); n = H · W · C.
         weights: (H, W, 1) or (H, W, C); None for ones.
         background: (H, W, 4), the image that this one is composited onto, or None.
         loss: the loss of the residuals; W and S are diagonal matrices of its `weights`.
@@ -133,9 +134,10 @@ def _any(tangents: np.ndarray) -> bool:
 def _accumulate(
     start, stop, planes, plain, grid, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
 ):
-    """Fill `sums` (B, T + 1, T + 1) for bands [start, stop): products of T tangents and, last, the residuals.
+    """Add to `sums` (B, T + 1, T + 1), zeros, for bands [start, stop): products of T tangents and, last, the residuals.
 
-    Only lower triangles are filled. Each pixel is the mean of `fine` rows and columns of cells.
+    Only lower triangles are filled; their last number is the sum of losses. Each pixel is the mean of `fine` rows and
+    columns of cells.
     """
     positions, rgba, row = grid.positions, grid.rgba, grid.row
     t_positions, t_rgba = tangents
@@ -195,7 +197,7 @@ def _accumulate(
 
 @compiled
 def _change(change, value, sources, moving, layers, y, count, planes):
-    """Fill values and tangents of a row of a tile by the stencil."""
+    """Fill `value` and `change`, a row of a tile of the image and its tangents (T, ·), by the stencil."""
     normalised_sums(value, sources, layers, y, count)
     for n in range(len(change)):
         change_row(change[n], moving[n], sources, value, layers, y, count, planes)
@@ -204,7 +206,7 @@ def _change(change, value, sources, moving, layers, y, count, planes):
 
 @compiled
 def _add_means(to, row, fine, count):
-    """Add a row of cells to the means of its pixels."""
+    """Add a row of cells to `to`, the means of the `count` pixels that it belongs to, `fine` cells to a pixel."""
     share = to.dtype.type(1 / fine**2)
     for c in range(4):
         for j in range(count):
@@ -216,7 +218,7 @@ def _add_means(to, row, fine, count):
 
 @compiled
 def _mix(change, value, grid, choices, tangents, border, y, left, count, changes):
-    """Replace the stencil's values and tangents of the mixed targets of a row of a tile."""
+    """Replace the stencil's `value` and `change` at the mixed targets of a row of a tile."""
     offsets, columns = choices.offsets, choices.columns
     one = value.dtype.type(1)
     for d in range(offsets[y + border], offsets[y + border + 1]):
@@ -234,7 +236,7 @@ def _mix(change, value, grid, choices, tangents, border, y, left, count, changes
 
 @compiled
 def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
-    """Add the changes by moving outlines in a row of a tile."""
+    """Add the changes by moving outlines to `change` in a row of a tile."""
     for d in range(outlines.offsets[y + border], outlines.offsets[y + border + 1]):
         j = outlines.columns[d] - border - left
         if not 0 <= j < count:
@@ -247,7 +249,7 @@ def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
 
 @compiled
 def _move_lines(change, grid, choices, crossings, tangents, border, y, left, count):
-    """Replace the derivatives of targets beside lines of crossing in a row of a tile."""
+    """Replace `change` at targets beside lines of crossing in a row of a tile."""
     t_positions, t_rgba = tangents
     pixel = np.empty(4, change.dtype)
     for d in range(crossings.offsets[y + border], crossings.offsets[y + border + 1]):
@@ -272,9 +274,10 @@ def _counts(weights):
 
 @compiled
 def _settle(change, value, rgba, t_rgba, settled, moving):
-    """Fill values and tangents of targets of a row of a tile that have one colour (`settled`, an index of rgba).
+    """Fill `value` and `change` at targets of a row of a tile that show a sample's colour: `settled`, its index, or −1.
 
-    Returns True if their tangents may differ from zero.
+    Unless `moving`, `change` is cleared before, if colours have tangents. Returns True if the filled tangents may
+    differ from zero.
     """
     some, colored = False, t_rgba.shape[1] > 0
     for j in range(len(settled)):
@@ -329,7 +332,7 @@ def _multiply(sums, products, change, value, fields, loss, y, left, count, chang
 
 @compiled
 def _weigh(products, many, loss, count):
-    """Scale tangents and residuals to those of a loss's normal equations; return the sum of losses.
+    """Scale tangents and residuals, in place, to those of a loss's normal equations; return the sum of losses.
 
     Args:
         products: (many + 2, ·), tangents, residuals, and a row that is overwritten.

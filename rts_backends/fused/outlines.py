@@ -1,8 +1,9 @@
 """Derivatives of the compiled `Visible` by moving outlines; these move as `rts.splatting.rims` says.
 
 Let v̂ be the motion of the outline beside a cell, and v that of its front. A source of weight w adds to a target's
-derivative ∂w · (v̂ − v), times the change of the target's colour with the coverage of one buffer, if the buffer covers
-the target in part. Gradients add up in one order: every other band of rows first, then those between.
+derivative ∂w · (v̂ − v), times the change of the target's colour with the coverage of one buffer (in front, or at the
+surface), if the buffer covers the target in part. Gradients add up in one order: every other band of rows first, then
+those between.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ BAND = 16
 NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """The coverage that a source gives to a target.
 
-NOTHING; that of the buffer in front, moving with the source's outline; that of the surface, moving with the target's
-outline; that of the surface, over nothing or another part, moving with the source's outline."""
+NOTHING: none. FRONT: that of the buffer in front, moving with the source's outline. JOINED: that of the surface,
+moving with the target's outline. SURFACE: that of the surface, over nothing or another part, moving with the
+source's outline."""
 
 NEAR = 1e-3
 """Exponents below which four terms of its series give the exponential in double precision."""
@@ -50,7 +52,8 @@ class Outlines(NamedTuple):
         second: (1, H, W) int32, where β is −1 a second partner: the mean of both motions counts; or no entries.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
         columns: (M,) int32, the targets' columns.
-        gives: (M, 9) uint8, the kind of coverage from each source; source 3 (v + 1) + (u + 1) lies at −(u, v).
+        gives: (M, 9) uint8, the coverage from each source, NOTHING to SURFACE; source 3 (v + 1) + (u + 1) lies at −(u,
+            v).
         slopes: (M, 9, 2), derivatives of these sources' weights with their position.
         changes: (M, 2, 4), derivatives of the target's colour with coverage in front, and at the surface.
     """
@@ -66,7 +69,7 @@ class Outlines(NamedTuple):
 
 
 DIRECTIONS = LISTED - 1
-"""Bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends, in the `ends` of `survey`."""
+"""Mask of bits 3 (v + 1) + (u + 1), of directions (u, v) in which a front ends, in the `ends` of `survey`."""
 
 BESIDE = LISTED << 1
 """Mark in `ends` of targets that are not LISTED, but whose outline affects LISTED ones beside them."""
@@ -94,7 +97,7 @@ OUTWARD = np.array([_ordered(bits) for bits in range(LISTED)], np.int8)
 def narrow(start, stop, ends, wanted, kept, counts):
     """Copy `ends` to `kept` in rows [start, stop), without LISTED at targets that are not wanted.
 
-    Of these, targets beside wanted ones that are LISTED get the mark BESIDE.
+    A target that loses LISTED gets BESIDE instead if it lies beside a wanted target that is LISTED.
 
     Args:
         start: first row.
@@ -102,7 +105,7 @@ def narrow(start, stop, ends, wanted, kept, counts):
         ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`.
         wanted: (H, W) uint8, not 0 for targets whose colour is wanted.
         kept: (H, W) uint16, to be filled.
-        counts: (H,), to be filled with the number of listed targets.
+        counts: (H,), to be filled with the number of targets in each row that are still LISTED.
     """
     height, width = ends.shape
     for y in range(start, stop):
@@ -132,7 +135,7 @@ def _beside(ends, wanted, y, x):
 
 @compiled
 def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
-    """β and the partner's sample (see `Outlines`) of a cell whose front ends in some direction."""
+    """β and the partner's sample (see `Outlines`) of a cell whose front ends in some direction; (0, −1) for no rule."""
     layers, height, width = row.shape
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
     bits, front = ends[y, x] & DIRECTIONS, positions[row[0, y, x], 2]
@@ -197,7 +200,7 @@ def fill(
     ends,
     result,
 ):
-    """Find the motions of outlines in rows [start, stop), as `rts.splatting.rims.rules` does; list marked targets.
+    """Find the motions of outlines in rows [start, stop), as `rts.splatting.rims.rules` does; list LISTED targets.
 
     Args:
         start: first row.
@@ -214,7 +217,7 @@ def fill(
         ranges: (M, 9, 3, 2).
         sums: (M, 3, 5).
         ends: (H, W) of `uniform_cells.survey` and `layer_pairing.choose`, or of `narrow`.
-        result: `Outlines`, to be filled but for its offsets.
+        result: `Outlines`, to be filled but for `offsets` and `second`.
     """
     beta, partner, _, offsets, columns, gives, slopes, changes = result
     positions, row, peak = grid.positions, grid.row, grid.peak
@@ -267,9 +270,9 @@ def _any(ends):
 
 @compiled
 def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
-    """Fill the slopes of the weights of the fronts around a target, and their kinds of coverage if none is mixed.
+    """Fill `slopes`, of the weights of the fronts around target d, and `gives` as if the target were not mixed.
 
-    Returns the sums of their colours and weights.
+    Returns the sums of the fronts' weighted colours (four numbers), and of their weights.
     """
     positions, rgba, row, scale, _, gamma = grid
     _, height, width = row.shape
@@ -301,7 +304,10 @@ def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
 
 @compiled
 def _change(gives, changes, d, total):
-    """Fill the derivative of a target's colour with its coverage, to which all fronts around it add."""
+    """Fill the derivative of target d's colour with its coverage, to which all fronts around it add.
+
+    A target that is not covered in part has zeros, and `gives` becomes NOTHING.
+    """
     zero, one = changes.dtype.type(0), changes.dtype.type(1)
     partial = zero < total[4] < one
     over = one / total[4] if partial else zero
@@ -319,7 +325,10 @@ def _clear(gives, d):
 
 @compiled
 def _change_mixed(changes, d, sums, m):
-    """Fill the derivatives of a mixed target's colour with its buffers' coverage; return which buffers are partial."""
+    """Fill the derivatives of a mixed target's colour with its buffers' coverage.
+
+    Returns two marks: True if the buffer in front, and the one at the surface, cover the target in part.
+    """
     zero, one = sums.dtype.type(0), sums.dtype.type(1)
     front, surface = zero < sums[m, 0, 4] < one, zero < sums[m, 1, 4] < one
     over = one / sums[m, 0, 4] if front else zero
@@ -333,7 +342,10 @@ def _change_mixed(changes, d, sums, m):
 
 @compiled(inline="always")
 def _list(gives, d, ranges, m, front, surface):
-    """Fill the kinds of coverage that a mixed target gets; `gives` is NOTHING before for sources without a front."""
+    """Fill `gives` of a mixed target, whose buffers cover it in part as `front` and `surface` say.
+
+    Before, `gives` is NOTHING for sources without a front, and only for these.
+    """
     for n in range(9):
         if gives[d, n] != NOTHING:
             if front and ranges[m, n, 0, 1] == 1:
@@ -344,7 +356,10 @@ def _list(gives, d, ranges, m, front, surface):
 
 @compiled
 def _part(gives, d, part, ends, y, x):
-    """Have sources of other parts than the target's move as their own outlines, if any: a gap may lie between."""
+    """Have sources of other parts than the target's move as their own outlines: a gap may lie between.
+
+    Sources without an outline give NOTHING.
+    """
     n = 0
     for v in range(-1, 2):
         for u in range(-1, 2):
@@ -355,7 +370,7 @@ def _part(gives, d, part, ends, y, x):
 
 @compiled
 def _outline(t_positions, row, beta, partner, second, y, x, axis):
-    """The motion v̂ of the outline beside a cell, along an axis."""
+    """The motion v̂ of the outline beside a cell along an axis, 0 or 1, if samples move as `t_positions` (N, 3)."""
     b, own = beta[y, x], t_positions[row[0, y, x], axis]
     if b == 0:
         return own
@@ -367,7 +382,7 @@ def _outline(t_positions, row, beta, partner, second, y, x, axis):
 
 @compiled
 def gain(d, t_positions, row, outlines, y):
-    """The growth of a target's coverage by moving outlines along a tangent, in front and at the surface."""
+    """The growth of target d's coverage by moving outlines along a tangent (N, 3): in front, and at the surface."""
     front, surface = outlines.slopes.dtype.type(0), outlines.slopes.dtype.type(0)
     x, rule = outlines.columns[d], (outlines.beta, outlines.partner, outlines.second)
     for n in range(9):
@@ -403,7 +418,7 @@ def push(start, stop, row, outlines, t_positions, border, out):
 
 
 def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_positions: np.ndarray) -> None:
-    """Add outlines' shares to the gradients of positions (N, 3), from the gradient of the image (H, W, 4)."""
+    """Add outlines' shares to the gradients of positions (N, 3), `g_positions`, from the image's `g` (H, W, 4)."""
     bands = -(-len(g) // BAND)
     for first in range(2):
         given = row, outlines, border, g, first, g_positions
@@ -424,7 +439,7 @@ def _pull(start, stop, row, outlines, border, g, first, g_positions):
 def _pull_rows(
     top, bottom, row, beta, partner, second, offsets, columns, gives, slopes, changes, border, g, g_positions
 ):
-    """`pull` of the targets of rows [top, bottom)."""
+    """`pull` of the targets of rows [top, bottom) of the cells."""
     width, zero = g.shape[1], g_positions.dtype.type(0)
     for y in range(top, bottom):
         for d in range(offsets[y], offsets[y + 1]):
@@ -441,7 +456,7 @@ def _pull_rows(
 
 @compiled
 def _pull_target(g_positions, row, beta, partner, second, gives, slopes, d, y, x, front, surface):
-    """`pull` of a target, from the gradients of the coverage of its buffers in front and at the surface."""
+    """`pull` of target d, from the gradients `front` and `surface` of its buffers' coverage."""
     zero = g_positions.dtype.type(0)
     joined_x, joined_y = zero, zero
     for n in range(9):
@@ -466,7 +481,7 @@ def _pull_target(g_positions, row, beta, partner, second, gives, slopes, d, y, x
 
 @compiled(inline="always")
 def _lead(g_positions, row, beta, partner, second, y, x, g_x, g_y):
-    """Pass on the gradient of an outline's motion relative to its front: to the front's sample and its partners."""
+    """Add the gradient of v̂ − v, an outline's motion less its front's, to the front's sample and its partners."""
     b = beta[y, x]
     if b != 0:
         i, j = row[0, y, x], partner[y, x]

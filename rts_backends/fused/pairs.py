@@ -1,4 +1,4 @@
-"""Mixed targets, found by depths: targets with a source that is not paired front to front."""
+"""Mixed targets, found by depths: cells of which one of the nine sources is not paired front to front."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 from rts.plugin_api.loops import compiled
 
 BLOCK = 16
-"""Columns that share one mark of nearby hidden layers."""
+"""Columns of cells that share one mark of nearby hidden layers."""
 
 
 @compiled
 def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
-    """Mark the mixed targets of a row; return their number.
+    """Mark the mixed targets of a row in `mixed`; return their number.
 
     Args:
         mixed: (W,) uint8, to be filled.
@@ -22,7 +22,7 @@ def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
         y: the row.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
         z: (3, K, W + 2), depths of rows y − 1 to y + 1, one more at each side; filled where `loaded` has another row.
-        loaded: (3, B) int64, the row that z holds in each block.
+        loaded: (3, B) int64, the row that z holds in each block; updated.
         target: (K, BLOCK), working memory.
     """
     layers, _, width = row.shape
@@ -51,7 +51,7 @@ def mark(mixed, asked, positions, row, y, beyond, z, loaded, target):
 
 @compiled
 def _load(z, positions, row, y, first, last, beyond):
-    """Load depths of some cells of a row into z (K, ·): NaN for an empty cell, `beyond` for a missing layer."""
+    """Load depths of cells [first, last) of row y to z (K, ·): NaN for an empty cell, `beyond` for a missing layer."""
     layers, height, width = row.shape
     nothing = z.dtype.type(np.nan)
     for x in range(first, last):
@@ -71,7 +71,10 @@ def _load(z, positions, row, y, first, last, beyond):
 
 @compiled
 def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front, target_hidden):
-    """Mark targets where a hidden layer pairs nearer than the two fronts; rows begin one cell left of the targets'."""
+    """Mark targets of which a hidden layer, or one of a source, pairs nearer than the two fronts.
+
+    Rows of sources begin one cell left of the targets'.
+    """
     for x in range(len(marks)):
         t, q = target_front[x], target_hidden[x]
         some = _nearer(front0, hidden0, x, t, q) | _nearer(front1, hidden1, x, t, q) | _nearer(front2, hidden2, x, t, q)
@@ -80,7 +83,7 @@ def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front
 
 @compiled
 def _nearer(front, hidden, x, target_front, target_hidden):
-    """True if `_mark` marks a target for one of three sources in a row; comparisons with NaN are false."""
+    """True if `_mark` marks target x for one of three sources in a row; comparisons with NaN are false."""
     some = False
     for u in range(3):
         f, h = front[x + u], hidden[x + u]

@@ -21,7 +21,10 @@ MIXED, RING = 1, 2
 
 
 def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.ndarray:
-    """Marks (K, H, W) of samples needed by `Visible` or `Multi`, from covered (K, H, W) bool and depth (K, H, W)."""
+    """Marks (K, H, W) of the samples that `Visible` or `Multi` needs, from covered (K, H, W) bool and depth (K, H, W).
+
+    They are `covered` itself for a single layer, and for `Multi` with too small an epsilon.
+    """
     layers, height, _ = covered.shape
     visible, rims = settings.kind == "visible", settings.rims
     if layers == 1 or not (visible or settings.epsilon >= Visible.LEAST_EPSILON):
@@ -38,7 +41,7 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
 
 
 def _extremes(covered: np.ndarray, depth: np.ndarray) -> tuple[np.floating, np.floating]:
-    """The least and the largest of the covered depths and zero; none of them may be NaN."""
+    """The least and the largest of the covered depths and zero; no covered depth may be NaN."""
     if depth.dtype != np.float32:
         return depth.min(initial=0, where=covered), depth.max(initial=0, where=covered)
     lines = depth.shape[0] * depth.shape[1]
@@ -67,7 +70,10 @@ def _find_extremes(start, stop, bits, covered, extremes):
 
 @loop
 def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued, kept):
-    """Keep the fronts of rows [start, stop), and hidden layers around marks; around RING alone, the second layer."""
+    """Fill `kept` in rows [start, stop): True for fronts, and for hidden layers around marks.
+
+    Around marks MIXED all hidden layers are kept, around RING alone the second layer.
+    """
     layers, height, width = covered.shape
     # From row start − HALO on: depths with a border, NaN where there is nothing; least and largest front, least hidden.
     rows = stop - start + 2 * HALO
@@ -104,7 +110,10 @@ def _load(z, covered, depth):
 
 @compiled
 def _bound(least, largest, hidden, front, second):
-    """Fill least and largest front of each cell and its two neighbours, and their least depth of the second layer."""
+    """Fill `least` and `largest` with depths of the fronts of each cell and its two neighbours in the row.
+
+    Also fills `hidden` with the least depth of their second layers.
+    """
     infinity = least.dtype.type(np.inf)
     for x in range(len(least)):
         a, b, c = front[x], front[x + 1], front[x + 2]
@@ -121,7 +130,7 @@ def _bound(least, largest, hidden, front, second):
 
 @compiled
 def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
-    """Mark the targets of row r whose colour may depend on hidden layers."""
+    """Mark the targets of row r whose colour may depend on hidden layers, with MIXED; others get 0."""
     width = z.shape[2] - 2
     above, level, below = bounds[r - 1], bounds[r], bounds[r + 1]
     least, largest = (above[0], level[0], below[0]), (above[1], level[1], below[1])
@@ -145,7 +154,10 @@ def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
 
 @compiled
 def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2, hidden0, hidden1, hidden2, margin):
-    """Mark the covered targets, few, whose hidden layers are not all farther behind fronts than fronts are apart."""
+    """Mark covered targets, unless all hidden layers around lie farther behind the fronts than the fronts lie apart.
+
+    Few targets are marked.
+    """
     for x in range(len(least0)):
         a, b, c = least0[x], least1[x], least2[x]
         least = b if b < a else a
@@ -175,7 +187,10 @@ def _near(z, r, x, margin):
 
 @compiled
 def _continued(z, r, x, beyond, margin, continued):
-    """True if every source that is not nearest front to front continues the target's front along a line."""
+    """True if every source's front that does not pair with the target's by depth alone lies on a line with it.
+
+    Sources without a sample do not count. Depths `z` are a window of rows; `r` is the target's row in it.
+    """
     layers, rows, width = z.shape
     target = z[0, r, x + 1]
     for n in range(9):
@@ -201,7 +216,7 @@ def _continued(z, r, x, beyond, margin, continued):
 
 @compiled
 def _mark_ring(marks, above, level, below):
-    """Mark the cells of a row that lie beside empty ones."""
+    """Add RING to the marks of the covered cells of a row that lie beside empty ones."""
     for x in range(len(marks)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 2]
         if (around | below[x] | below[x + 1] | below[x + 2]) > level[x + 1]:
@@ -210,7 +225,7 @@ def _mark_ring(marks, above, level, below):
 
 @compiled
 def _spread(kept, covered, which, above, level, below):
-    """Keep covered cells around marks of the given kinds."""
+    """Fill `kept` (W,): covered cells with a mark out of `which` on them or beside them."""
     for x in range(len(kept)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         kept[x] = covered[x] & (((around | below[x] | below[x + 1] | below[x + 2]) & which) != 0)

@@ -47,7 +47,10 @@ _MANTISSA, _BIAS = np.int32(23), np.int32(127 << 23)
 
 
 def exp(x):
-    """The exponential of a number of at most 0; in float32 by arithmetic alone, so that loops become vector code."""
+    """The exponential of a number of at most 0.
+
+    Compiled, in float32, it is arithmetic alone, so that loops become vector code; numbers below −87 count as −87.
+    """
     return math.exp(x)
 
 
@@ -94,14 +97,14 @@ class Grid(NamedTuple):
 
 @compiled
 def slot(s, k, y, size):
-    """The slot, `size` numbers of s, of layer k in row y ≥ −2."""
+    """The slot, a view of `size` numbers of s, of layer k in row y ≥ −2."""
     start = (3 * k + (y + 3) % 3) * size
     return s[start : start + size]
 
 
 @compiled
 def tile(width, t):
-    """First column and number of columns of tile t."""
+    """First column and number of columns of tile t of a row of `width` cells."""
     count = (width + TILE - 1) // TILE
     return width * t // count, width * (t + 1) // count - width * t // count
 
@@ -120,7 +123,7 @@ def busy(states, y, first, count, least):
 
 @compiled
 def load(s, grid, k, y, first, count):
-    """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
+    """Fill a source's slot `s` with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
     positions, rgba, row, scale, peak, gamma = grid
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     _, height, width = row.shape
@@ -162,7 +165,7 @@ def add_row(to, s, v, count):
 
 @compiled
 def normalised_sums(total, sources, layers, y, count):
-    """Normalise both buffers of target row y: colours over the weight, taken as at least one, beside the weight."""
+    """Fill `total` with both buffers of target row y: colours over the weight, taken as at least one; the weight."""
     one = total.dtype.type(1)
     total[: min(layers, 2) * SUM] = total.dtype.type(0)
     for k in range(layers):
@@ -178,7 +181,7 @@ def normalised_sums(total, sources, layers, y, count):
 
 @compiled
 def composite(total, layers, count):
-    """Composite the surface over the buffer behind, in place of the surface's colours."""
+    """Composite the surface over the buffer behind, in `total`, in place of the surface's colours."""
     one = total.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -189,7 +192,7 @@ def composite(total, layers, count):
 
 @compiled
 def fill(s, rgba, cells, states, left, count):
-    """Fill planes of a row without busy targets: the colours of FLAT targets, and zeros."""
+    """Fill planes `s` of a row without busy targets: the colours of FLAT targets, and zeros at others."""
     for j in range(count):
         for c in range(4):
             s[c * PITCH + j] = rgba[cells[left + j], c] if states[left + j] == FLAT else s.dtype.type(0)

@@ -119,7 +119,7 @@ class _Fused(SummingSplatter):
         background: Array | None = None,
         loss: Loss | None = None,
     ) -> tuple[Array, Array, Array] | None:
-        """See `rts.Splatter`."""
+        """See `rts.Splatter`. None also for translucent `Visible`, and in subclasses that draw in their own way."""
         if not self._sweeps or (self.kind == "visible" and not splats.opaque):
             return None
         from rts_backends.fused import normal_equations

@@ -1,7 +1,8 @@
 """Targets of translucent layers: the rule of `rts.splatting.stacks`, compiled, and its first derivatives.
 
-Plans are made once: for each level of a target, the layers that each source gives to the buffers in front, at the
-level, and in the gap beside it. Layers that a source gives to one buffer lie over one another, as chains.
+Level t of a target is its own layer t, with the layers of its sources that pair with it. Plans are made once: for each
+level, the layers that each source gives to the buffers in front, at the level, and in the gap beside it. Layers that a
+source gives to one buffer lie over one another, as chains.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ class Stacks(NamedTuple):
 
     Attributes:
         levels: (M,) int32, the number of levels of each target.
-        plans: (M, K, 9, 3) int16, for each source the first layer that it gives to each buffer, or −1; see `ends_of`.
-        ends: (M, K, 9) int16, the layer behind those in front.
+        plans: (M, K, 9, 3) int16, for each source the first layer that it gives to each buffer, or −1; see `_last`.
+        ends: (M, K, 9) int16, for each source the layer behind those that it gives to the buffer in front.
         least: (M, K), the least weight that fills a buffer.
         sums: (M, K, 3, 5), of each buffer the colours over the weight, taken as at least `least`, and the weight.
-        images: (M, K + 1, 4), the image from each level on.
-        straight: (H, W) uint8, the number of layers of further targets, which need no plan (`straight_stacks.py`).
+        images: (M, K + 1, 4), the image from each level on; zero behind the last.
+        straight: (H, W) uint8, the number of layers of further targets, which need no plan (`straight_stacks.py`); 0 at
+            others.
     """
 
     levels: np.ndarray
@@ -39,7 +41,7 @@ class Stacks(NamedTuple):
 
     @classmethod
     def of(cls, count: int, layers: int, kind: np.dtype, straight: np.ndarray) -> Stacks:
-        """Room for `count` targets with plans."""
+        """Memory, not yet filled, for `count` targets with plans."""
         return cls(
             np.zeros(count, np.int32),
             np.empty((count, layers, 9, 3), np.int16),
@@ -52,13 +54,13 @@ class Stacks(NamedTuple):
 
 
 WEIGHT, ALONG_X, ALONG_Y, DEPTH, SOURCE = 4, 5, 6, 7, 8
-"""A layer of a source: four numbers of its colour, its weight, the offset from sample to target, its depth; and their
-number."""
+"""Indices of the numbers of a source's layer: four of its colour, then its weight, the offset from sample to target (x,
+y), its depth. SOURCE is how many there are."""
 
 
 @compiled
 def _load(sources, n, grid, y, x, u, v, beyond):
-    """Fill the layers (K, 8) of source n, from which (u, v) leads to a target; return their number."""
+    """Fill the layers (K, 8) of source n, from which (u, v) leads to target (y, x); return how many are covered."""
     positions, rgba, row = grid.positions, grid.rgba, grid.row
     layers, height, width = row.shape
     py, px, count = y - v, x - u, 0
@@ -136,7 +138,10 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
 
 @compiled
 def _share(t, counts, first, joins, nominal):
-    """The share of the weights of sources that take part in level t; −1 if none has a layer left."""
+    """The share of the weights of sources that take part in level t; −1 if none of these has a layer left.
+
+    `nominal` (9,) are the shares of sources whose samples lie on their cells' centres.
+    """
     share, some = nominal.dtype.type(0), False
     for n in range(9):
         if joins[n] <= t:
@@ -147,7 +152,7 @@ def _share(t, counts, first, joins, nominal):
 
 @compiled
 def _shift(shift, t, d, ranges, sources, sides, told, counts, first, joins):
-    """Fill the numbers s of sources that take part in level t."""
+    """Fill `shift` (9,) with the number s of each source that takes part in level t; see `_pair`. Others stay."""
     for n in range(9):
         if joins[n] > t or first[n] >= counts[n]:
             continue
@@ -159,7 +164,7 @@ def _shift(shift, t, d, ranges, sources, sides, told, counts, first, joins):
 
 @compiled
 def _load_sides(sides, facing, counts, y, x):
-    """Fill the sides (9, K) that the layers of the nine sources of a target show."""
+    """Fill `sides` (9, K) with the sides that the layers of the nine sources of a target show."""
     for n in range(9):
         for k in range(counts[n]):
             sides[n, k] = facing[k, y - n // 3 + 1, x - n % 3 + 1]
@@ -167,7 +172,10 @@ def _load_sides(sides, facing, counts, y, x):
 
 @compiled
 def _pair(sources, sides, told, counts, n, t, first, behind_only):
-    """The number s of a source at level t; only below 0 if `behind_only`, since it is known not to be at the level."""
+    """The number s of source n at level t: s ≥ 0 if its layer `first` + s pairs with the target's layer t.
+
+    For s < 0 its layer `first` pairs with the target's layer t − s. It is at most 0 if `behind_only`.
+    """
     layers = sources.shape[1]
     if t >= counts[4]:
         return 0
@@ -187,7 +195,7 @@ def _pair(sources, sides, told, counts, n, t, first, behind_only):
 
 @compiled
 def _plan(stacks, d, t, sources, counts, first, joins, shift):
-    """Fill the plan of a level."""
+    """Fill the plan of level t of target d: `plans` and `ends` of all nine sources."""
     plans, ends, layers = stacks.plans, stacks.ends, sources.shape[1]
     least = layers
     for n in range(9):
@@ -218,7 +226,7 @@ def _plan(stacks, d, t, sources, counts, first, joins, shift):
 
 @compiled
 def _advance(t, layers, counts, first, joins, shift):
-    """The layers that sources have left behind a level."""
+    """Update, behind level t, the `first` layer that each source has left, and the level at which it `joins` again."""
     for n in range(9):
         if joins[n] > t:
             continue
@@ -233,7 +241,10 @@ def _advance(t, layers, counts, first, joins, shift):
 
 @compiled
 def _last(plans, ends, d, t, n, b, whole):
-    """The layer behind a chain of a source; layers that are not covered follow, and count for nothing."""
+    """The end of the chain of layers that source n gives to buffer b at level t: one more than its last layer.
+
+    It may exceed the number of layers; layers that are not covered count for nothing. `whole` is True at level K − 1.
+    """
     if b == 0:
         return ends[d, t, n]
     return plans[d, t, n, 1] + 1 if b == 1 and not whole else 32767
@@ -241,7 +252,7 @@ def _last(plans, ends, d, t, n, b, whole):
 
 @compiled
 def _sum(stacks, d, t, sources, counts, whole):
-    """Fill the sums of a level; `whole` if layers behind it count at once."""
+    """Fill the sums (3, 5) of level t of target d. If `whole`, at level K − 1, chains go on behind the level."""
     plans, ends, total = stacks.plans, stacks.ends, stacks.sums
     zero, one = total.dtype.type(0), total.dtype.type(1)
     for b in range(3):
@@ -262,7 +273,7 @@ def _sum(stacks, d, t, sources, counts, whole):
 
 @compiled
 def _composite(stacks, d, levels):
-    """Fill the images of a target from each level on."""
+    """Fill the images of target d from each of its levels on, the last first."""
     sums, images = stacks.sums, stacks.images
     one = sums.dtype.type(1)
     for c in range(4):
@@ -275,7 +286,7 @@ def _composite(stacks, d, levels):
 
 @compiled
 def _under(sums, images, coverage, d, t, c):
-    """A channel of the image of a level without what is in front."""
+    """A channel of the image of level t without the buffer in front."""
     one = sums.dtype.type(1)
     through = (coverage - sums[d, t, 1, 3]) * images[d, t + 1, c]
     return sums[d, t, 1, c] + through + (one - coverage) * sums[d, t, 2, c]
@@ -288,7 +299,8 @@ def _under(sums, images, coverage, d, t, c):
 def recolor(start, stop, own, listed, offsets, columns, stacks, changes):
     """Fill `outlines.Outlines.changes` (L, 2, 4) of listed targets: how colours change with coverage.
 
-    `own` (H + 1,) and `listed` (L,) are rows and columns of these targets, `offsets` and `columns` those of stacks.
+    `own` (H + 1,) tells where the listed targets of each row begin, `listed` (L,) their columns; `offsets` and
+    `columns` tell so of targets with plans. Listed targets without a plan get zeros.
     """
     sums, images, one = stacks.sums, stacks.images, changes.dtype.type(1)
     for y in range(start, stop):
@@ -312,7 +324,7 @@ def recolor(start, stop, own, listed, offsets, columns, stacks, changes):
 
 @loop
 def forward(start, stop, offsets, columns, images, border, image):
-    """Fill targets of rows [start, stop) of the image (H, W, 4)."""
+    """Fill targets with plans in rows [start, stop) of the image (H, W, 4)."""
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d] - border
@@ -323,7 +335,7 @@ def forward(start, stop, offsets, columns, images, border, image):
 
 @loop
 def adjoint(start, stop, offsets, columns, stacks, border, g, adjoints):
-    """Fill the gradients (M, K, 3, 5) of the sums that are not normalised, from the image's (H, W, 4)."""
+    """Fill `adjoints` (M, K, 3, 5), gradients of the sums before normalisation, from the image's `g` (H, W, 4)."""
     levels, sums, images, least = stacks.levels, stacks.sums, stacks.images, stacks.least
     zero, own, below = g.dtype.type(0), np.empty(4, g.dtype), np.empty(4, g.dtype)
     for y in range(start, stop):
@@ -339,7 +351,10 @@ def adjoint(start, stop, offsets, columns, stacks, border, g, adjoints):
 
 @compiled
 def _adjoint_level(a, d, t, sums, images, least, own, below):
-    """Fill the gradients (3, 5) of a level's sums from that of its image (4,), and that of the next level's."""
+    """Fill the gradients `a` (3, 5) of a level's sums from `own` (4,), the gradient of its image.
+
+    Also fills `below` (4,), the gradient of the next level's image.
+    """
     zero, one = own.dtype.type(0), own.dtype.type(1)
     coverage, alpha = min(sums[d, t, 1, 4] / least[d, t], one), sums[d, t, 1, 3]
     shown, front, surface, covered = one - sums[d, t, 0, 3], zero, zero, zero
@@ -364,7 +379,10 @@ def _adjoint_level(a, d, t, sums, images, least, own, below):
 
 @loop
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
-    """Add targets' shares to the gradients of the samples of source rows [start, stop)."""
+    """Add targets' shares to the gradients of the samples of source rows [start, stop), from `adjoints`.
+
+    A gradient of no rows is not wanted.
+    """
     layers, height, _ = grid.row.shape
     kind = grid.positions.dtype
     source, products = np.empty((1, layers, SOURCE), kind), np.empty((layers, 2), kind)
@@ -383,7 +401,7 @@ def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_r
 
 @compiled
 def _pull_source(gradients, products, source, count, levels, plans, ends, adjoints, d, n):
-    """Add the gradients (K, 5) of the colours and weights of the n-th source (1, K, 8) of a target."""
+    """Add the gradients (K, 5) of the colours and weights of one source (1, K, 8), the n-th of target d."""
     for t in range(levels if count > 0 else 0):
         for b in range(3):
             first, last = max(plans[d, t, n, b], 0), 0
@@ -430,7 +448,10 @@ def _scatter(g_positions, g_rgba, gradients, source, count, row, y, x, slope):
 
 @loop
 def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
-    """Fill targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
+    """Fill targets with plans in rows [start, stop) of `out` (T, H, W, 4).
+
+    `tangents` are those of positions (T, N, 3) and rgba (T, N, 4); no samples stand for zeros.
+    """
     layers, kind = len(grid.row), out.dtype
     sources, counts = np.empty((9, layers, SOURCE), kind), np.empty(9, np.int64)
     moves = np.empty((9, layers, 5), kind)
@@ -454,7 +475,7 @@ def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
 
 @compiled
 def _load_tangents(moves, sources, counts, grid, y, x, t_positions, t_rgba):
-    """Fill the tangents (9, K, 5) of the colours and weights of a target's sources."""
+    """Fill `moves` (9, K, 5), the tangents of the colours and weights of a target's sources."""
     slope = moves.dtype.type(2) * grid.scale * grid.gamma
     moves[:] = 0
     for n in range(9):
@@ -471,7 +492,7 @@ def _load_tangents(moves, sources, counts, grid, y, x, t_positions, t_rgba):
 
 @compiled
 def _change(change, d, t, sources, counts, moves, stacks, whole):
-    """Tangents (3, 5) of the sums of a level: of normalised colours, and of the weight."""
+    """Fill `change` (3, 5), tangents of the sums of level t: of normalised colours, and of the weight."""
     sums, zero, one = stacks.sums, change.dtype.type(0), change.dtype.type(1)
     change[:] = zero
     for n in range(9):
@@ -497,7 +518,7 @@ def _change(change, d, t, sources, counts, moves, stacks, whole):
 
 @compiled
 def _over(grown, change, sums, images, least, d, t):
-    """From the tangent of the image of the next level to that of a level."""
+    """Turn `grown` (4,), the tangent of the next level's image, into that of the image of level t, in place."""
     zero, one = grown.dtype.type(0), grown.dtype.type(1)
     part = sums[d, t, 1, 4] / least[d, t]
     coverage, more = min(part, one), change[1, 4] / least[d, t] if part < one else zero

@@ -1,4 +1,7 @@
-"""Splatting onto plain targets, with all sources paired front to front: a 3 × 3 stencil, row by row of a tile."""
+"""Splatting onto plain targets, with all sources paired front to front: a 3 × 3 stencil, row by row of a tile.
+
+`rows.py` tells what a tile, a plane and a slot are.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,9 @@ from rts_backends.fused.rows import (
 from rts_backends.fused.uniform_cells import BUSY, FLAT, SETTLED
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
-"""Planes of a tangent to compute, as tuples whose length the compiler knows: all five, or alpha and the weight."""
+"""Planes of a tangent to compute: all five (colours, weight), or alpha and the weight alone.
+
+They are tuples, whose length the compiler knows."""
 
 X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 """Where planes X and Y begin in a tangent's slot, after five planes D, and the slot's length.
@@ -77,7 +82,7 @@ def forward(start, stop, grid, states, border, image):
 
 @compiled
 def _copy(image, rgba, cells, states, most):
-    """Copy the colour of their cell to the targets of a row with states up to `most`: they lie amid one colour."""
+    """Copy the colour of their cell's front to targets of states SETTLED to `most`: they lie amid one colour."""
     for x in range(len(image)):
         if SETTLED <= states[x] <= most:
             i = max(cells[x], 0)  # Without a sample any colour will do.
@@ -86,7 +91,10 @@ def _copy(image, rgba, cells, states, most):
 
 @compiled
 def add_adjoint(to, total, g, count):
-    """Adjoint of a buffer's sums from that of its normalised colours; zero for the weight where it is below one."""
+    """Fill `to` with the gradient of a buffer's sums, from `g`, that of its normalised colours.
+
+    The weight's is zero where the weight is below one.
+    """
     zero, one = to.dtype.type(0), to.dtype.type(1)
     for j in range(count):
         weight = total[ONE + j]
@@ -100,7 +108,7 @@ def add_adjoint(to, total, g, count):
 
 @compiled
 def adjoint_row(to, total, g, layers, count):
-    """Adjoints of both buffers' sums in a row, from the image's in `g`, which is overwritten."""
+    """Fill `to` with the gradients of both buffers' sums in a row, from the image's in `g`, which is overwritten."""
     one = to.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -116,7 +124,7 @@ def adjoint_row(to, total, g, layers, count):
 
 @compiled
 def load_image(s, image, states, least, border, y, first, count):
-    """Load cells of an image as planes; zero beyond it and at targets whose state is below `least`."""
+    """Load `count` cells of an image as planes `s`; zero beyond it and at targets whose state is below `least`."""
     height, width, _ = image.shape
     within = 0 <= y - border < height
     for j in range(count):
@@ -166,7 +174,10 @@ def gather(to, s, above, level, below, count):
 
 @loop
 def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
-    """Fill gradients of the samples of source rows [start, stop) from plain targets; each cell collects its own."""
+    """Write the gradients of the samples of source rows [start, stop) by plain targets, from the image's `g` (H, W, 4).
+
+    Each cell collects its own. A gradient of no rows is not wanted.
+    """
     row = grid.row
     layers, _, width = row.shape
     sources, total = np.empty(3 * layers * SOURCE, g.dtype), np.empty(SUMS, g.dtype)
@@ -201,7 +212,7 @@ def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
 
 @compiled
 def scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
-    """Pass the sums that a row of cells has gathered on to their samples."""
+    """Write the sums that a row of cells has gathered to the gradients of the cells' samples."""
     for j in range(count):
         i = row[left + j]
         if i >= 0:
@@ -216,7 +227,7 @@ def scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
 
 @compiled
 def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope, planes=COLORS):
-    """Fill a tangent's slot, from its source's slot `s` and the tangents of positions and colours."""
+    """Fill a tangent's slot `to`, from its source's slot `s` and the tangents of positions and colours; see `X`."""
     zero, lowest = to.dtype.type(0), 5 - len(planes)
     _, height, width = row.shape
     for j in range(count):
@@ -248,7 +259,7 @@ def load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, y, first
 
 @compiled
 def change_row(to, tangents, sources, total, layers, y, count, planes=COLORS):
-    """The tangent of target row y, in the first planes of `to`, from the slots of sources and of their tangents."""
+    """Fill the first planes of `to` with the tangent of target row y, from slots of sources and of their tangents."""
     to[: min(layers, 2) * SUM] = to.dtype.type(0)
     for k in range(layers):
         for v in range(-1, 2):
@@ -259,7 +270,7 @@ def change_row(to, tangents, sources, total, layers, y, count, planes=COLORS):
 
 @compiled
 def add_tangent_row(to, s, tangent, v, count, planes=COLORS):
-    """Add a source row's tangents to the tangents of a buffer's row: the derivative of `add_row`."""
+    """Add a source row's tangents to `to`, the tangents of a buffer's row: the derivative of `add_row`."""
     wy, dv = s[WY + (v + 1) * PITCH :], s.dtype.type(v)
     for j in range(count):
         w0, w1, w2 = s[WX + 2 * PITCH + j] * wy[j], s[WX + PITCH + j + 1] * wy[j + 1], s[WX + j + 2] * wy[j + 2]
@@ -275,7 +286,7 @@ def add_tangent_row(to, s, tangent, v, count, planes=COLORS):
 
 @compiled
 def tangent_row(to, total, layers, count, planes=COLORS):
-    """The tangent of a row of the image, in the first planes of `to`, from those of both buffers' sums."""
+    """Turn `to`, the tangents of both buffers' sums in a row, into that of the image, in the first planes."""
     zero, one, lowest = to.dtype.type(0), to.dtype.type(1), 5 - len(planes)
     for b in range(min(layers, 2)):
         d, s = to[b * SUM :], total[b * SUM :]
@@ -295,7 +306,7 @@ def tangent_row(to, total, layers, count, planes=COLORS):
 
 @loop
 def push(start, stop, grid, t_positions, t_rgba, states, border, out):
-    """Fill rows [start, stop) of the tangents (T, H, W, 4). Tangents that are zeros may be absent: (T, 0, ·)."""
+    """Fill rows [start, stop) of `out`, the tangents (T, H, W, 4). Tangents that are zeros may be absent: (T, 0, ·)."""
     layers, (many, _, width, _) = len(grid.row), out.shape
     sources, total, change = (
         np.empty(3 * layers * SOURCE, out.dtype),

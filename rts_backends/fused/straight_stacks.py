@@ -1,8 +1,8 @@
 """Targets of translucent layers whose nine sources pair layer by layer: most targets, without plans.
 
 Layer by layer, all sources are at the level of the target. So nothing lies in front of a level or in a gap, and the
-image is I = S + (W − A) · I' at each level, see `rts.splatting.stacks`. Each layer is splatted by a stencil of its own,
-in rows of tiles as in `stencil.py`.
+image is I = S + (W − A) · I' at each level (sums S of colours, W of weights, A of alpha; I' is the next level's image),
+see `rts.splatting.stacks`. Each layer is splatted by a stencil of its own, in rows of tiles as in `stencil.py`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ IMAGE = 4 * PITCH
 
 @loop
 def find(start, stop, positions, row, ends, crossed, marks, straight, counts):
-    """Move the marks of straight targets of rows [start, stop) to another mask.
+    """Move the marks of straight targets of rows [start, stop) from `marks` to `straight`.
 
     A target is straight if its sources have c or c − 1 layers, and if no layer of a source is nearer to the target's
-    layers before or behind the one of its number. No outline or line of crossing may be beside it.
+    layers before or behind the one of its number. No outline or line of crossing may be beside it, and it is not in the
+    outermost rows and columns.
 
     Args:
         start: first row.
@@ -82,7 +83,7 @@ def _keep_zeros(own, marks):
 
 @compiled
 def _keep_even(own, above, level, below):
-    """Keep targets whose nine sources differ by at most one layer."""
+    """Clear in `own` the targets whose nine sources differ by more than one layer."""
     for x in range(1, len(own) - 1):
         least = most = level[x]
         for u in range(-1, 2):
@@ -93,7 +94,7 @@ def _keep_even(own, above, level, below):
 
 @compiled
 def _count(own, above, level, below):
-    """Multiply marks by the number of layers, the largest of nine sources."""
+    """Multiply the marks `own` by the number of layers, the largest of nine sources."""
     for x in range(1, len(own) - 1):
         most = 0
         for u in range(-1, 2):
@@ -103,9 +104,10 @@ def _count(own, above, level, below):
 
 @compiled
 def _keep_regular(own, depth, behind, source, source_behind):
-    """Keep targets whose layer of one number is the one nearest to that layer of three sources in a row.
+    """Keep in `own` the targets whose layer k pairs with layer k, not k + 1, of each of three sources in a row.
 
-    An infinite depth makes a distance infinite or NaN, which no other exceeds.
+    Layers k of target and source have depths `depth` and `source`; `behind` and `source_behind` are those of layers k +
+    1. An infinite depth makes a distance infinite or NaN, which no other exceeds.
     """
     for x in range(1, len(own) - 1):
         irregular = False
@@ -132,7 +134,10 @@ def _depth(straight, y, first, count):
 
 @compiled
 def _sums(total, images, sources, layers, y, count):
-    """Fill the sums of each layer in a row, colours over the weight and the weight, and the images from each on."""
+    """Fill `total`, the sums of each layer in row y (colours over the weight, and the weight), and `images`.
+
+    These are the images from each layer on.
+    """
     one = total.dtype.type(1)
     images[layers * IMAGE : (layers + 1) * IMAGE] = total.dtype.type(0)
     for k in range(layers - 1, -1, -1):
@@ -160,7 +165,7 @@ def _store(image, marks, left, planes, count):
 
 @loop
 def forward(start, stop, grid, straight, border, image):
-    """Fill the straight targets (H, W) of rows [start, stop) of the image (H, W, 4)."""
+    """Fill the straight targets of rows [start, stop) of the image (H, W, 4), which lacks the border of `straight`."""
     layers, width = len(grid.row), image.shape[1]
     sources, loaded = np.empty(3 * layers * SOURCE, image.dtype), np.empty(3, np.int64)
     total, images = np.empty(layers * SUM, image.dtype), np.empty((layers + 1) * IMAGE, image.dtype)
@@ -178,7 +183,7 @@ def forward(start, stop, grid, straight, border, image):
 
 @compiled
 def _adjoints(to, total, images, own, layers, y, count):
-    """Fill the gradients of the sums that are not normalised, from the image's in planes `own`, which change."""
+    """Fill `to` with the gradients of the sums before normalisation, from the image's in planes `own`, which change."""
     zero, one = own.dtype.type(0), own.dtype.type(1)
     for k in range(layers):
         a, s, behind = slot(to, k, y, SUM), total[k * SUM : (k + 1) * SUM], images[(k + 1) * IMAGE :]
@@ -197,7 +202,10 @@ def _adjoints(to, total, images, own, layers, y, count):
 
 @loop
 def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
-    """Add straight targets' shares to the gradients of the samples of source rows [start, stop)."""
+    """Add straight targets' shares to the gradients of the samples of source rows [start, stop), from `g` (H, W, 4).
+
+    A gradient of no rows is not wanted.
+    """
     layers, _, width = grid.row.shape
     sources, loaded = np.empty(3 * layers * SOURCE, g.dtype), np.empty(3, np.int64)
     total, images = np.empty(layers * SUM, g.dtype), np.empty((layers + 1) * IMAGE, g.dtype)
@@ -244,7 +252,7 @@ def _scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
 
 @compiled
 def _change(grown, change, tangent, sources, total, images, layers, y, count):
-    """Fill the tangent of a row of the image, in planes `grown`, from the tangents of the sources."""
+    """Fill `grown`, planes of the tangent of row y of the image, from the slots of sources and of their tangents."""
     zero, one = grown.dtype.type(0), grown.dtype.type(1)
     grown[:] = zero
     for k in range(layers - 1, -1, -1):
@@ -265,7 +273,7 @@ def _change(grown, change, tangent, sources, total, images, layers, y, count):
 
 @loop
 def push(start, stop, grid, t_positions, t_rgba, straight, border, out):
-    """Fill the straight targets of rows [start, stop) of the tangents (T, H, W, 4)."""
+    """Fill the straight targets of rows [start, stop) of the tangents `out` (T, H, W, 4)."""
     layers, (many, _, width, _) = len(grid.row), out.shape
     sources, loaded = np.empty(3 * layers * SOURCE, out.dtype), np.empty(3, np.int64)
     total, images = np.empty(layers * SUM, out.dtype), np.empty((layers + 1) * IMAGE, out.dtype)

@@ -20,7 +20,8 @@ LISTED = 1 << 9
 may be covered in part."""
 
 NOTHING, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
-"""Bits of a cell: inside the array without a sample, with one, and not sure to fill its share of its neighbours."""
+"""Bits of a cell. NOTHING: inside the array without a sample. COVERED: with one. LOOSE: not sure to fill its share of
+its neighbours."""
 
 
 @loop
@@ -64,8 +65,8 @@ def survey(
         counts: (H,) zeros, to be filled with the number of cells of `row` and `exits` that refer to a sample.
         mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows if not wanted.
         marked: (H,) zeros, to be filled with the number of targets marked in `mixed` in each row.
-        ends: (H, W) uint16, to be filled with directions in which fronts end before nothing, and LISTED; no rows if
-            not wanted.
+        ends: (H, W) uint16, to be filled with the mark LISTED, and, at covered LISTED targets, bits of the directions
+            in which the neighbour is empty; no rows if not wanted.
         listed: (H,) zeros, to be filled with the number of targets that are LISTED in each row.
     """
     layers, height, width = row.shape
@@ -116,7 +117,10 @@ def survey(
 
 @compiled
 def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins, kinds):
-    """Fill the marks of a row of cells: those of column x at index x + 1, but in `kinds` at x."""
+    """Fill the marks of row y of cells: those of column x at index x + 1, but in `kinds` at x.
+
+    `covered`: with a sample. `calm`: amid three alike. `joins`: like the cell `above`. `kinds`: bits NOTHING to LOOSE.
+    """
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0
     for x in range(len(cells)):
@@ -157,7 +161,10 @@ def _cover(covered, cells):
 
 @compiled
 def _note(cells, positions, behind, hidden, depths, seen):
-    """Note the samples and depths of a row of a layer; return the number of covered cells."""
+    """Note a row of a layer: mark its samples in `seen`, extend `depths` (2,), and mark blocks in `hidden` if `behind`.
+
+    Returns the number of covered cells.
+    """
     count, last = 0, len(cells) - 1
     least, largest = depths[0], depths[1]
     for x in range(len(cells)):
@@ -174,7 +181,7 @@ def _note(cells, positions, behind, hidden, depths, seen):
 
 @compiled
 def _note_exits(cells, seen):
-    """Note the samples of a row of exits; return their number."""
+    """Mark the samples of a row of exits in `seen`; return how many cells have one."""
     count = 0
     for x in range(len(cells)):
         if cells[x] >= 0:
@@ -213,14 +220,14 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
 
 @compiled
 def _fill_settled(kinds, states):
-    """Mark settled targets as not loose: no loose cell lies beside them, unless samples overflowed."""
+    """Mark settled targets as COVERED and not LOOSE: no loose cell lies beside them, unless samples overflowed."""
     for x in range(len(kinds)):
         kinds[x] = COVERED if states[x] == SETTLED else kinds[x]
 
 
 @compiled
 def _mark_partial(partial, above, level, below, fronts):
-    """Mark the targets of a row that may be covered in part."""
+    """Fill `partial` (W,), 1 at the targets of a row that may be covered in part, 0 at others."""
     for x in range(len(partial)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         around |= below[x] | below[x + 1] | below[x + 2]
@@ -258,7 +265,7 @@ def _empty(kinds, x, n):
 
 @loop
 def paint(start, stop, settled, border, colors, images):
-    """Give settled targets of rows [start, stop) the colours (T, N, 4) of the samples that `settled` names.
+    """Give settled targets of rows [start, stop) of `images` the colours (T, N, 4) of the samples that `settled` names.
 
     Images (T, H, W, 4) are the targets less the border. Colours are zero if N is 0.
     """
@@ -275,7 +282,7 @@ def paint(start, stop, settled, border, colors, images):
 
 @loop
 def note(start, stop, settled, shown):
-    """Mark the samples (N,) bool whose colours settled targets of rows [start, stop) show."""
+    """Mark in `shown` (N,) bool the samples whose colours settled targets of rows [start, stop) show."""
     last = -1
     for y in range(start, stop):
         for x in range(settled.shape[1]):
@@ -287,9 +294,9 @@ def note(start, stop, settled, shown):
 
 @loop
 def collect(start, stop, settled, number, border, g, sums):
-    """Sum the gradient (H, W, 4) of an image, the targets less the border, over settled ones of rows [start, stop).
+    """Sum the gradient `g` (H, W, 4) of an image, the targets less the border, over settled ones of rows [start, stop).
 
-    The sums (H, S, 4) are by row and by the sample whose colour is shown; `number` (N,) gives its index among S.
+    Adds to `sums` (H, S, 4), by row and by the sample whose colour is shown; `number` (N,) gives its index among S.
     """
     width = g.shape[1]
     for y in range(start, stop):
@@ -304,7 +311,7 @@ def collect(start, stop, settled, number, border, g, sums):
 
 @compiled(fastmath={"contract", "reassoc"})
 def _add(to, g):
-    """Add the sum of the rows of g (n, 4), in an order that suits vector instructions."""
+    """Add the sum of the rows of g (n, 4) to `to` (4,), in an order that suits vector instructions."""
     a, b, c, d = to[0], to[1], to[2], to[3]
     for x in range(len(g)):
         a += g[x, 0]

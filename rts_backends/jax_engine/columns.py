@@ -19,7 +19,10 @@ SHORT = 4
 
 
 def summed_by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`f`, a function from arrays to a tree of arrays, with its short sums (`_is_short`) computed by columns."""
+    """`f`, a function from arrays to a tree of arrays, with its short sums (`_is_short`) computed by columns.
+
+    Sums inside of loops and other control flow stay as they are.
+    """
 
     def call(*arrays: Any) -> Any:
         traced, shapes = jax.make_jaxpr(f, return_shape=True)(*arrays)
@@ -65,7 +68,7 @@ def _is_call(equation: JaxprEqn) -> bool:
 
 
 def _is_short(equation: JaxprEqn) -> bool:
-    """True for a sum over few numbers along the last axis alone, where the first axis is longer."""
+    """True for a sum over at most `SHORT` numbers along the last axis alone, where the first axis is longer."""
     if equation.primitive.name != "reduce_sum":
         return False
     aval: Any = equation.invars[0].aval

@@ -27,7 +27,10 @@ _REAL_KINDS = ("f", "i", "u", "b", "V")
 
 
 def bucket(rows: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ, at least 1024: few sizes, so that eager operations stay compiled."""
+    """The least number of the form 2ⁿ or 3·2ⁿ that is at least `rows` and 1024.
+
+    So arrays have few sizes, and eager operations stay compiled.
+    """
     size = 1024
     while size < rows:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
@@ -53,7 +56,7 @@ class JaxEngine(Engine):
         return isinstance(x, jax.Array)
 
     def constant(self, value: Any, like: jax.Array | None = None) -> jax.Array:
-        """`value` as a jax array: floats as float64 if `like` is, else as float32; int64 as int32."""
+        """`value` as a jax array: floats as float64 if `like` is, else as float32; int64 as int32; others stay."""
         array = np.asarray(value)
         if np.issubdtype(array.dtype, np.floating):
             array = array.astype(np.float64 if like is not None and like.dtype == np.float64 else np.float32)
@@ -62,7 +65,10 @@ class JaxEngine(Engine):
         return jnp.asarray(array)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[jax.Array, ...]:
-        """Call `fn`; packed rows are padded: to a bucket if values are known, to the largest shape under a trace."""
+        """Call `fn` without derivative. Packed results are padded with zeros.
+
+        They are padded to a `bucket` if values are known, to the shape in `specs` under a trace.
+        """
         # Under grad and jvp this yields the plain value; only jit and vmap leave a tracer.
         args = tuple(jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a for a in args)
         if not any(isinstance(a, Tracer) for a in args):
@@ -97,7 +103,11 @@ class JaxEngine(Engine):
         return getattr(x.dtype, "kind", None) in _REAL_KINDS
 
     def admitted(self, x: jax.Array, name: str) -> jax.Array:
-        """`x`; complex numbers and keys of random numbers are refused."""
+        """`x` itself.
+
+        Raises:
+            InputError: `x` holds complex numbers, or keys of random numbers.
+        """
         if getattr(x.dtype, "kind", None) not in _REAL_KINDS:
             raise InputError(f"{name} has dtype {x.dtype}; expected real numbers")
         return x
@@ -118,7 +128,10 @@ class JaxEngine(Engine):
         return super().by_host(f, otherwise, *arrays)
 
     def take_error(self) -> RtsError | None:
-        """The error of the latest host call under a trace, returned once; jax itself raises another in its place."""
+        """The `RtsError` of the latest host call under a trace, handed out once; None if there is none.
+
+        jax itself raises another error in its place.
+        """
         error, self._error = self._error, None
         return error
 
@@ -127,7 +140,7 @@ class JaxEngine(Engine):
         return jax.lax.stop_gradient(x)
 
     def apply(self, operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any]) -> jax.Array:
-        """The result by compiled code on CPUs, if all floats are float32 or all float64; else by specification."""
+        """The result by compiled code on CPUs, if all floats are float32 or all float64; else by the array code."""
         if not operations.fits(operation, operands):
             return operation.specification(*operands, **params)
         used = self._used.used([operands[i] for i in operation.packed])
@@ -149,7 +162,10 @@ class JaxEngine(Engine):
     def by_rows_in_use(
         self, f: Callable[[dict[str, jax.Array]], jax.Array], rows: Mapping[str, jax.Array], row: jax.Array, whole: Any
     ) -> jax.Array:
-        """See `Engine.by_rows_in_use`: a traced program on the CPU calls `f` piece by piece; others return `whole`."""
+        """See `Engine.by_rows_in_use`: a traced program on the CPU calls `f` piece by piece.
+
+        Otherwise, or where pieces would gain nothing (`row_blocks.apply`), the result is `whole`.
+        """
         if not isinstance(row, Tracer) or jax.default_backend() != "cpu":
             return whole
         used = jnp.max(row) + 1
@@ -171,7 +187,7 @@ class JaxEngine(Engine):
         return np.asarray(x)
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int) -> Tree:
-        """A Python loop while values are known, which compiles nothing; else `jax.lax.while_loop`."""
+        """See `Engine.repeat`: a Python loop, which compiles nothing; `jax.lax.while_loop` once values are unknown."""
         state = jax.lax.stop_gradient(state)
         for count in range(most):
             on = going(state)
@@ -183,7 +199,7 @@ class JaxEngine(Engine):
         return state
 
     def map_rows(self, f: Callable[[jax.Array], jax.Array], rows: jax.Array, size: int) -> jax.Array:
-        """See `Engine.map_rows`; all calls have one shape, so that a program holds `f` only once."""
+        """See `Engine.map_rows`; the last call is padded with zeros to `size`, so that a program holds `f` once."""
         count = rows.shape[0]
         if count <= size:
             return f(rows)

@@ -1,7 +1,8 @@
 """Host functions inside compiled jax programs, on the CPU without copies of operands and results.
 
 `jax.pure_callback` makes jax arrays of the operands first. That takes a copy of each, and never ends where all of XLA's
-threads are already busy with host functions. It serves devices other than CPUs, whose memory the host cannot read.
+threads are already busy with host functions. So it serves only devices other than CPUs, whose memory the host cannot
+read.
 
 Shapes in a program are those of the worst case. Unused rows of an array are zero.
 """
@@ -35,7 +36,7 @@ Shapes = Sequence[jax.ShapeDtypeStruct]
 def filled(
     function: Filler, shapes: Shapes, *operands: jax.Array, in_place: dict[int, int] | None = None
 ) -> list[jax.Array]:
-    """The results of a host function, in a traced program for the CPU, which keeps the function alive.
+    """The results of a host function in a traced program for the CPU. The program keeps the function alive.
 
     Args:
         function: fills the results.
@@ -57,8 +58,8 @@ def filled(
 def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Array]:
     """The results of a host function in any traced program, which keeps the function alive.
 
-    Results that the program does not use are not copied. One that is shorter along an axis than its shape says is
-    padded with zeros. Under `vmap` the function is called for each item.
+    Results that the program does not use are not copied. A result that is shorter along an axis than its shape says is
+    padded with zeros; a longer one raises a ValueError. Under `vmap` the function is called for each item.
     """
     return _call.bind(*operands, function=function, shapes=tuple(shapes), used=tuple(range(len(shapes))))
 
@@ -89,7 +90,10 @@ def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, l
 
 
 def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], Any]:
-    """The call with only the wanted results, a rule for jax's removal of dead code; and marks of operands it reads."""
+    """Marks of the operands that the call reads, and the call with only the wanted results, or None if none is wanted.
+
+    A rule for jax's removal of dead code.
+    """
     if not any(wanted):
         return [False] * len(equation.invars), None
     used = tuple(i for i, wish in zip(equation.params["used"], wanted, strict=True) if wish)
@@ -119,7 +123,7 @@ def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Seque
 
 
 def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:
-    """Copy `value` to `out`, with zeros where it is shorter."""
+    """Copy `value` to `out`, with zeros where it is shorter; a ValueError if it is longer, or has other axes."""
     value = np.asarray(value)
     if value.shape != out.shape:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
@@ -130,10 +134,11 @@ def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:
 
 
 def clear(out: np.ndarray) -> None:
-    """Fill `out` with zeros. Pages of a large array are handed back: the system gives empty ones at the next touch.
+    """Fill `out` with zeros.
 
-    Tangents in a program are mostly rows that nobody reads: to write them makes a step of Levenberg–Marquardt up to
-    half as long again.
+    On Linux, pages of a large array are handed back: the system gives empty ones at the next touch. Tangents in a
+    program are mostly rows that nobody reads: to write them makes a step of Levenberg–Marquardt up to half as long
+    again.
     """
     if out.nbytes < _LEAST or not out.flags.c_contiguous or _advise is None:
         out[...] = 0

@@ -1,8 +1,9 @@
 """Operations as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and their combinations.
 
-Three primitives an operation: its value, its pushforward and its pullback. Each of the last two is linear in the
-tangents or the gradients, and the transpose of the other; their derivatives by the operands, which are second
-derivatives of the operation, are taken of its specification. So is everything on devices other than the CPU.
+Three primitives an operation: its value, its pushforward (tangents) and its pullback (gradients). Each of the last two
+is linear in the tangents or the gradients, and the transpose of the other. Their derivatives by the operands, which are
+second derivatives of the operation, are taken of its specification, which is array code. On devices other than the CPU,
+all is computed by the specification.
 
 Tangents and gradients have a leading axis T: one sweep takes T of them. Under `vmap`, operands that differ from item to
 item have an axis B before that. Two numbers may follow the operands of an operation: how many rows are in use, and a
@@ -40,7 +41,7 @@ MOST_KEPT = 1 << 24
 
 
 def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any], used: Any) -> jax.Array:
-    """The result of an operation whose operands fit.
+    """The result of an operation whose operands fit, see `fits`.
 
     Args:
         operation: the operation.
@@ -64,7 +65,7 @@ _specifying = contextvars.ContextVar("rts_specifying", default=False)
 
 @contextlib.contextmanager
 def by_specification() -> Iterator[None]:
-    """A context within which all operations are computed by their specifications."""
+    """A context within which this thread computes all operations by their specifications, in array code."""
     token = _specifying.set(True)
     try:
         yield
@@ -97,7 +98,7 @@ class _Kept:
 
 
 def _size(kept: Any) -> int:
-    """Bytes of the arrays in tuples, or of one array."""
+    """Bytes of all arrays in nested tuples, or of one array; 0 for anything else."""
     return sum(map(_size, kept)) if isinstance(kept, tuple) else getattr(kept, "nbytes", 0)
 
 
@@ -151,17 +152,20 @@ class _Differentiable:
 
     @staticmethod
     def told(operation: Operation) -> bool:
-        """True if the operation's functions take the number of rows in use."""
+        """True if the operation's primitives take the number of rows in use: rows are packed, and it has no `used`."""
         return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:
-        """The operation's result."""
+        """The operation's result; `operands` include the number of rows in use if `told`."""
         return self._value(*operands, **params)[0]
 
     # ------------------------------------------------------------------------------------------ by compiled loops
 
     def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
-        """Operands, packed ones cut to rows in use; the number of these rows; what the value has kept, or None."""
+        """Operands, packed ones cut to rows in use; the number of these rows, or 0; what the value has kept, or None.
+
+        The number is 0 if no operand is packed.
+        """
         operands = [read_only(x) for x in given[: self._inputs]]
         operation, used = self.operation, 0
         if operation.packed:
@@ -236,7 +240,7 @@ class _Differentiable:
         return list(jax.vmap(jax.vjp(function, *given)[1])(operands[-1]))
 
     def _among(self, wanted: Wanted, operands: Sequence, params: dict) -> tuple[Callable, list[jax.Array]]:
-        """The specification as a function of the wanted operands alone, and the list of these operands."""
+        """The operation's array code as a function of the wanted operands alone, and the list of these operands."""
         n = self.varied
 
         def function(*given: jax.Array) -> jax.Array:
@@ -279,7 +283,7 @@ class _Differentiable:
     def _along_operands(
         self, operation: HostPrimitive, primals: Sequence, tangents: Sequence, params: dict
     ) -> list | None:
-        """Derivatives of results along tangents of the differentiable operands, by specification; None if all zero."""
+        """Derivatives of results along tangents of the differentiable operands, by array code; None if all are zero."""
         n = self.varied
         _, moved = _present(tangents[:n])
         if not any(moved):
@@ -318,7 +322,7 @@ def _whole(operation: HostPrimitive, params: tuple) -> Callable:
 
 
 def _spread(given: Sequence, wanted: Wanted) -> list:
-    """A list as long as `wanted`: the items of `given`, in order, where it is True, and None elsewhere."""
+    """A list as long as `wanted`: the items of `given`, in order, where `wanted` is True, and None elsewhere."""
     it = iter(given)
     return [next(it) if wish else None for wish in wanted]
 
@@ -332,7 +336,7 @@ def _zeros(like: Sequence[jax.Array]) -> list:
 
 
 def _present(tangents: Sequence, wanted: Wanted | None = None) -> tuple[list, Wanted]:
-    """Tangents that are not zero, and marks of the operands that have them.
+    """Tangents that are not zero, and a mark for each operand: True if its tangent is among them.
 
     `tangents` are of all operands, or of those that `wanted` marks.
     """
@@ -351,5 +355,8 @@ def _name(operation: Operation) -> str:
 
 
 def _summed(x: jax.Array, rank: int) -> jax.Array:
-    """`x`, summed over the items of a batch if it has their axis: for an operand of `rank` axes that they share."""
+    """`x`, summed over its first axis, the items of a batch, if it has more than `rank` axes.
+
+    It is the gradient of an operand that all items share.
+    """
     return x.sum(0) if x.ndim > rank else x

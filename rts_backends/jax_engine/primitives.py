@@ -29,8 +29,8 @@ class HostPrimitive:
         ranks: the number of axes of each of its operands, without the axis B of a batch.
         samples: number of operands before tangents or gradients.
         shapes: gives the shapes of the results, from those of the operands, both without B, and the parameters.
-        host: fills the results for one item.
-        specified: computes the results by specification.
+        host: (operands, results, **params), fills the results for one item, in NumPy.
+        specified: (*operands, **params) → the results, in array code.
         even: see `Operation`.
         noted: True if the last result is a note, () int32 (see `operations.py`).
         some: True if the operands after the samples are only those that a parameter `wanted` marks.
@@ -70,7 +70,7 @@ class HostPrimitive:
         return self.primitive.bind(*operands, **params)
 
     def specification(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
-        """The results by specification, which is differentiable."""
+        """The results by array code, which is differentiable; of a batch, if operands have the axis B."""
         axes = tuple(0 if b else None for b in self._by_item(operands, params))
         function = functools.partial(self._specified, **params)
         return (function if not any(a == 0 for a in axes) else jax.vmap(function, axes))(*operands)
@@ -83,11 +83,11 @@ class HostPrimitive:
         return [*samples, *rest]
 
     def _by_item(self, operands: Sequence[Any], params: dict) -> list[bool]:
-        """Marks of the operands that have the axis B."""
+        """A mark for each operand: True if it has the axis B."""
         return [x.ndim > rank for x, rank in zip(operands, self._own_ranks(params), strict=True)]
 
     def _results(self, operands: Sequence[Any], params: dict) -> list[jax.ShapeDtypeStruct]:
-        """Shapes and dtypes of the results."""
+        """Shapes and dtypes of the results, with the axis B if any operand has it."""
         by_item = self._by_item(operands, params)
         lead = next(((x.shape[0],) for x, b in zip(operands, by_item, strict=True) if b), ())
         shapes = (x.shape[1:] if b else x.shape for x, b in zip(operands, by_item, strict=True))
@@ -96,7 +96,7 @@ class HostPrimitive:
         return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
 
     def _on_host(self, operands: Sequence[np.ndarray], results: Sequence[np.ndarray], params: dict) -> None:
-        """Fill the results, item by item if operands have the axis B."""
+        """Fill the results in place, item by item if operands have the axis B."""
         by_item = self._by_item(operands, params)
         if not any(by_item):
             self._host(operands, results, **params)
@@ -106,7 +106,7 @@ class HostPrimitive:
             self._host(item, [x[b, ...] for x in results], **params)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
-        """The host call in a program for the CPU; an even operand of equal rows is passed as one row."""
+        """The host call in a program for the CPU; an operand in `even` of equal rows is passed as one row."""
         shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
         values, avals = list(operands), list(ctx.avals_in)
         for i in self._even:
@@ -165,7 +165,7 @@ class HostPrimitive:
     def _over_samples(
         self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
     ) -> tuple[list, list[int]]:
-        """Compute a batch whose items differ in samples, item by item."""
+        """Compute a batch whose items differ in samples, item by item; operands may have an axis B already."""
         inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
         if not inner:
             results = self(*operands, **params)
@@ -181,7 +181,7 @@ class HostPrimitive:
 
 
 def _only_row(value: Any) -> Any:
-    """The first row of an array in a program about to be compiled, if the program shows that all are equal, or None."""
+    """The first row of an array in a program about to be compiled; None unless the program shows that all are equal."""
     ir, operation = mlir.ir, value.owner
     name = getattr(operation, "name", "")  # An argument's owner has no name.
     kind = ir.RankedTensorType(value.type)
@@ -199,13 +199,13 @@ def _only_row(value: Any) -> Any:
 
 
 def _read_once(value: Any) -> bool:
-    """True for an array that a program about to be compiled computes, and that only one operation reads so far."""
+    """True for an array that a program about to be compiled computes, and that exactly one operation reads so far."""
     name = getattr(value.owner, "name", "stablehlo.constant")  # An argument's owner has no name.
     return name != "stablehlo.constant" and sum(1 for _ in value.uses) == 1
 
 
 def _cpu_of(operands: Sequence[jax.Array]) -> Any:
-    """The device of the arrays if it is one CPU, else None."""
+    """The device of the jax arrays among `operands` if it is one CPU, else None."""
     devices = set().union(*(x.devices() for x in operands if isinstance(x, jax.Array)))
     return next(iter(devices)) if len(devices) == 1 and all(d.platform == "cpu" for d in devices) else None
 

@@ -61,7 +61,7 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
     """Compute the part of a function that does not depend on its arguments.
 
-    Returns the function of the other equations, and values that it takes as its first arguments.
+    Returns the function of the other equations, and the values, computed here, that it takes as its first arguments.
     """
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
@@ -109,7 +109,8 @@ class _Pieces:
     def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
         """Do `state = step(start, first, state)` for each piece, and return the last state.
 
-        A piece has the rows from `start` on; those before `first` were in the piece before.
+        A piece has the rows from `start` on. The last piece may overlap the one before: rows before `first` were in
+        that.
         """
         size = self._size
 
@@ -128,7 +129,7 @@ class _Pieces:
         return jax.lax.dynamic_slice_in_dim(x, start, self._size)
 
     def among(self, x: Any, in_use: jax.Array, other: Any) -> Any:
-        """Rows of `x` that `in_use` (n,) marks; `other` in place of the rest."""
+        """`x` with `other` in place of the rows that `in_use` (n,) does not mark."""
         return jnp.where(in_use.reshape(-1, *[1] * (x.ndim - 1)), x, other)
 
     def index(self, start: Any) -> jax.Array:
@@ -136,7 +137,7 @@ class _Pieces:
         return start + jnp.arange(self._size)
 
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
-        """The value of a piece as a function of the wanted operands alone, rows cut to it; and these operands."""
+        """The value of a piece as a function of the wanted operands alone; and these operands, rows cut to it."""
         operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
         in_use = self.index(start) < self._used
 
@@ -164,7 +165,10 @@ def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr, fixed: int) ->
 
 
 def _pushed(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """The derivative along tangents of the wanted operands. `arrays` are operands, then tangents; see `_Pieces`."""
+    """The value's derivative (N, ·) along tangents of the wanted operands; rows that are not in use get anything.
+
+    `arrays` are operands, then the tangents; see `_Pieces`.
+    """
     operands, tangents = arrays[: len(wanted)], arrays[len(wanted) :]
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
@@ -179,7 +183,10 @@ def _pushed(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted
 
 
 def _pulled(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
-    """Gradients of the wanted operands. `arrays` are operands, then the value's gradient; see `_Pieces`."""
+    """Gradients of the wanted operands, each in its operand's shape.
+
+    `arrays` are operands, then the value's gradient; see `_Pieces`.
+    """
     *operands, g = arrays
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
     same = sum(wanted[:fixed])
@@ -238,7 +245,7 @@ def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
 
 
 def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
-    """Marks of the tangents that are not zero; integers have none."""
+    """A mark for each tangent: True if it is not zero; integers have none."""
     return tuple(type(t) is not ad.Zero and t.dtype != jax.dtypes.float0 for t in tangents)
 
 

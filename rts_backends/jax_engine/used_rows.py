@@ -27,7 +27,10 @@ class UsedRows:
             self._record[key] = weakref.ref(x, lambda _: self._record.pop(key, None)), used
 
     def used(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
-        """The number of rows in use of `packed`, arrays (N, ·) with the same rows in use; N if none has a record."""
+        """The number of rows in use of `packed`, arrays (N, ·) with the same rows in use.
+
+        It is N if none of the arrays has a record, and 0 if there are no arrays.
+        """
         for x in packed:
             known = self._record.get(id(x))
             if known is not None and known[0]() is x:

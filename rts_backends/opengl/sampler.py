@@ -3,7 +3,7 @@
 Each pass draws the triangles beyond those of the pass before and keeps the nearest, into an integer target: the
 triangle and its quantised depth. The order (depth, triangle) is total, so coplanar triangles peel one by one. Hardware
 snaps vertices to fractions of a pixel; so each hit is then decided in float64 by the edge functions of
-`rts_backends.triangles`, and passed on to the neighbour that truly covers the pixel's centre.
+`rts_backends.triangles`, and passed on to the neighbour that truly covers the pixel's centre, or dropped.
 
 Hardware computes in float32. That is too coarse for triangles that are very large beside a pixel, or reach from very
 near to very far, such as a ground from the camera to the horizon: the sampler "raster" draws such views.
@@ -27,14 +27,14 @@ from rts_backends.raster.sampler import Raster
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4
-"""Image sizes for which framebuffers are kept."""
+"""The most image sizes for which framebuffers are kept."""
 
 DEPTH_STEPS = 2**22
-"""Quantised depths; the 24 bits of a depth buffer hold each exactly."""
+"""Number of quantised depths; the 24 bits of a depth buffer hold each exactly."""
 
 MOST_RATIO, MOST_ROUNDING = 1e4, 0.1
-"""Limits of float32: how many times as far as the nearest point the farthest may be, and how many pixels rounding may
-move a vertex. Beyond them hits are lost."""
+"""Limits of float32: how many times as wide a pixel may be at the farthest point as at the nearest; and how many pixels
+rounding may move a vertex. Beyond them hits are lost."""
 
 VERTEX = """
 #version 330
@@ -69,14 +69,17 @@ void main() { found = ivec2(-1, 0); }
 
 
 class Device:
-    """A proxy's OpenGL objects, and the one context in which they may be used; none may touch those of a lost one."""
+    """A proxy's OpenGL objects, and the one context in which they may be used; none may be touched once it is lost."""
 
     context: moderngl.Context | None = None
     objects: tuple[Any, ...] = ()
 
 
 class Buffers:
-    """A proxy on the device, its vertices moved and scaled to the unit sphere. Released when garbage-collected."""
+    """A proxy on the device, its vertices moved and scaled to the unit sphere; released when garbage-collected.
+
+    Lists of the triangles around each corner (`exact_hits`) stay on the host.
+    """
 
     def __init__(self, worker: Worker, proxy: Proxy):
         faces = np.ascontiguousarray(proxy.faces, np.int32)
@@ -98,11 +101,11 @@ class OpenGL(TriangleSampler):
         self._warned = False
 
     def prepare(self, proxy: Proxy) -> Buffers:
-        """Move the triangles to the device."""
+        """Copy the triangles to the device."""
         return Buffers(self._worker, super().prepare(proxy))
 
     def rasterize(self, prepared: Buffers, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
-        """See `TriangleSampler.rasterize`."""
+        """See `TriangleSampler.rasterize`. Views beyond float32 are drawn by the sampler "raster", with one warning."""
         height, width = size
         if _beyond_float32(camera, prepared, size):
             self._warn()
@@ -137,7 +140,7 @@ class OpenGL(TriangleSampler):
 
 
 def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
-    """First and last depth between which an object may be seen; if it is out of view, first ≥ last."""
+    """First and last depth between which an object may be seen; if it is out of view, not first < last."""
     near, far = (float(z) for z in camera.depth_range())
     middle = -(camera.view[2, :3] @ prepared.center + camera.view[2, 3])
     reach = 1.01 * prepared.radius * np.linalg.norm(camera.view[2, :3])
@@ -152,13 +155,16 @@ def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
 
 
 def _ratio(camera: Camera, near: float, far: float) -> float:
-    """The width of a pixel at depth `far` over that at `near`; infinity where the pixel is a point at `near`."""
+    """The width of a pixel at depth `far` over that at `near`; infinity where it is not positive at `near`."""
     first, last = (camera.projection[3, 3] - camera.projection[3, 2] * z for z in (near, far))
     return float(last / first) if first > 0 else np.inf
 
 
 def _beyond_float32(camera: Camera, prepared: Buffers, size: tuple[int, int]) -> bool:
-    """True if hardware would lose hits of a view, see `MOST_RATIO`; False for slanted planes, which have no depth."""
+    """True if hardware would lose hits of a view, see `MOST_RATIO`.
+
+    False if the object is out of view, and for slanted near and far planes, which have no depth.
+    """
     p = camera.projection
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return False
@@ -171,7 +177,10 @@ def _beyond_float32(camera: Camera, prepared: Buffers, size: tuple[int, int]) ->
 
 
 def _tight(projection: np.ndarray, view: np.ndarray, prepared: Buffers) -> np.ndarray:
-    """The projection with its planes drawn close around the object, so that depth is quantised finely."""
+    """The projection with its planes drawn close around the object, so that depth is quantised finely.
+
+    Slanted planes, and those of views that do not show the object, stay.
+    """
     p = projection.copy()
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return p
@@ -226,7 +235,11 @@ def _release(context: moderngl.Context, objects: Sequence[Any]) -> None:
 
 
 def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any, Any]]:
-    """Two framebuffers of `size`, each with its texture: one is read while the other is drawn."""
+    """Two framebuffers of `size`, each with its texture: one is read while the other is drawn.
+
+    Raises:
+        InputError: the image is larger than the device draws.
+    """
     kept = _programs(context)["targets"]
     if size not in kept:
         limit = context.info["GL_MAX_TEXTURE_SIZE"]
@@ -256,7 +269,10 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
 def _peel(
     context: moderngl.Context, prepared: Buffers, clip: np.ndarray, size: tuple[int, int], layers: int, keep: float
 ) -> np.ndarray:
-    """(K, H, W) triangle ids, −1 for none, of vertices as hardware rounds them; `exact_hits` corrects them later."""
+    """(K, H, W) triangle ids, −1 for none, of vertices as hardware rounds them; `exact_hits` corrects them later.
+
+    `clip` (4, 4) leads from the unit sphere to clip space; `keep` is the sign of `facing`.
+    """
     parts, array = _programs(context), _upload(context, prepared)
     program, query = parts["peel"], parts["query"]
     targets = _targets(context, size)

@@ -43,11 +43,16 @@ class Worker:
         self.context: moderngl.Context | None = None
 
     def __reduce__(self) -> tuple:
-        """A copy, or one in another process, has a thread and a context of its own."""
+        """Pickle as a new worker: a copy, or one in another process, has a thread and a context of its own."""
         return Worker, ()
 
     def call(self, function: Callable, *args: Any) -> Any:
-        """`function(context, *args)` on the worker's thread; its result, or its exception."""
+        """The result of `function(context, *args)`, run on the worker's thread; its exception is raised here.
+
+        Raises:
+            PluginError: the process was forked after OpenGL was in use, the thread has ended, or OpenGL reports an
+                error.
+        """
         global _process
         if _forked():
             raise PluginError(FORKED)
@@ -66,7 +71,10 @@ class Worker:
         return future.result()
 
     def later(self, function: Callable, *args: Any) -> None:
-        """Run a function in the thread without waiting for it, for clean-up; do nothing if the thread has ended."""
+        """Run `function(context, *args)` in the thread without waiting for it, for clean-up.
+
+        Nothing is done if the thread has not begun, or has ended, or in a forked child.
+        """
         if not _forked() and self._thread is not None and self._thread.is_alive():
             self._tasks.put((function, args, Future()))
 
@@ -121,7 +129,7 @@ def _forked() -> bool:
 
 
 def _errors(context: moderngl.Context) -> list[str]:
-    """The errors that the context has recorded; it then has none."""
+    """The errors that the context has recorded, at most `MOST_ERRORS`; reading them clears them."""
     errors: list[str] = []
     while len(errors) < MOST_ERRORS and (error := context.error) != "GL_NO_ERROR":
         errors.append(error)

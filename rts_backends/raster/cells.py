@@ -20,7 +20,8 @@ class Blocks(NamedTuple):
 
     Attributes:
         table: (Y, X) int32, the index in `numbers` of each block with requested cells; −1 for other blocks.
-        numbers: (B, SIDE, SIDE) int32, the index of each cell of a block in the list of cells; −1 if not requested.
+        numbers: (B, SIDE, SIDE) int32, the index of each cell of a block in the flat list of cells; −1 if not
+            requested.
         bits: (H, X) uint16, a bit for each cell of a row of the grid, set if it is requested; SIDE bits to a number.
     """
 
@@ -33,7 +34,7 @@ class Blocks(NamedTuple):
         """The blocks of `cells` (L, C): flat indices in a grid of `size` (height, width); −1 is skipped.
 
         Raises:
-            InputError: a cell is not in the grid, or listed twice.
+            InputError: a cell lies beyond the grid's last, or is listed twice.
         """
         height, width = size
         table = np.full((-(-height // SIDE), -(-width // SIDE)), -1, np.int32)
@@ -53,9 +54,10 @@ EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int
 
 @loop
 def _fill(cells, width, table, numbers, bits):
-    """Fill in the arrays of `Blocks`. Returns the number of blocks that have requested cells.
+    """Fill in the arrays of `Blocks`: at first `table` is −1, `bits` is 0, and `numbers` has room for all blocks.
 
-    The second result is the index in `cells` of a cell beyond the grid or listed twice, where the loop stops; else −1.
+    Returns the number of blocks that have requested cells; and the index in `cells` of a cell beyond the grid or listed
+    twice, where the loop stops, or −1.
     """
     count, m, side, size = 0, 0, np.uint32(SIDE), len(bits) * width
     while m < len(cells):
@@ -103,10 +105,11 @@ def _following(cells, first):
 
 @compiled
 def touching(places, box, begin, end, bits):
-    """Move indices of boxes with requested cells to the front of `places`. Returns the number of these boxes.
+    """Move those of the indices `places`, of boxes, that hold requested cells to the front. Returns their number.
 
-    Only rows from `begin` to `end` − 1 are looked at. `box` (4, ·) has first and last column, and first and last row.
-    One loop does all, since compiled code counts references to arrays that it passes on.
+    `box` (4, ·) has first and last column, and first and last row, of each box; only its rows from `begin` to `end` − 1
+    are looked at. The other entries of `places` are overwritten. One loop does all, since compiled code counts
+    references to arrays that it passes on.
     """
     count, side, one, three = 0, np.uint32(SIDE), np.uint32(1), np.uint32(3)
     for h in range(len(places)):

@@ -17,7 +17,7 @@ from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster.cells import EVERYTHING, SIDE, Blocks
 
 SIZE = 256
-"""Triangles of a cluster, and vertices of a block."""
+"""Triangles of a cluster, and vertices of a block; the last may have fewer."""
 
 FRONTS, BACKS = 1, 2
 """Bits of a cluster: it may hold triangles whose determinant has the requested sign; or the opposite sign."""
@@ -42,7 +42,8 @@ class Clusters(NamedTuple):
         vertices: (V, 3) float32, the vertices that triangles use, in the order of their first use.
         faces: (T, 3) int32, triangles in the order of clusters, SIZE in each.
         order: (T,) int32, the index of each triangle in the proxy.
-        boxes: (6, C) float32, the least and the largest x, y and z of each cluster.
+        boxes: (6, C) float32, the least and the largest x, y and z of each cluster; infinite if some number is not
+            finite.
         cones: (5, C) float64 of each cluster: a unit vector (x, y, z); the least cosine between it and a triangle's
             normal, below 0 if unknown; and the least length of (b − a) × (c − a) over triangles (a, b, c).
         offsets: (C + 1,) int64, where each cluster's blocks of vertices begin in `blocks`.
@@ -86,11 +87,11 @@ class Clusters(NamedTuple):
             size: (height, width).
             keep: sign of the determinants of requested triangles; 0 for all.
             both: True if triangles of the opposite sign are requested, too.
-            asked: the blocks of requested cells.
+            asked: the blocks of requested cells; others are out of view.
 
         Returns:
             Indices of clusters (N,) int32; bits `FRONTS` and `BACKS` of the triangles that they may hold (N,) uint8;
-            and indices of blocks of vertices, int32.
+            and indices of the blocks of vertices that these clusters use, int32.
         """
         height, width = size
         # Positions more than a pixel outside of the image cannot be rounded into it.
@@ -111,7 +112,10 @@ class Clusters(NamedTuple):
 
 @loop
 def _extent(vertices):
-    """The least x, y and z (3,) of vertices, and their largest extent; numbers that are not finite are left out."""
+    """The least x, y and z (3,) of vertices, and their largest extent along an axis, at least 1e-30.
+
+    Numbers that are not finite are left out.
+    """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for v in range(len(vertices)):
         for r in range(3):
@@ -123,7 +127,7 @@ def _extent(vertices):
 
 @loop
 def _keys(start, stop, vertices, faces, low, scale, keys):
-    """Fill in keys of triangles: 33 bits of position and octant, then 31 of the index, so that all keys differ."""
+    """Fill `keys` of triangles [start, stop), all different: 33 bits of position and octant, then 31 of the index."""
     for t in range(start, stop):
         key = np.uint64(0)
         for r in range(3):
@@ -144,7 +148,10 @@ def _keys(start, stop, vertices, faces, low, scale, keys):
 
 @loop
 def _renumber(vertices, faces, order, new_vertices, new_faces):
-    """Fill in the triangles as `order` lists them, and vertices by first use. Returns the number of vertices used."""
+    """Fill `new_faces` with triangles as `order` lists them, `new_vertices` with vertices by first use.
+
+    Returns the number of vertices used.
+    """
     numbers, count = np.full(len(vertices), -1, np.int32), 0
     for t in range(len(order)):
         for c in range(3):
@@ -160,9 +167,10 @@ def _renumber(vertices, faces, order, new_vertices, new_faces):
 
 @loop
 def _find_blocks(faces, last, offsets, blocks):
-    """Fill `blocks` with the blocks of vertices of each cluster, `offsets` with where they begin; return their number.
+    """Fill `blocks` with the blocks of vertices of each cluster, `offsets[1:]` with where each cluster's end.
 
-    `last` holds, for each block of vertices, the latest cluster that uses it: −1 at first.
+    `last` holds, for each block of vertices, the latest cluster that uses it: −1 at first. Returns the length of
+    `blocks` that is filled.
     """
     count = 0
     for t in range(len(faces)):
@@ -179,7 +187,7 @@ def _find_blocks(faces, last, offsets, blocks):
 
 @loop
 def _bound(start, stop, vertices, faces, boxes, cones):
-    """Fill in boxes and cones of clusters, see `Clusters`."""
+    """Fill `boxes` (6, C) and `cones` (5, C) of clusters [start, stop), see `Clusters`."""
     normals = np.empty((SIZE, 3))
     for cluster in range(start, stop):
         block = faces[cluster * SIZE : (cluster + 1) * SIZE]
@@ -242,7 +250,7 @@ def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
         keep: sign of the determinants of triangles of the bit FRONTS, the others have BACKS; 0 gives both bits to all.
         wanted: bits, of which a cluster needs at least one.
         kept: (C,) int32, to be filled with the indices of the clusters, from the start.
-        sides: (C,) uint8, to be filled with the bits of each of `kept`.
+        sides: (C,) uint8, to be filled with the bits of each of `kept`; in the rest anything.
     """
     # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
     q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
@@ -264,7 +272,11 @@ def _minor(rows, i, j, k):
 
 @compiled(inline="always")
 def _test(boxes, cones, planes, towards, rows, sides):
-    """Fill in the bits FRONTS and BACKS of each cluster; no bits if it is out of view."""
+    """Fill `sides` with the bits FRONTS and BACKS of each cluster; no bits if it is out of view.
+
+    `towards` are q (three numbers) and s, times `keep`: a triangle's determinant is n · (q + s a), for its corner a and
+    normal n. `rows` (3, 4) are absolute values.
+    """
     qx, qy, qz, s = towards
     for cluster in range(len(sides)):
         x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
@@ -293,7 +305,7 @@ def _test(boxes, cones, planes, towards, rows, sides):
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
     """Mark in `near` which of the clusters `kept` may touch blocks of requested cells.
 
-    `there` (Y + 1, X + 1) holds cumulative counts of these blocks.
+    `there` (Y + 1, X + 1) holds counts of these blocks, cumulative along both axes.
 
     A cluster whose box reaches behind the eye is always marked.
     """

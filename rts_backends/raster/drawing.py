@@ -1,7 +1,7 @@
 """The second pass of the rasterizer: listed triangles drawn into the layers of pixels, a band of rows at a time.
 
-Loops run over arrays of one short block (a row for each number, a column for each triangle) and have no branches, so
-that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
+The innermost loops run over arrays of one short block (a row for each number, a column for each triangle) and have no
+branches, so that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ LISTED = 8
 
 NUMBERS = 18
 """Numbers computed for a triangle: coefficients (x, y, 1) of its three edge functions, positive inside; depths of its
-corners; and their w + z and w − z of clip space."""
+corners; the corners' w + z of clip space; and their w − z."""
 
 
 @loop
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
-    """Fill the three fragment arrays (K, H · W), band by band.
+    """Fill the fragment arrays, ids and depths (K, H · W) and barycentrics (K, H · W, 2), in bands `turns[first:last]`.
 
     `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `cells.EVERYTHING`; `size` is (H, W).
     """
@@ -47,9 +47,10 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
 
 @loop
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
-    """`draw` for a list of M cells: fills ids, barycentrics and `nearest` (K, M), which `clear` has emptied.
+    """`draw` for a list of M cells: fills ids, barycentrics and depths `nearest` (K, M), which `clear` has emptied.
 
-    `asked` are the arrays of the cells' `Blocks`. If `narrows` is set, triangles that touch none of them are skipped.
+    `asked` are the arrays of the cells' `Blocks`. If `narrows` is set, triangles whose boxes hold no requested cell are
+    skipped.
     """
     triangle_ids, barycentrics, _ = fragments
     table, numbers, bits = asked
@@ -66,7 +67,7 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows
 
 @loop
 def clear(start, stop, nearest, fragments, drawn):
-    """Empty the layers of cells [start, stop) of arrays (K, M), or, if `drawn`, fill in the depths from `nearest`."""
+    """Empty the layers of cells [start, stop) of arrays (K, M); or, if `drawn`, fill in the depths from `nearest`."""
     triangle_ids, barycentrics, depths = fragments
     infinity = nearest.dtype.type(np.inf)
     for k in range(len(nearest)):
@@ -81,7 +82,7 @@ def clear(start, stop, nearest, fragments, drawn):
 
 @compiled
 def _depths(depths, nearest):
-    """Copy `nearest` to `depths`, with 0 for empty cells, where it is infinite."""
+    """Copy `nearest` to `depths`, with 0 where `nearest` is infinite: in empty cells."""
     for i in range(len(depths)):
         depths[i] = nearest[i] if nearest[i] < np.inf else 0.0
 
@@ -90,7 +91,8 @@ def _depths(depths, nearest):
 def _draw(items, given, top, end, width, asked, layered):
     """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
-    `layered` are the index of the band's first cell among M; `nearest`; and ids and barycentrics (K, M, ·).
+    `items` are the triangles' indices in `rows`. `layered` are the index of the band's first cell among M; `nearest`,
+    depths (K, ·); ids (K, M); and barycentrics (K, M, 2).
     """
     rows, vertices, matrix, view_depth, keep = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
@@ -133,9 +135,9 @@ def _draw(items, given, top, end, width, asked, layered):
 
 @compiled
 def _asked(hits, count, top, asked, cells):
-    """Drop hits (n, 2) in cells that are not requested; fill `cells` with the numbers of the others' cells.
+    """Move the hits in requested cells to the front of `hits[:count]`, and fill `cells` with these cells' numbers.
 
-    Returns the number of hits left.
+    Returns the number of hits left. If all cells are requested, nothing is changed.
     """
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
@@ -155,7 +157,7 @@ def _asked(hits, count, top, asked, cells):
 
 @compiled(inline="always")
 def _gather(block, rows, vertices, entries, points):
-    """Gather the triangles' list entries (LISTED, BLOCK) and corners (3, 3, BLOCK).
+    """Fill the list entries (LISTED, BLOCK) and the corners `points` (3, 3, BLOCK), by corner and axis, of a block.
 
     The loops are so short that the processor overlaps their waits for memory.
     """
@@ -173,7 +175,8 @@ def _gather(block, rows, vertices, entries, points):
 def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
     """Compute the numbers (NUMBERS, BLOCK) of triangles, and mark in `clips` those that may need clipping.
 
-    Each triangle's rows of pixels are cut to the band; a triangle of no area, or that is culled, keeps no rows.
+    In `entries`, each triangle's rows of pixels are cut to the band, `top` to `bottom`. A triangle of no area, or that
+    is culled, keeps no rows.
     """
     corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
     for c in range(3):
@@ -223,7 +226,10 @@ def _cover(count, entries, numbers, covers):
 
 @compiled
 def _insert(hits, met, drawn, layered):
-    """Insert hits into the layers of cells; `hits` (n, 2): triangle in the block · BAND_ROWS + row in band, column."""
+    """Insert the hits that stand the exact test into the layers of cells.
+
+    `hits` (n, 2): triangle in the block · BAND_ROWS + row in band, column.
+    """
     top, width, entries, numbers, clips = drawn
     cells, sure, depths, within = met
     first, nearest, triangle_ids, barycentrics = layered
@@ -239,7 +245,10 @@ def _insert(hits, met, drawn, layered):
 
 @compiled
 def _meet(hits, top, numbers, clips, sure, depths, within):
-    """Fill in each hit's depth (n,) and first two barycentrics (2, n); and `sure`, True if `_covers` is not needed."""
+    """Fill each hit's depth (n,) and first two barycentrics `within` (2, n), and `sure`: True if it needs no test.
+
+    The test is `_covers`, for hits on an edge or of triangles that may need clipping.
+    """
     for h in range(len(hits)):
         place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
         b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
@@ -255,7 +264,7 @@ def _meet(hits, top, numbers, clips, sure, depths, within):
 
 @compiled
 def _covers(b, x, y, numbers, clips):
-    """True if triangle b of a block covers a point, edges and clipping taken into account."""
+    """True if triangle b of a block covers a point (x, y), pixels, edges and clipping taken into account."""
     xa, ya, xb, yb, xc, yc = numbers[0, b], numbers[1, b], numbers[3, b], numbers[4, b], numbers[6, b], numbers[7, b]
     ea, eb, ec = (
         xa * x + (ya * y + numbers[2, b]),
@@ -269,7 +278,11 @@ def _covers(b, x, y, numbers, clips):
 
 @compiled(inline="always")
 def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers of a cell, sorted by depth, then by the triangle's index; the farthest drops out."""
+    """Put a hit into the layers of a cell, sorted by depth, then by the triangle's index; the farthest drops out.
+
+    The hit has depth z, triangle t and barycentrics p, q. `place` is the cell's index in `nearest`, `cell` in the
+    others.
+    """
     moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, place], triangle_ids[k, cell]
@@ -285,7 +298,7 @@ def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
 
 @compiled
 def _outside(numbers, b, ea, eb, ec):
-    """True if the point with barycentrics in the ratio ea : eb : ec lies before the near or beyond the far plane."""
+    """True if the point with barycentrics in the ratio ea : eb : ec is nearer than the near or beyond the far plane."""
     near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]
     far = ea * numbers[15, b] + eb * numbers[16, b] + ec * numbers[17, b]
     return near < 0 or far < 0

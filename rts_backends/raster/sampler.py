@@ -1,14 +1,16 @@
-"""Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
+"""Rasterizer for the CPU: the K nearest triangles of each pixel, drawn at once, on all cores (numba).
 
-Most triangles of a large mesh cover no pixel's centre. A first pass reads only their rounded corners on screen, and
-lists the triangles that may cover one. In a mesh that stays it skips whole clusters (`rts_backends.raster.clusters`).
+Most triangles of a large mesh cover no pixel's centre. A first pass reads only rounded positions of their corners on
+screen, and lists the triangles that may cover a centre. In a large mesh that stays (`rts.prepare`) this pass skips
+whole clusters of triangles (`rts_backends.raster.clusters`).
 
 A second pass draws the image in bands of rows, each by one thread. For blocks of listed triangles it computes, in
-float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`. It finds the pixels that they may cover,
-and inserts them into the layers. The result depends neither on the number of threads nor on the order of the list.
+float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`. It finds the pixels that these triangles
+cover, and inserts the triangles into the pixels' layers. The result depends neither on the number of threads nor on the
+order of the list.
 
-Loops run over arrays of one short block (a row for each number, a column for each triangle) and have no branches, so
-that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
+The innermost loops run over arrays of one short block (a row for each number, a column for each triangle) and have no
+branches, so that they compile to vector instructions and no jump is mispredicted. Rare cases are handled last.
 """
 
 from __future__ import annotations
@@ -29,47 +31,50 @@ from rts_backends.raster.drawing import BAND_ROWS, LISTED, clear, draw, draw_cel
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
 LONG_BLOCK = SIZE
-"""Length of a block for loops that keep few numbers of each triangle or vertex."""
+"""Triangles, or vertices, of a block in loops that keep few numbers of each."""
 
 PER_CHUNK = 8
 CHUNK = PER_CHUNK * LONG_BLOCK
 
 LIMIT = np.float32(2**15 - 2)
-"""Steps from the middle of the image to two pixels outside of it; positions beyond are clamped there.
+"""Steps from the middle of the image to two pixels beyond its longer sides. Farther positions are clamped to this.
 
-Positions on screen take 16 bits, so that those of a million triangles stay in caches.
-"""
+Positions on screen take 16 bits, so that those of a million triangles stay in caches."""
 
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
 
 MANY = 1 << 16
-"""The least number of triangles that is put in clusters; fewer gain nothing."""
+"""The least number of triangles that are put in clusters; fewer gain nothing."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
 """An empty array in place of an order: triangles are in the order of their indices."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
-"""Codes in place of a position: before the near plane (or NaN), beyond the far plane."""
+"""Codes in place of a vertex's position: nearer than the near plane, behind the eye, or NaN; farther than the far
+plane."""
 
 
 class Raster(TriangleSampler):
-    """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
+    """K-buffer rasterization with a top-left fill rule; of triangles at one depth, the lower index comes first."""
 
     concurrent = True
     _scratch: tuple[tuple, list[tuple]]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Give every instance room to keep scratch memory, whatever `__init__` a subclass has."""
+        """Create an instance with an empty store of scratch memory, whatever `__init__` a subclass has."""
         self = super().__new__(cls, *args, **kwargs)
         self._scratch = (), []  # Memory of one size. A thread that draws takes a piece out, so threads never share.
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """See `TriangleSampler`: copies have scratch memory of their own."""
+        """The state of `TriangleSampler.__getstate__` without scratch memory, of which each copy makes its own."""
         return {name: value for name, value in super().__getstate__().items() if name != "_scratch"}
 
     def arrange(self, prepared: Any) -> Any:
-        """See `TriangleSampler.arrange`: triangles in clusters, if there are many."""
+        """See `TriangleSampler.arrange`: `Clusters` of a proxy of at least `MANY` triangles; else `prepared` itself.
+
+        A subclass that overrides a method that draws gets `prepared` itself, too.
+        """
         many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
         draws = self._draws and type(self).rasterize_exits == Raster.rasterize_exits
         return Clusters.of(prepared) if many and draws else prepared
@@ -98,7 +103,10 @@ class Raster(TriangleSampler):
     def rasterize_exits(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """See `TriangleSampler.rasterize_exits`: one pass lists triangles of both orientations."""
+        """See `TriangleSampler.rasterize_exits`: one pass lists triangles of both orientations.
+
+        In a subclass that overrides `rasterize` or `rasterize_cells`, these two methods draw.
+        """
         if not self._draws:
             return super().rasterize_exits(prepared, camera, size, layers, beside)
         with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
@@ -109,7 +117,7 @@ class Raster(TriangleSampler):
 
     @property
     def _draws(self) -> bool:
-        """True unless a subclass overrides `rasterize` or `rasterize_cells`, and so may read the prepared proxy."""
+        """True unless a subclass overrides `rasterize` or `rasterize_cells`, either of which may expect a `Proxy`."""
         kind = type(self)
         return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
 
@@ -123,7 +131,7 @@ class Raster(TriangleSampler):
         both: bool = False,
         asked: Blocks = EVERYTHING,
     ) -> Iterator[_Seen]:
-        """A mesh as a camera sees it, in scratch memory.
+        """Lend a mesh as a camera sees it, whose arrays are scratch memory kept from call to call.
 
         Drawn repeatedly, a mesh touches the same pages of memory, which the system clears only once. The memory has
         room for every vertex and triangle, but unused pages are never touched.
@@ -145,9 +153,9 @@ class _List(NamedTuple):
 
     Attributes:
         keep: sign of the determinants of triangles to draw; 0 for both signs.
-        turns: (bands,), bands of rows, those with most items first, so that threads end together.
+        turns: (bands,), indices of bands of rows, those with most items first, so that threads end together.
         offsets: (bands + 1,), where the items of each band begin.
-        items: uint32, indices of triangles in `rows`, in the order of the search.
+        items: uint32, for each band the triangles whose boxes touch it, as indices of `rows`.
         rows: (T, LISTED) int32, the numbers listed for each triangle.
     """
 
@@ -166,8 +174,8 @@ class _Seen:
         camera: the camera.
         size: (height, width).
         keep: sign of the determinants of triangles to draw; 0 for both signs.
-        both: True if triangles that face the other way are requested, too.
-        asked: the blocks of requested cells.
+        both: True if triangles of the opposite sign are requested, too, for a list of their own.
+        asked: the blocks of requested cells; `EVERYTHING` for all cells.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
         behind: (T, LISTED) int32, memory for a list of triangles that face the other way.
@@ -202,7 +210,7 @@ class _Seen:
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
     def select(self) -> list[_List]:
-        """Lists of triangles that may cover requested cells: one; with `both` a second of the other orientation."""
+        """One list of the triangles that may cover requested cells; with `both`, a second of the other orientation."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads should not write to neighbouring memory.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
@@ -214,14 +222,18 @@ class _Seen:
         return [fronts, _sorted(-self.keep, self.order, *lists[1])] if self.both else [fronts]
 
     def draw(self, listed: _List, layers: int) -> Fragments:
-        """Fragments (layers, H, W) of the listed triangles."""
+        """Fragments (layers, H, W) of the listed triangles in all pixels."""
         fragments = _empty((layers, *self.size))
         given = self.vertices, self.matrix, self.depth_row, tuple(EVERYTHING), self.size
         parallel(draw, len(listed.turns), listed, *given, _flat(fragments))
         return fragments
 
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
-        """Fragments (layers, L, C) of the listed triangles in `cells` (L, C), whose `Blocks` are `blocks`."""
+        """Fragments (layers, L, C) of the listed triangles in `cells` alone.
+
+        `cells` (L, C) are flat indices of pixels, or −1, whose fragments are empty; `blocks` are the `Blocks` of
+        `cells`.
+        """
         fragments = _empty((layers, *cells.shape))
         flat, nearest = _flat(fragments), np.empty((layers, cells.size))
         parallel(clear, cells.size, nearest, flat, False, work=nearest.size)
@@ -232,7 +244,7 @@ class _Seen:
 
 
 def _flat(fragments: Fragments) -> tuple[np.ndarray, ...]:
-    """Fragment arrays with the axes of cells flattened: (K, M), and (K, M, 2)."""
+    """Views of triangle ids (K, M), barycentrics (K, M, 2) and depths (K, M), with the axes of cells flattened."""
     triangle_ids, barycentrics, depth = fragments
     layers, count = len(depth), depth[0].size
     return triangle_ids.reshape(layers, count), barycentrics.reshape(layers, count, 2), depth.reshape(layers, count)
@@ -244,7 +256,10 @@ def _empty(shape: tuple[int, ...]) -> Fragments:
 
 
 def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
-    """A list of `_select`, sorted by bands of rows, with triangles named by their indices in the proxy."""
+    """The list that `_select` wrote to `rows`, `spans` and `counts`, sorted by bands of rows of pixels.
+
+    In `rows`, indices of triangles are replaced by those in the proxy, in place.
+    """
     sums = counts.sum(axis=0)
     offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
@@ -255,9 +270,10 @@ def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray,
 
 @loop
 def _project(first, last, used, vertices, m, screen):
-    """Fill positions (V,) on screen of some blocks of vertices, in steps from the image's middle.
+    """Fill `screen` (V,) with positions of vertices, in steps from the image's middle.
 
-    The lower 16 bits are the column, the upper ones the row.
+    Only the blocks `used[first:last]` of vertices are projected, by `m` (4, 4) to homogeneous steps. The lower 16 bits
+    are the column, the upper ones the row. Positions are clamped to ±`LIMIT`; see `BEFORE` for vertices out of view.
     """
     points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
     for n in used[first:last]:
@@ -298,13 +314,15 @@ def _select(
     fronts,
     backs,
 ):
-    """List and count the triangles that may cover a pixel's centre in cells marked by `bits` of `Blocks`.
+    """List and count the triangles that may cover the centre of a requested pixel.
 
-    The search goes through chunks of `blocks`, the blocks of triangles; `sides` are bits FRONTS and BACKS of each.
+    The search goes through chunks [first, last) of `blocks`, the indices of blocks of triangles. `sides` are bits
+    FRONTS and BACKS of each block. `bits` are those of `Blocks`, or empty if all pixels are requested.
 
-    A list consists of a row for each triangle (T, LISTED), where the rows of each chunk begin and end (chunks, 2), and
-    the number of a chunk's triangles that touch each band (chunks, bands). One call writes its chunks one after
-    another. `backs`, if it has room, lists triangles that may face the other way.
+    `fronts` and `backs` are lists to be filled. A list consists of a row for each triangle (T, LISTED), where the rows
+    of each chunk begin and end (chunks, 2), and the number of a chunk's triangles that touch each band (chunks, bands).
+    One call writes its chunks one after another. `fronts` lists triangles whose determinants may have the sign `keep`;
+    `backs`, if it has room, the opposite sign.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
@@ -329,7 +347,11 @@ def _select(
 
 @compiled(inline="always")
 def _look(count, xy, height, width, step, sign, box, clips, near):
-    """Fill in each triangle's box of pixels, and marks: `clips`, it needs clipping; `near`, it may cover a centre."""
+    """Fill in each triangle's box of pixels, and marks: `clips`, it may need clipping; `near`, it is to be listed.
+
+    `xy` (3, ·) are the corners' positions of `_project`. `box` (4, ·) gets first and last column, first and last row. A
+    triangle is `near` if it may cover a pixel's centre and may face as `sign` says, or if it `clips`.
+    """
     more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
     middle, center = np.float32(width / 2), np.float32(height / 2)
     for b in range(count):
@@ -357,7 +379,11 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 @compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
-    """List the triangles of a block that are marked `near`, from row `place` on. Returns the next free row."""
+    """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on; count their bands.
+
+    Left out are triangles that touch no requested cell, and clipped ones that cover no centre. Returns the next free
+    row.
+    """
     vertices, matrix, height, width, step, bits = given
     listed, _, counts = made
     count = 0
@@ -390,7 +416,10 @@ def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
 
 @compiled
 def _centres(x0, x1, y0, y1, height, width, step):
-    """First and last column and row, in float32, of pixels with centres in a box, itself exact to half a step."""
+    """First and last column, first and last row (float32) of pixels whose centres a box may hold; first > last if none.
+
+    The box, in pixels, is exact to half a step. Columns and rows are cut to the image.
+    """
     slack, half, zero = np.float32(0.75) * step, np.float32(0.5), np.float32(0)
     i0, i1 = max(np.ceil(x0 - half - slack), zero), min(np.floor(x1 - half + slack), np.float32(width - 1))
     j0, j1 = max(np.ceil(y0 - half - slack), zero), min(np.floor(y1 - half + slack), np.float32(height - 1))
@@ -399,7 +428,11 @@ def _centres(x0, x1, y0, y1, height, width, step):
 
 @compiled
 def _clipped_box(corners, width, height):
-    """The pixel box (x0, x1, y0, y1) of the part of a triangle before the near plane."""
+    """The box (x0, x1, y0, y1), pixels, of the part of a triangle beyond the near plane; empty if there is none.
+
+    `corners` (3, 4) are homogeneous pixels. If a corner of that part has a w that is not positive, the box is the whole
+    image.
+    """
     x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
     for i in range(3):
         j = (i + 1) % 3
@@ -421,7 +454,8 @@ def _clipped_box(corners, width, height):
 def _sort(first, last, order, listed, spans, places, items):
     """Sort a list by bands: write the rows of each band's triangles to `items`, from `places` (chunks, bands) on.
 
-    In the list, `order` replaces triangles' indices by those of the proxy; if it is empty, they are the same.
+    Only chunks [first, last) are sorted; `places` move on. In the list, `order` replaces triangles' indices by those of
+    the proxy; if `order` is empty, they are the same.
     """
     for chunk in range(first, last):
         if len(order) > 0:

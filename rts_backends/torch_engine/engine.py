@@ -36,13 +36,13 @@ def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
 
 
 def _to_host(x: torch.Tensor) -> np.ndarray:
-    """The value as NumPy; half precision, of which NumPy knows only one kind, as float32."""
+    """The detached value as NumPy, without a copy where it is on the host; both half precisions as float32."""
     x = x.detach().cpu()
     return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
 
 
 class _HostCall(torch.autograd.Function):
-    """A host function without derivative, transparent to every torch transform."""
+    """A call of a host function, without derivative, that works under every torch transform."""
 
     @staticmethod
     def forward(fn, specs, *args):
@@ -93,7 +93,7 @@ class TorchEngine(Engine):
         return isinstance(x, torch.Tensor)
 
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
-        """`value` on the device of `like`, floats as float64 if `like` is, else as float32."""
+        """`value` on the device of `like`, else on the CPU; floats as float64 if `like` is, else as float32."""
         array = np.asarray(value)
         dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
         if array.dtype != dtype and array.dtype.kind == "f":
@@ -103,14 +103,17 @@ class TorchEngine(Engine):
         return _tensor(array, None if like is None else like.device)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
-        """Call `fn` on NumPy views or copies of `args`; under vmap once for each item, packed rows padded alike."""
+        """Call `fn` on NumPy views or copies of `args`, without derivative.
+
+        Under `torch.vmap` it is called once for each item, and packed results are padded with zeros to the longest.
+        """
         if torch.compiler.is_compiling():
             # torch annotates nothing of what `disable` returns.
             return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)  # pyright: ignore[reportCallIssue]
         return applied(_HostCall, fn, specs, *args)
 
     def uncompiled(self, f: Callable) -> Callable:
-        """`f` itself, called and not traced where `torch.compile` meets it."""
+        """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
         return torch.compiler.disable(f) if torch.compiler.is_compiling() else f
 
     def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
@@ -118,7 +121,10 @@ class TorchEngine(Engine):
         return x.detach()
 
     def apply(self, operation: Operation, operands: Sequence[torch.Tensor], params: Mapping[str, Any]) -> torch.Tensor:
-        """The result by compiled code on the host, if all floats are float32 or all float64; else by specification."""
+        """The operation's result: by compiled code if tensors are on the host, with all floats float32 or all float64.
+
+        Otherwise, and under `torch.compile`, by its specification, which is array code.
+        """
         return operations.apply(operation, operands, params)
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
@@ -131,11 +137,15 @@ class TorchEngine(Engine):
         return a.is_cpu and b.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
     def plain(self, x: torch.Tensor) -> bool:
-        """True for a dense tensor of real numbers that has values, while forward mode is off."""
+        """True for a dense tensor with values, of a dtype in `_REAL`, while torch's forward mode is off."""
         return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and torch_internals.forward_level() < 0
 
     def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
-        """`x`, its tangent in its own dtype. Sparse, quantized and complex tensors, and "meta", are refused."""
+        """`x`, with its tangent in the dtype of `x`.
+
+        Raises:
+            InputError: `x` is sparse, quantized, complex, or on the device "meta".
+        """
         if x.layout is not torch.strided or x.is_quantized:
             what = "quantized" if x.is_quantized else str(x.layout).removeprefix("torch.")
             raise InputError(f"{name} is a {what} tensor; expected a dense one (to_dense(), dequantize())")
@@ -146,7 +156,7 @@ class TorchEngine(Engine):
         return tangent_alike(x) if torch_internals.forward_level() >= 0 else x
 
     def known(self, x: torch.Tensor) -> np.ndarray | None:
-        """The value of `x`, for all items of a batch; None under `torch.compile`, or for a `foreign` tensor."""
+        """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
         if torch.compiler.is_compiling() or foreign(x):
             return None
         if not torch_internals.transforms_active():
@@ -157,11 +167,11 @@ class TorchEngine(Engine):
             return _to_host(x)
 
     def padded(self, x: torch.Tensor) -> bool:
-        """True under `torch.func` transforms: under `torch.vmap` each item has as many rows as the largest."""
+        """True under a `torch.func` transform: under `torch.vmap` all items have as many rows as the longest."""
         return torch_internals.maybe_current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
-        """See `Engine.fill_unused`: by selection; all ones if no row is in use."""
+        """See `Engine.fill_unused`: by selection; all rows become ones if no row is in use."""
         used = row.max() + 1
         index = torch.arange(x.shape[0], device=x.device).reshape(-1, *[1] * (x.ndim - 1))
         return torch.where(index < used, x, torch.where(used > 0, x[:1], torch.ones_like(x[:1])))
@@ -184,7 +194,10 @@ class TorchEngine(Engine):
         state: Tree,
         most: int,
     ) -> Tree:
-        """A Python loop; under `torch.vmap` it goes on as long as any item does, and finished items stay unchanged."""
+        """See `Engine.repeat`: by a Python loop.
+
+        Under `torch.vmap` it goes on as long as any item does, and finished items stay unchanged.
+        """
         with torch.no_grad():
             return map_leaves(
                 self.stop_gradient, self._repeated(body, going, map_leaves(self.stop_gradient, state), most)
@@ -212,7 +225,7 @@ class TorchEngine(Engine):
         return x
 
     def concurrent(self) -> bool:
-        """True unless a transform or inference mode is on: torch sets these for one thread alone."""
+        """True unless a transform, a compilation or inference mode is on: torch sets these for one thread alone."""
         return not transformed() and not torch.is_inference_mode_enabled()
 
     def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:

@@ -16,9 +16,9 @@ from rts_backends.torch_engine import torch_internals
 
 
 def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
-    """Call `function.apply(*args)`, with all arguments given.
+    """The result of `function.apply(*args)`, with all arguments given.
 
-    Outside of transforms it spares torch's search for defaults, which takes longer than a small loop.
+    Outside of transforms this spares torch's search for defaults, which takes longer than a small loop.
     """
     if torch_internals.transforms_active():
         return function.apply(*args)
@@ -29,7 +29,7 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
 
 
 def transformed() -> bool:
-    """True while a transform of torch, forward mode or a compilation traces the computation."""
+    """True under a `torch.func` transform, in forward mode, or while `torch.compile` traces."""
     if torch.compiler.is_compiling() or torch_internals.forward_level() >= 0:
         return True
     return torch_internals.maybe_current_level() is not None
@@ -39,7 +39,7 @@ _loaded: list[bool] = []
 
 
 def quiet_forward_mode() -> None:
-    """Have torch load the modules of its forward mode once; the loading warns of torch's own `torch.jit.script`."""
+    """Have torch load the modules of its forward mode, once, and hide its warning of `torch.jit.script`."""
     if not _loaded:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
@@ -48,7 +48,7 @@ def quiet_forward_mode() -> None:
 
 
 def foreign(*tensors: Tensor | None) -> bool:
-    """True if a tensor is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which hides its values."""
+    """True if any tensor is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which hides its values."""
     for t in tensors:
         if t is not None and torch_internals.is_legacy_batchedtensor(t):
             return True
@@ -71,7 +71,7 @@ def tangent_alike(x: Tensor) -> Tensor:
 
 
 def on_host(x: Tensor) -> np.ndarray:
-    """The value of a tensor in the memory of the host, without a copy."""
+    """The value of a tensor in the memory of the host: a view, or new zeros for torch's zeros without memory."""
     x = x.detach()
     # Zeros that torch's forward mode makes up have no memory.
     return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if torch_internals.is_zero(x) else x.numpy()

@@ -1,7 +1,7 @@
 """Operations as torch functions: autograd, `torch.func` transforms, forward mode and `torch.compile`.
 
-Three functions: the value, its pullback and its pushforward, each by compiled code. The derivatives of the last two,
-which are second derivatives of the value, are taken of the specification.
+Three functions: the value, its pullback (gradients) and its pushforward (tangents), each by compiled code. The
+derivatives of the last two, which are second derivatives of the value, are taken of the specification: array code.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, tor
 
 
 def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str, Any]) -> Tensor:
-    """The result of an operation, by compiled code if it takes the operands, else by specification."""
+    """The result of an operation: by compiled code if it takes the operands, else by the operation's array code.
+
+    The array code also runs under `torch.compile`, and while other array code is differentiated.
+    """
     if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
@@ -32,9 +35,9 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
 
 class _Specifying(threading.local):
-    """A flag `on` for each thread: True while a specification is differentiated.
+    """A flag `on` for each thread: True while an operation's specification, its array code, is differentiated.
 
-    Operations in the specification then run as array code, too: torch cannot nest its transforms in `Function`s.
+    Operations called inside it then run as array code, too: torch cannot nest its transforms in `Function`s.
     """
 
     on = False
@@ -44,7 +47,7 @@ _specifying = _Specifying()
 
 
 def _fits(operands: Sequence[Tensor]) -> bool:
-    """True if compiled code takes these operands: on the host, all floats float32 or all float64."""
+    """True if compiled code takes these operands: on the host, floats all float32 or all float64, the rest integers."""
     real = operands[0].dtype
     if real not in _DTYPES:
         return False
@@ -76,7 +79,7 @@ class _Call:
         return given[: self.count], given[self.count :]
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
-        """The specification as a function of the differentiable operands; `fixed` are the others."""
+        """The operation's array code as a function of the differentiable operands; `fixed` are the others."""
 
         def specified(*varied: Tensor) -> Tensor:
             before, _specifying.on = _specifying.on, True
@@ -88,7 +91,7 @@ class _Call:
         return specified
 
     def pulled(self, wanted: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., tuple[Tensor, ...]]:
-        """The specification's pullback as a function of the differentiable operands and the gradient.
+        """The pullback of the array code, as a function of the differentiable operands and the result's gradient.
 
         It returns a gradient for each differentiable operand, empty if not wanted.
         """
@@ -100,7 +103,10 @@ class _Call:
         return pull
 
     def pushed(self, present: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., Tensor]:
-        """The specification's pushforward as a function of the differentiable operands, and present tangents (T, ·)."""
+        """The pushforward of the array code, as a function of the differentiable operands and present tangents (T, ·).
+
+        It returns the result's tangents (T, ·).
+        """
 
         def push(*given: Tensor) -> Tensor:
             varied, tangents = self.split(given)
@@ -114,7 +120,7 @@ class _Call:
 
 
 def _spread(given: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
-    """A list as long as `present`: the items of `given`, in order, where it is True, and None elsewhere."""
+    """A list as long as `present`: the items of `given`, in order, where `present` is True, and None elsewhere."""
     it = iter(given)
     return [next(it) if there else None for there in present]
 
@@ -124,7 +130,7 @@ def _host(tensors: Sequence[Tensor]) -> list[np.ndarray]:
 
 
 def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
-    """Arguments of each item of a `torch.vmap` batch."""
+    """For each item of a `torch.vmap` batch, the tuple of its arguments."""
     return [
         tuple(a if d is None else a.select(d, b) for a, d in zip(args, in_dims, strict=True))
         for b in range(info.batch_size)
@@ -196,7 +202,7 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def _differentiable(ctx):
-        """The specification's pullback, its arguments that have derivatives, and the number of other operands."""
+        """The pullback by array code, its arguments that have derivatives, and the number of the other operands."""
         *operands, g = ctx.saved_tensors
         varied, fixed = ctx.call.split(operands)
         return ctx.call.pulled(ctx.wanted, fixed), (*varied, g), len(fixed)
@@ -242,7 +248,7 @@ class _Push(torch.autograd.Function):
 
     @staticmethod
     def _differentiable(ctx):
-        """The specification's pushforward, its arguments that have derivatives, and the number of other operands."""
+        """The pushforward by array code, its arguments that have derivatives, and the number of the other operands."""
         given, count = ctx.saved_tensors, sum(ctx.present)
         varied, fixed = ctx.call.split(given[:-count])
         return ctx.call.pushed(ctx.present, fixed), (*varied, *given[-count:]), len(fixed)

@@ -47,5 +47,5 @@ is_zero = getattr(Tensor, "_is_zerotensor", lambda x: False)
 
 
 def forward_level() -> int:
-    """The level of forward mode, negative where it is off."""
+    """The level of forward mode, negative where it is off; 0 from a torch that does not tell."""
     return getattr(forward_ad, "_current_level", 0)
