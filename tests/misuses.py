@@ -143,6 +143,15 @@ def residuals(**options):
     return rts.ImageResiduals(lambda p: scene(p)[0], CAMERA, SIZE, np.ones(SIZE, np.float32), **options)(pose())
 
 
+def of_views(**options):
+    """Residuals of a view, computed once."""
+    view = rts.View(CAMERA, np.ones((*SIZE, 4), np.float32))
+    given = {"scene": lambda p: scene(p)[0], "views": [view], **options}
+    residuals = rts.ViewResiduals(**given)
+    return residuals.of(residuals.load(residuals.draw(0)[0]))(pose())
+
+
+
 OPERATION = "name", "specification", "ranks", "shape", "forward", "push", "pull", "differentiable", "packed", "keeps"
 RENDERED = (
     "parts",
@@ -203,13 +212,25 @@ GROUPS = {
     "Subdivision": open_in(
         subdivided, "faces", "scheme", "creases", "corners", "boundary", "chaikin", "indices", "uv_rule", "tolerance"
     ),
+    "View": open_in(
+        lambda **o: rts.View(**{"camera": CAMERA, "image": np.ones((*SIZE, 4), np.float32), **o}),
+        *("camera", "image", "size", "mask"),
+    ),
+    "ViewResiduals": open_in(
+        of_views,
+        *("scene", "views", "batch", "window", "seed", "cameras", "exposure", "weights", "target", "unreadable", "memory"),
+        *("background", "sampler", "splatter", "layers", "supersample", "capacity", "channels", "loss", "f_scale"),
+    ),
     "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s"),
     "engine_of": {"trees": rts.engine_of},
     "exact_calibration": {"reach": lambda v: rts.splatting.exact_calibration(0.5, v)},
     "explain": open_in(
         lambda **o: rts.explain(PART, CAMERA, **o), "size", "splatter", "layers", "supersample", size=SIZE
     ),
-    "fit": open_in(lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o), "progress", "jit"),
+    "fit": open_in(
+        lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o),
+        *("progress", "jit", "method", "learning_rate", "validation", "validate_every", "checkpoint", "checkpoint_every"),
+    ),
     "gradient": {"points": lambda v: gradient(lambda p: p[:, 0], v)},
     "gradient_image": {
         "parameters": lambda v: rts.gradient_image(lambda p: p, v),
