@@ -218,6 +218,7 @@ GROUPS = {
             *("split", "downscale", "linear", "background", "pixel_center", "frame", "near", "far", "cache"),
         ),
     },
+    "save_views": {"path": lambda v: rts.save_views(v, []), "views": lambda v: rts.save_views("views.json", v)},
     "namespace": {"arrays": rts.namespace},
     "plugins": {"details": lambda v: rts.plugins("surfaces", details=v)},
     "render_samples": {"engine": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, engine=v)},
