@@ -26,6 +26,8 @@ MODELS = {
 FISHEYE = "OPENCV_FISHEYE"
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion, in OpenCV's order."""
+BAND = 32
+"""Rows of a picture that are undistorted together: their positions stay in caches."""
 
 
 @dataclass(frozen=True)
@@ -164,14 +166,18 @@ def undistorted(picture: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray
     """
     from scipy.ndimage import map_coordinates
 
-    height, width = picture.shape[:2]
-    rows, columns = np.mgrid[:height, :width]
-    x, y = lens.distorted(columns + 0.5, rows + 0.5)
-    defined = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)  # NaN is not.
-    place = np.where(defined, np.stack([y, x]) - 0.5, 0)
-    channels = [map_coordinates(c, place, order=1, mode="nearest") for c in np.moveaxis(picture, 2, 0)]
-    known = defined.astype(np.float32)
-    return np.stack(channels, axis=2) * known[..., None], known
+    height, width, channels = picture.shape
+    result, known = np.empty(picture.shape, np.float32), np.empty((height, width), np.float32)
+    for start in range(0, height, BAND):
+        band = slice(start, start + BAND)
+        rows, columns = np.mgrid[start : min(start + BAND, height), :width]
+        x, y = lens.distorted(columns + 0.5, rows + 0.5)
+        defined = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)  # NaN is not.
+        place = np.where(defined, np.stack([y, x]) - 0.5, 0)
+        for c in range(channels):
+            result[band, :, c] = defined * map_coordinates(picture[..., c], place, order=1, mode="nearest")
+        known[band] = defined
+    return result, known
 
 
 def _first_root(polynomial: Polynomial) -> float:

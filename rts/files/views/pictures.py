@@ -122,10 +122,10 @@ def read_mask(pose: Pose) -> np.ndarray:
         mask = _encoded(pose.mask)[..., :3].mean(axis=2)
         _check_unchanged(pose.mask, mask.shape, pose.mask_size)
         if mask.shape != pose.size:
-            mask = np.asarray(Image.fromarray(mask).resize(pose.size[::-1], Image.Resampling.BOX))
+            height, width = pose.size
+            mask = np.asarray(Image.fromarray(mask).resize((width, height), Image.Resampling.BOX))
     if pose.lens.distorts:
-        found, defined = undistorted(mask[..., None], pose.lens)
-        mask = found[..., 0] * defined
+        mask = undistorted(mask[..., None], pose.lens)[0][..., 0]  # It is 0 where nothing is defined.
     return _means(mask[..., None], pose.downscale)[..., 0]
 
 

@@ -72,23 +72,24 @@ class _Entry(NamedTuple):
     camera_to_world: np.ndarray
 
 
-def _entry(place: str, view: View) -> _Entry:
-    height, width = check_pixels(view.size)
-    camera: Any = view.camera
+def _entry(place: str, posed: View) -> _Entry:
+    height, width = check_pixels(posed.size)
+    camera: Any = posed.camera
     if not isinstance(camera, Camera) or camera.is_stacked:
         raise InputError(f"{place} has a camera that is {quoted(camera)}; expected an rts.Camera of one view")
-    known = [value_of(matrix) for matrix in (camera.view, camera.projection)]
+    known: list[Any] = [value_of(matrix) for matrix in (camera.view, camera.projection)]
     if any(matrix is None or not np.isfinite(matrix).all() for matrix in known):
         raise InputError(f"{place} has a camera that is traced, NaN or infinite; expected one of finite numbers")
-    camera = Camera(*(np.asarray(matrix, np.float64) for matrix in known), camera.aspect)
+    view, projection = (np.asarray(matrix, np.float64) for matrix in known)
+    camera = Camera(view, projection, camera.aspect)
     K, rotation, translation = camera.to_opencv((height, width), pixel_center=0.5)
     if min(K[0, 0], K[1, 1]) <= 0 or abs(K[0, 1]) > SKEW * K[0, 0]:
         raise InputError(f"{place} has a camera that mirrors or skews, K = {K.tolist()}; these formats have none")
     check_rotation(f"the rotation of {place}.camera", rotation)
-    lens = replace(view.lens or Lens(1, 1, 0, 0), fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+    lens = replace(posed.lens or Lens(1, 1, 0, 0), fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
     model = "FULL_OPENCV" if any((lens.k3, lens.k4, lens.k5, lens.k6)) else "OPENCV"
     model = FISHEYE if lens.fisheye else model if lens.distorts else "PINHOLE"
-    return _Entry(view, place, model, lens, rotation, translation, np.linalg.inv(camera.view))
+    return _Entry(posed, place, model, lens, rotation, translation, np.linalg.inv(view))
 
 
 def _blender(folder: Path, entries: list[_Entry]) -> str:
