@@ -27,6 +27,7 @@ def images(count):
 
 
 POINTS = [((0.1 * i, 0.3, 0.02 * i * i), [20 - j for j in range(i % 4)]) for i in range(30)]
+POINTS.append(((0, 0, -50.0), [20]))  # A wrong one, behind the camera.
 
 
 def data_set(folder, write=binary_model, count=10, model="sparse/0", size=SIZE, **options):
@@ -59,8 +60,9 @@ def test_cameras_of_models_see_what_opencv_s_equation_says(tmp_path, form, model
         expected = np.stack([90 * x + 63, 84 * y + 49.5, local[:, 2]], axis=1)
         np.testing.assert_allclose(view.camera.project(points, SIZE), expected, rtol=1e-9)
         assert view.image.shape == (*SIZE, 4) and (view.lens is not None) == (i == 1)
-        depths = [float(turn[2] @ np.array(p) + place[2]) for p, seen in POINTS if number in seen]
-        if depths:
+        depths = np.array([turn[2] @ np.array(p) + place[2] for p, seen in POINTS if number in seen])
+        depths = depths[depths > 0]
+        if len(depths):
             np.testing.assert_allclose([view.near, view.far], np.percentile(depths, [0.1, 99.9]), rtol=1e-12)
             np.testing.assert_allclose(view.camera.depth_range(), (view.near / 100, view.far * 100), rtol=1e-6)
         else:
@@ -171,18 +173,19 @@ def test_a_real_scene_is_the_same_in_two_formats(tmp_path, data):
     fern = np.load(data / "nerf/fern_images_378.npz")
     height, width, focal = fern["hwf"]
     np.save(tmp_path / "poses_bounds.npy", fern["poses_bounds"])
-    listed, seen = [], [[] for _ in fern["points_xyz"]]
+    positions = fern["points_xyz"][::3]
+    listed, seen = [], [[] for _ in positions]
     for i, row in enumerate(fern["poses_bounds"]):
         save(tmp_path / f"images/{i:02}.png", np.ascontiguousarray(fern["rgb"][i, ::42, ::42]))
         down, right, back, position = row[:-2].reshape(3, 5).T[:4]
         turn = np.stack([right, down, -back])
         listed.append((i + 1, turn, -turn @ position, 1, f"{i:02}.png", []))
-        local = fern["points_xyz"] @ turn.T - turn @ position
+        local = positions @ turn.T - turn @ position
         pixels = focal * local[:, :2] / local[:, 2:] + [width / 2, height / 2]
         inside = (local[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
         for n in np.flatnonzero(inside):
             seen[n].append(i + 1)
-    points = list(zip(fern["points_xyz"].tolist(), seen, strict=True))
+    points = list(zip(positions.tolist(), seen, strict=True))
     binary_model(tmp_path / "sparse/0", {1: ("SIMPLE_PINHOLE", (378, 504), [focal, 252.0, 189.0])}, listed, points)
     colmap = rts.load_views(tmp_path / "sparse/0", split="all")
     llff = rts.load_views(tmp_path / "poses_bounds.npy")

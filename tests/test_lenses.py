@@ -87,17 +87,18 @@ def test_a_lens_that_turns_back_shows_no_place_twice(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "lens", [Lens(1, 1, 0, 0, k4=-0.25), Lens(1, 1, 0, 0, k1=-1 / 12), Lens(1, 1, 0, 0, k1=-1 / 12, fisheye=True)]
+    "reach, distortion",
+    [
+        (2, {"k4": -0.25}),  # 1 − r² / 4 under the fraction is 0.
+        (2, {"k1": -1 / 12}),  # r − r³ / 12 has its maximum.
+        (np.tan(1), {"k4": -1 / 9, "fisheye": True}),  # θ − θ⁹ / 9 has it at θ = 1.
+        (np.inf, {"k1": -1 / 12, "fisheye": True}),  # θ − θ³ / 12 has it at θ = 2, behind the camera.
+    ],
 )
-def test_a_lens_reaches_as_far_as_its_polynomials_grow(lens):
-    # 1 − r² / 4 under the fraction ends at r = 2; r − r³ / 12 has its maximum at 2, and for a fisheye at θ = 2 > π / 2.
-    r = np.array([0.0, 1, 1.999, 2.001, 5])
-    found = lens.distorted(r, 0 * r)[0]
-    if lens.fisheye:
-        angle = np.arctan(r)
-        np.testing.assert_allclose(found, angle - angle**3 / 12, atol=1e-12)
-    else:
-        np.testing.assert_array_equal(np.isnan(found), r > 2)
+def test_a_lens_reaches_as_far_as_its_polynomials_grow(reach, distortion):
+    r = np.array([0.0, 1, 1.55, 1.56, 1.999, 2.001, 50])
+    found = Lens(1, 1, 0, 0, **distortion).distorted(r, 0 * r)[0]
+    np.testing.assert_array_equal(np.isnan(found), r > reach)
 
 
 def test_without_distortion_a_picture_stays():
@@ -142,6 +143,8 @@ def test_focal_lengths_and_principal_points_of_json_are_followed(tmp_path, facto
     depth = -points[:, 2]
     expected = np.stack([61 + 90 * points[:, 0] / depth, 50 - 84 * points[:, 1] / depth, depth / factor], axis=1)
     np.testing.assert_allclose(view.camera.project(points, view.size), factor * expected, rtol=1e-12)
+    (width,) = transforms(tmp_path, {k: v for k, v in LENS.items() if k != "h"}, size=(96 * factor, 128 * factor))
+    assert width.camera == view.camera
     (frames,) = transforms(tmp_path, {**LENS, "fl_x": 1.0}, LENS, size=(96 * factor, 128 * factor))
     assert frames.camera == view.camera
 

@@ -28,7 +28,7 @@ def save_views(path: Any, views: Any) -> None:
 
     Pictures and masks are not written: they stay where they are. Where the pictures are of a lens that distorts, its
     coefficients are written as well. So files speak of the pictures as they are on disk, at the views' size. Near and
-    far planes are not written.
+    far planes, and masks' names, are not written. A camera of another `pixel_center` is written as it is, shifted.
 
     Args:
         path: a name ending in .json, for Blender's format with fl_x, fl_y, cx, cy, w, h in each frame. It names
