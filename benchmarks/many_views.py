@@ -57,13 +57,20 @@ def shape(name: str, size: int, count: int) -> Shape:
         theta["colors"] = (0.5 + 0.35 * np.sin(9 * vertices + np.array([0, 2, 4]))).astype(np.float32)
     part = part.replace(theta=theta, shader="lambert")
     distance = 1.05 * np.linalg.norm(vertices, axis=1).max() / np.sin(np.radians(FOV / 2))
-    return Shape(part, pictures(part, distance * sphere(count), size), pictures(part, distance * sphere(8, 1.0) * [1, -1, 1], size))
+    return Shape(
+        part,
+        pictures(part, distance * sphere(count), size),
+        pictures(part, distance * sphere(8, 1.0) * [1, -1, 1], size),
+    )
 
 
 def pictures(part: rts.Part, eyes: np.ndarray, size: int) -> list[rts.View]:
     """Pictures of a part from all around, 4 × 4 samples a pixel."""
     cameras = [rts.Camera.look_at(eye, (0, 0, 0), fov_y=FOV) for eye in eyes]
-    return [rts.View(c, np.asarray(rts.render(part, c, (size, size), supersample=4)), name=f"{i}") for i, c in enumerate(cameras)]
+    return [
+        rts.View(c, np.asarray(rts.render(part, c, (size, size), supersample=4)), name=f"{i}")
+        for i, c in enumerate(cameras)
+    ]
 
 
 class Model(NamedTuple):
@@ -77,7 +84,9 @@ class Model(NamedTuple):
         return rts.Part(self.surface, {"vertices": self.steps.decode(p["shape"]), "colors": p["colors"]}, "unlit")
 
 
-def fitted(start: trimesh.Trimesh, colors: np.ndarray, shape: Shape, steps: int, batch: int, smoothness: float, rates: dict) -> tuple[trimesh.Trimesh, np.ndarray, Any]:
+def fitted(
+    start: trimesh.Trimesh, colors: np.ndarray, shape: Shape, steps: int, batch: int, smoothness: float, rates: dict
+) -> tuple[trimesh.Trimesh, np.ndarray, Any]:
     """The mesh and its colours after some steps."""
     large = rts.LargeSteps(start.faces, len(start.vertices), smoothness)
     model = Model(large, rts.Mesh(start.faces))
@@ -131,7 +140,7 @@ if __name__ == "__main__":
         ball = trimesh.creation.icosphere(4)
         ball.apply_scale(0.6)
         mesh, colors = ball, np.full((len(ball.vertices), 3), 0.5, np.float32)
-        for stage, (steps, smooth, rate) in enumerate(zip(options.steps, options.smooth, options.rate)):
+        for stage, (steps, smooth, rate) in enumerate(zip(options.steps, options.smooth, options.rate, strict=True)):
             if stage == 1:
                 vertices, faces, colors = finer(mesh, colors)
                 mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -142,7 +151,19 @@ if __name__ == "__main__":
                 {"vertices": np.asarray(mesh.vertices, np.float32), "colors": colors},
                 "unlit",
             )
-            print(name, stage, len(mesh.vertices), f"{time.perf_counter() - start:.0f} s", f"chamfer {100 * chamfer(mesh, truth):.3f} %", f"PSNR {psnr(part, known.held_out):.2f} dB", fit.loss, flush=True)
+            print(
+                name,
+                stage,
+                len(mesh.vertices),
+                f"{time.perf_counter() - start:.0f} s",
+                f"chamfer {100 * chamfer(mesh, truth):.3f} %",
+                f"PSNR {psnr(part, known.held_out):.2f} dB",
+                fit.loss,
+                flush=True,
+            )
         if options.pictures:
-            shown = [np.concatenate([np.asarray(rts.render(part, v.camera, v.size, supersample=2)), v.image], axis=0) for v in known.held_out[:4]]
+            shown = [
+                np.concatenate([np.asarray(rts.render(part, v.camera, v.size, supersample=2)), v.image], axis=0)
+                for v in known.held_out[:4]
+            ]
             rts.save_image(options.pictures / f"{name}.png", np.concatenate(shown, axis=1))

@@ -32,7 +32,8 @@ from rts.errors import (
 )
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
-from rts.files.posed_images import load_views
+from rts.files.views.loading import load_views
+from rts.files.views.saving import save_views
 from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.large_steps import LargeSteps
@@ -141,6 +142,7 @@ __all__ = [
     "sample",
     "save_animation",
     "save_image",
+    "save_views",
     "tune",
     "volume_render",
     "warmup",

@@ -151,7 +151,6 @@ def of_views(**options):
     return residuals.of(residuals.load(residuals.draw(0)[0]))(pose())
 
 
-
 OPERATION = "name", "specification", "ranks", "shape", "forward", "push", "pull", "differentiable", "packed", "keeps"
 RENDERED = (
     "parts",
@@ -218,7 +217,19 @@ GROUPS = {
     ),
     "ViewResiduals": open_in(
         of_views,
-        *("scene", "views", "batch", "window", "seed", "cameras", "exposure", "weights", "target", "unreadable", "memory"),
+        *(
+            "scene",
+            "views",
+            "batch",
+            "window",
+            "seed",
+            "cameras",
+            "exposure",
+            "weights",
+            "target",
+            "unreadable",
+            "memory",
+        ),
         *("background", "sampler", "splatter", "layers", "supersample", "capacity", "channels", "loss", "f_scale"),
     ),
     "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s"),
@@ -229,7 +240,16 @@ GROUPS = {
     ),
     "fit": open_in(
         lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o),
-        *("progress", "jit", "method", "learning_rate", "validation", "validate_every", "checkpoint", "checkpoint_every"),
+        *(
+            "progress",
+            "jit",
+            "method",
+            "learning_rate",
+            "validation",
+            "validate_every",
+            "checkpoint",
+            "checkpoint_every",
+        ),
     ),
     "gradient": {"points": lambda v: gradient(lambda p: p[:, 0], v)},
     "gradient_image": {
@@ -245,6 +265,7 @@ GROUPS = {
             *("split", "downscale", "linear", "background", "pixel_center", "frame", "near", "far", "cache"),
         ),
     },
+    "save_views": {"path": lambda v: rts.save_views(v, []), "views": lambda v: rts.save_views("views.json", v)},
     "namespace": {"arrays": rts.namespace},
     "plugins": {"details": lambda v: rts.plugins("surfaces", details=v)},
     "render_samples": {"engine": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, engine=v)},

@@ -901,6 +901,13 @@ def of_base(name, change):
     return lambda self, *args: change(getattr(super(type(self), self), name)(*args))
 
 
+def forgetful(self, *args):
+    """An optimiser that does not take its state back."""
+    step = super(type(self), self).optimizer(*args)
+    step.restore = lambda state, parameters: None
+    return step
+
+
 def others(name, function):
     """The namespace of torch with another function."""
     from types import SimpleNamespace

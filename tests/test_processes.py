@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytestmark = [pytest.mark.fitting, pytest.mark.thorough]
+pytestmark = pytest.mark.fitting
 pytest.importorskip("torch")
 
 SCRIPT = Path(__file__).with_name("distributed_fit.py")
@@ -31,6 +31,7 @@ def results(path):
         return {name: known[name] for name in known.files}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["adam", "lm"])
 def test_two_processes_take_the_steps_of_one(tmp_path, method):
     for count in (1, 2):
@@ -42,6 +43,7 @@ def test_two_processes_take_the_steps_of_one(tmp_path, method):
         np.testing.assert_allclose(two[name], one[name], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_job_goes_on_after_a_process_has_ended(tmp_path):
     code, output = run(1, "adam", tmp_path / "whole.npz")
     assert code == 0, output
@@ -52,6 +54,7 @@ def test_a_job_goes_on_after_a_process_has_ended(tmp_path):
     np.testing.assert_allclose(results(ended)["history"], results(tmp_path / "whole.npz")["history"], rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_without_a_restart_the_job_ends_with_a_line(tmp_path):
     code, output = run(2, "adam", tmp_path / "ended.npz", tmp_path / "checkpoint", "1:23")
     assert code != 0

@@ -120,7 +120,10 @@ class Checkpoint:
         if self._processes is not None and self._processes.rank:
             return
         about = json.dumps({**state.about, "identity": self._identity}).encode()
-        arrays = {"about": np.frombuffer(about, np.uint8), "method": np.frombuffer(state.method, np.uint8)}
+        arrays: dict[str, Any] = {
+            "about": np.frombuffer(about, np.uint8),
+            "method": np.frombuffer(state.method, np.uint8),
+        }
         arrays |= dict(self._numbered("parameters", state.parameters))
         if state.best is not None:
             arrays |= dict(self._numbered("best", state.best))

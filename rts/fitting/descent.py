@@ -176,8 +176,10 @@ def checked_rates(learning_rate: Any, method: Any, names: Sequence[str]) -> floa
         if learning_rate is not None:
             raise InputError("learning_rate is given beside an optimiser object, which has its own; leave it out")
         return 0.0
+    if learning_rate is None:
+        return LEARNING_RATES.get(method, 0.0)
     if not isinstance(learning_rate, dict):
-        return _checked_rate("learning_rate", LEARNING_RATES.get(method, 0.0), learning_rate)
+        return _checked_rate("learning_rate", learning_rate)
     if method == "lm":
         raise InputError('learning_rate is a mapping, and method "lm" has no rates; leave it out')
     rates: dict[str, float] = {}
@@ -185,15 +187,13 @@ def checked_rates(learning_rate: Any, method: Any, names: Sequence[str]) -> floa
         own = [name for name in names if name == key or name.startswith(f"{key}.")]
         if not own:
             raise InputError(f"learning_rate names {quoted(key)}; expected names of parameters: {listed(names, 8)}")
-        rates |= dict.fromkeys(own, _checked_rate(f"learning_rate[{key!r}]", None, learning_rate[key]))
+        rates |= dict.fromkeys(own, _checked_rate(f"learning_rate[{key!r}]", learning_rate[key]))
     if missing := [name for name in names if name not in rates]:
         raise InputError(f"learning_rate has no rate for {listed(missing, 8)}; expected one for each array")
     return [rates[name] for name in names]
 
 
-def _checked_rate(what: str, default: float | None, rate: Any) -> float:
-    if rate is None and default is not None:
-        return default
+def _checked_rate(what: str, rate: Any) -> float:
     if not (is_real(rate) and 0 < rate < math.inf):
         raise InputError(f"{what} is {quoted(rate)}; expected a positive number")
     return float(rate)

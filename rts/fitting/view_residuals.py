@@ -115,7 +115,7 @@ class ViewResiduals(Residuals):
         if not (is_real(memory) and memory >= 0):
             raise InputError(f"memory is {quoted(memory)}; expected a number of bytes")
         self._seed, self._memory = int(seed), float(memory)
-        self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._kept: OrderedDict[int, tuple[np.ndarray, np.ndarray | None]] = OrderedDict()
         self._warned = False
         self._options: dict[str, Any] = {
             "background": background,
@@ -191,7 +191,8 @@ class ViewResiduals(Residuals):
         """
         number, corner = key
         view = self.views[number]
-        data = {"camera": view.camera, "target": self._picture(number), "weights": self._factors(number)}
+        target, weights = self._picture(number)
+        data: dict[str, Any] = {"camera": view.camera, "target": target, "weights": weights}
         if corner is not None and self._window is not None:
             (top, left), (height, width) = corner, self._window
             band = slice(top, top + height), slice(left, left + width)
@@ -227,14 +228,15 @@ class ViewResiduals(Residuals):
 
     # ------------------------------------------------------------------------------------------------ pictures
 
-    def _picture(self, number: int) -> np.ndarray:
-        """The picture to compare a view with, (H, W, ·) float32."""
+    def _picture(self, number: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """The picture to compare a view with, (H, W, ·) float32; and weights (H, W) of differences, None for ones."""
         if number in self._kept:
             self._kept.move_to_end(number)
             return self._kept[number]
         view = self.views[number]
         try:
             picture = np.asarray(view.image if self._target is None else self._target(view))
+            mask = view.mask
         except InputError as error:
             raise InputError(f"view {number}: {error}") from error
         if picture.shape[:2] != tuple(view.size) or picture.ndim > 3 or picture.dtype.kind != "f":
@@ -244,11 +246,13 @@ class ViewResiduals(Residuals):
                 f"expected floats of shape ({height}, {width}, ·), as its camera is for"
             )
         self._warn_if_inverted(number, picture)
-        picture = picture.astype(np.float32, copy=False)
-        self._kept[number] = picture
-        while sum(x.nbytes for x in self._kept.values()) > self._memory and self._kept:
+        known = picture.astype(np.float32, copy=False), self._factors(number, mask)
+        self._kept[number] = known
+        while (
+            self._kept and sum(x.nbytes for pair in self._kept.values() for x in pair if x is not None) > self._memory
+        ):
             self._kept.popitem(last=False)
-        return picture
+        return known
 
     def _warn_if_inverted(self, number: int, picture: np.ndarray) -> None:
         alpha = picture if picture.ndim == 2 else picture[..., -1] if picture.shape[2] in (1, 4) else None
@@ -263,13 +267,16 @@ class ViewResiduals(Residuals):
                 InputWarning,
             )
 
-    def _factors(self, number: int) -> np.ndarray | None:
-        """Weights (H, W) of a view's differences; None for ones."""
-        mask, factor = self.views[number].mask, self._weights[number]
-        if mask is None and factor == 1:
-            return None
-        mask = np.ones(self.views[number].size, np.float32) if mask is None else np.asarray(mask, np.float32)
-        return factor * mask
+    def _factors(self, number: int, mask: np.ndarray | None) -> np.ndarray | None:
+        """A view's mask times its weight, (H, W) float32; None for ones."""
+        factor, size = self._weights[number], tuple(self.views[number].size)
+        if mask is None:
+            return None if factor == 1 else np.full(size, factor, np.float32)
+        if np.shape(mask) != size:
+            raise InputError(
+                f"view {number} ({self.views[number].name}) has a mask of shape {np.shape(mask)}, not {size}"
+            )
+        return factor * np.asarray(mask, np.float32)
 
     def _leave_out_unreadable(self) -> None:
         kept = []

@@ -1,8 +1,10 @@
-"""View, a picture with the camera that took it."""
+"""A view: a picture, the camera that took it, and where the picture counts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +12,13 @@ from rts.arrays.argument_checks import check_pixels, quoted
 from rts.errors import InputError
 from rts.scene.camera import Camera
 
+Reading = Callable[[], np.ndarray]
+
 
 class View:
     """A picture, and the camera that took it.
+
+    `camera` may be set to another one, such as one that was fitted: see `rts.save_views`.
 
     Args:
         camera: the camera, float64 NumPy.
@@ -23,6 +29,8 @@ class View:
         mask: (H, W) float32 from 0 to 1, 1 where the picture counts; or a function that returns it; None for all of it.
         near: the depth at which the scene begins, in the units of the camera; None where that is not known.
         far: the depth at which it ends, or None.
+        path: the file of the picture, or None.
+        lens: the lens that took the picture in `path`, for images of this size; None for one that does not distort.
 
     Raises:
         InputError: no camera of one view, or an image or mask of another size.
@@ -31,13 +39,15 @@ class View:
     def __init__(
         self,
         camera: Camera,
-        image: np.ndarray | Callable[[], np.ndarray],
+        image: np.ndarray | Reading,
         size: tuple[int, int] | None = None,
         *,
         name: str = "",
-        mask: np.ndarray | Callable[[], np.ndarray] | None = None,
+        mask: np.ndarray | Reading | None = None,
         near: float | None = None,
         far: float | None = None,
+        path: Path | None = None,
+        lens: Any = None,
     ):
         if not isinstance(camera, Camera) or camera.is_stacked:
             raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera of one view")
@@ -46,6 +56,7 @@ class View:
                 raise InputError("size is None, and image is a function; expected its (height, width), pixels")
             size = np.shape(image)[:2]
         self.camera, self.size, self.name, self.near, self.far = camera, check_pixels(size), name, near, far
+        self.path, self.lens = path, lens
         self._image, self._mask = image, mask
         for what, value in (("image", image), ("mask", mask)):
             if value is not None and not callable(value):
@@ -64,6 +75,8 @@ class View:
     def image(self) -> np.ndarray:
         """(H, W, 4) float32 premultiplied, or (H, W, 3) on the background; read now, if it is not kept.
 
+        Where the picture is not defined (`mask`) it is transparent, or the background.
+
         Raises:
             InputError: the picture is gone, damaged, or was exchanged for one of another size.
         """
@@ -71,5 +84,12 @@ class View:
 
     @property
     def mask(self) -> np.ndarray | None:
-        """(H, W) float32, 1 where the picture counts, 0 where it says nothing; None if all of it counts."""
+        """(H, W) float32 in [0, 1]: 1 where the picture is defined and counts; None where it does everywhere.
+
+        Of `rts.load_views`, the product of the mask's picture, if there is one, and of the part that is defined once a
+        lens's distortion is undone. A picture's own alpha is no part of it.
+
+        Raises:
+            InputError: the mask is gone, damaged, or was exchanged for one of another size.
+        """
         return self._mask() if callable(self._mask) else self._mask

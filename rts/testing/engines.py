@@ -324,14 +324,14 @@ class EngineConformance(Conformance):
         with owning(chosen):
             for name in ("sgd", "adam"):
                 parameters = map_leaves(chosen.constant, {"x": numbers(3), "y": [numbers(2, seed=1)]})
-                first = chosen.optimizer(name, [0.1, 0.3], parameters)
+                first: Any = chosen.optimizer(name, [0.1, 0.3], parameters)
                 if not hasattr(first, "state"):
                     pytest.skip("its optimisers have no state to keep")
                 once = first(parameters, map_leaves(chosen.constant, slopes))
                 state = first.state()
                 other = map_leaves(lambda v: chosen.constant(-3 * v), slopes)
                 expected = derivatives.host(chosen, first(once, other))
-                second = chosen.optimizer(name, [0.1, 0.3], parameters)
+                second: Any = chosen.optimizer(name, [0.1, 0.3], parameters)
                 second.restore(state, once)
                 stepped = derivatives.host(chosen, second(once, other))
                 for x, v in zip(leaves(stepped), leaves(expected), strict=True):
