@@ -59,8 +59,8 @@ SHAPES = {
 }
 SETTINGS: dict[str, list[dict[str, float]]] = {
     "vertices": [{"rate": 0.01, "weight": w} for w in (0.003, 0.03, 0.3)],
-    "large steps": [{"rate": r, "smoothness": 19.0} for r in (0.03, 0.1)],
-    "large steps, uniform": [{"rate": r, "smoothness": 19.0} for r in (0.1, 0.3)],
+    "large steps": [{"rate": r, "smoothness": 19.0} for r in (0.03, 0.1, 0.3)],
+    "large steps, uniform": [{"rate": r, "smoothness": 19.0} for r in (0.1, 0.3, 1.0)],
 }
 
 
