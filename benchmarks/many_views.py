@@ -202,11 +202,9 @@ def run(name: str, cameras: bool, folder: Path | None) -> None:
             f", cameras {np.median(angles):.2f}° (most {angles.max():.2f}°), {np.median(away):.2f} %" if cameras else ""
         )
         moved = model._replace(mesh=mesh)
-        print(
-            f"{name}, stage {number}: {seconds:.0f} s, {len(mesh.vertices)} vertices, chamfer "
-            f"{chamfer(mesh, known.mesh):.3f} %, PSNR {psnr(moved.part, known.held_out):.1f} dB{off if cameras else ''}",
-            flush=True,
-        )
+        good = f"chamfer {chamfer(mesh, known.mesh):.3f} %, PSNR {psnr(moved.part, known.held_out):.1f} dB"
+        told = f"{name}, stage {number}: {seconds:.0f} s, {len(mesh.vertices)} vertices, {good}"
+        print(told + off if cameras else told, flush=True)
     if folder:
         shown = [np.asarray(rts.render(moved.part, v.camera, v.size, supersample=2)) for v in known.held_out[:4]]
         rows = [np.concatenate(row, axis=1) for row in (shown, [v.image for v in known.held_out[:4]])]

@@ -46,7 +46,7 @@ def images(vertices, faces):
 
 pictures, steps = torch.as_tensor(images(truth, faces)), rts.LargeSteps(ball.faces, len(start))
 u = torch.tensor(steps.encode(start), requires_grad=True)  # Vertices that move along with their neighbours.
-optimizer = torch.optim.Adam([u], lr=0.02)
+optimizer = torch.optim.Adam([u], lr=0.03)
 for step in range(STEPS):
     optimizer.zero_grad()
     loss = (images(steps.decode(u), ball.faces) - pictures).square().mean()
