@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.meshes import MESHES, kept_mesh
-from benchmarks.report import environment, table
+from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
 from rts.arrays.engines import engine_named
