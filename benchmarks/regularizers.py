@@ -28,6 +28,7 @@ from benchmarks.timing import in_turn
 from rts.arrays.engines import engine_named
 from rts.compiling.threads import thread_count
 from rts.regularizers import ARAP, EdgeLength, Laplacian, NormalConsistency, Regularizer
+from rts_compare.environment import environment
 
 ENERGIES: dict[str, Callable[[np.ndarray, np.ndarray], Regularizer]] = {
     "ARAP": ARAP,
