@@ -211,6 +211,7 @@ def test_rates_by_name(target):
         ({"method": object()}, "expected 'adam', 'sgd', 'lm' or a torch.optim"),
         ({"validate_every": 0}, "validate_every is 0"),
         ({"validation": 3}, "validation is 3"),
+        ({"validation": Lines(), "method": "lm"}, "takes no validation"),
         ({"checkpoint": 5}, "checkpoint is 5"),
         ({"checkpoint": "/no/such/folder/fit.npz"}, "a folder that exists"),
         ({"checkpoint": "fit.npz", "checkpoint_every": 0}, "checkpoint_every is 0"),

@@ -150,7 +150,8 @@ def fit(
         EngineError: parameters of two engines, or of another than the arrays that `residuals` holds.
     """
     known = _check_functions(residuals, loss, callback)
-    _check_method(method, loss, steps)
+    title = method if isinstance(method, str) else type(method).__name__
+    _check_method(title, method, loss, steps, validation)
     _check_limits(tolerance, patience, validate_every)
     check_flag("jit", jit)
     stages = _stages(known, schedule)
@@ -160,7 +161,7 @@ def fit(
     optimizer = Method(method, checked_rates(learning_rate, method, names), parameters)
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
     parameters = map_leaves(partial(_copied, engine), parameters)
-    if method != "lm":
+    if title != "lm":
         optimizer.start(engine, parameters)  # Refused before any work.
     processes = Processes.joined() if overrides(known, "draw", Residuals) else None
     if processes is not None:
@@ -168,33 +169,25 @@ def fit(
         callback = None if callback is None else partial(_agreed, processes, callback)
     file, state = None, None
     if checkpoint is not None:
-        kind = method if isinstance(method, str) else type(method).__name__
-        file = Checkpoint(checkpoint, checkpoint_every, parameters, engine, kind, processes)
+        file = Checkpoint(checkpoint, checkpoint_every, parameters, engine, title, processes)
         state = file.read()
-    start = time.perf_counter()
+    start, most = time.perf_counter(), int(steps or STEPS.get(title, STEPS["adam"]))
     runs: list[Run] = []
-
-    most = int(steps or STEPS[method if isinstance(method, str) else "adam"])
-
-    def new_run() -> Run:
-        return Run(most, callback, tolerance, sum(len(r.history) for r in runs))
-
     for numbers in () if state is None else state.about["stages"]:
-        run = new_run()
-        run.go_on(numbers, None)
-        runs.append(run)
+        runs.append(Run(most, callback, tolerance, sum(len(r.history) for r in runs)))
+        runs[-1].go_on(numbers, None)
     for number in range(len(runs), len(stages)):
         stage, (reduced, fits) = stages[number], taken[number]
-        run = new_run()
-        saving, state = Saving(file, run, runs, state), None
-        bar = str(method) if isinstance(method, str) else type(method).__name__
-        with progress_bar(progress, run.steps, bar if len(stages) == 1 else f"{bar} {number + 1}/{len(stages)}", run):
+        run = Run(most, callback, tolerance, sum(len(r.history) for r in runs))
+        saving, state = Saving(file, run, tuple(runs), state), None
+        bar = title if len(stages) == 1 else f"{title} {number + 1}/{len(stages)}"
+        with progress_bar(progress, run.steps, bar, run):
             try:
                 terms = Terms(stage, engine, processes, partial(_checked, engine=engine, run=run))
                 judge = _validation(terms, reduced, validation, validate_every, engine, run, processes)
                 run.validates = judge is not None
                 run.patience = patience or max(PATIENCE, 3 * judge.every if judge else 0)
-                if isinstance(reduced, Loss) and method == "lm":
+                if isinstance(reduced, Loss) and title == "lm":
                     own = fits and overrides(stage, "normal_equations", Residuals)
                     supersample = finest(getattr(stage, "supersample", None))
                     levenberg_marquardt(terms, parameters, engine, run, jit, reduced, own, supersample, saving)
@@ -208,12 +201,15 @@ def fit(
             parameters = run.best
         if run.asked:
             break
+    return _outcome(parameters, runs, runs[-1].told(names), time.perf_counter() - start)
+
+
+def _outcome(parameters: Tree, runs: Sequence[Run], reason: str, seconds: float) -> Fit:
+    """The result of `fit`, after one run for each stage."""
     history = [value for run in runs for value in run.history]
     counts = tuple(len(run.history) for run in runs)
     lowest = [run.best_loss for run in runs if run.history][-1]
     validated = [pair for run in runs for pair in run.validated]
-    reason = runs[-1].told(names)
-    seconds = time.perf_counter() - start
     return Fit(parameters, lowest, history, len(history), reason, seconds, counts, validated)
 
 
@@ -320,14 +316,17 @@ def _own_loss(residuals: Residuals) -> Loss | None:
     raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
 
 
-def _check_method(method: Any, loss: Callable | None, steps: int | None) -> None:
-    if (isinstance(method, str) and method not in STEPS) or isinstance(method, (type, type(None), bool, int, float)):
+def _check_method(title: str, method: Any, loss: Callable | None, steps: int | None, validation: Any) -> None:
+    """Refuse methods by other names, and arguments that do not go with the method. `title` is its name."""
+    if (method is title and method not in STEPS) or isinstance(method, (type, type(None), bool, int, float)):
         raise InputError(f"method is {quoted(method)}; expected one of {', '.join(STEPS)}, or an optimiser object")
-    if method == "lm" and not (loss is None or isinstance(loss, Loss)):
+    if title == "lm" and not (loss is None or isinstance(loss, Loss)):
         raise InputError(
             f'method "lm" takes no loss but an rts.Loss, such as rts.Loss("huber", f_scale=0.1); it is {quoted(loss)}: '
             f'use "adam", or leave it out'
         )
+    if title == "lm" and validation is not None:
+        raise InputError('method "lm" takes no validation, since its loss decides; use "adam", or leave it out')
     if steps is not None:
         _check_count("steps", steps)
 

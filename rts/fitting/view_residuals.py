@@ -110,7 +110,7 @@ class ViewResiduals(Residuals):
         self._batch, self._window = _checked_draws(batch, window, self.views)
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise InputError(f"seed is {quoted(seed)}; expected a whole number, at least 0")
-        if unreadable not in ("error", "skip"):
+        if not isinstance(unreadable, str) or unreadable not in ("error", "skip"):
             raise InputError(f"unreadable is {quoted(unreadable)}; expected 'error' or 'skip'")
         if not (is_real(memory) and memory >= 0):
             raise InputError(f"memory is {quoted(memory)}; expected a number of bytes")

@@ -51,6 +51,9 @@ class View:
     ):
         if not isinstance(camera, Camera) or camera.is_stacked:
             raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera of one view")
+        for what, value in (("image", image), ("mask", mask)):
+            if not (callable(value) or hasattr(value, "shape") or (what == "mask" and value is None)):
+                raise InputError(f"{what} is {quoted(value)}; expected an array, or a function that gives one")
         if size is None:
             if callable(image):
                 raise InputError("size is None, and image is a function; expected its (height, width), pixels")
