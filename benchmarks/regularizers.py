@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.meshes import MESHES, kept_mesh
-from benchmarks.report import environment, table
+from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
 from rts.arrays.engines import engine_named
-from rts.compiling.threads import thread_count
 from rts.regularizers import ARAP, EdgeLength, Laplacian, NormalConsistency, Regularizer
+from rts_compare.environment import environment
 
 ENERGIES: dict[str, Callable[[np.ndarray, np.ndarray], Regularizer]] = {
     "ARAP": ARAP,
@@ -111,7 +111,7 @@ def main() -> None:
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     results = {mesh: measure(mesh, args.output, args.rounds) for mesh in args.meshes}
-    about = environment(thread_count(), ("numpy", "numba", "torch", "jax"))
+    about = environment(("numpy", "numba", "torch", "jax"))
     (args.output / "regularizers.json").write_text(json.dumps(about | {"results": results}, indent=2) + "\n")
     text = "\n".join(written(mesh, found) for mesh, found in results.items())
     (args.output / "regularizers.md").write_text(text)

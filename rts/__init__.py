@@ -32,11 +32,14 @@ from rts.errors import (
 )
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
-from rts.files.posed_images import load_views
+from rts.files.views.loading import load_views
+from rts.files.views.saving import save_views
 from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.large_steps import LargeSteps
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
+from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
 from rts.rendering.batched import render_views
 from rts.rendering.image import render, render_samples
@@ -47,6 +50,7 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
+from rts.scene.view import View
 
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "
@@ -95,6 +99,7 @@ __all__ = [
     "GBuffer",
     "ImageResiduals",
     "InputError",
+    "LargeSteps",
     "Loss",
     "Ndc",
     "Part",
@@ -112,6 +117,8 @@ __all__ = [
     "Surface",
     "TriangleSampler",
     "TriangleSurface",
+    "View",
+    "ViewResiduals",
     "check_gradient",
     "engine_of",
     "errors",
@@ -135,6 +142,7 @@ __all__ = [
     "sample",
     "save_animation",
     "save_image",
+    "save_views",
     "tune",
     "volume_render",
     "warmup",

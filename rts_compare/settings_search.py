@@ -330,7 +330,17 @@ class Search:
     def _reason(
         self, chosen: Setting, name: str, below: Setting | None, above: Setting | None, times: Mapping[Setting, float]
     ) -> str:
-        """The line on one field of the chosen setting: the cheaper one's error, the dearer one's time and error."""
+        """The line on one field of the chosen setting: the error of `below`; the time and the error of `above`.
+
+        Args:
+            chosen: the chosen setting.
+            name: the field.
+            below: the next cheaper setting in this field, see `_others`; None for none. Left out after the deadline.
+            above: the next dearer one, or for plugins the most accurate other one, which may be faster; None for none.
+                For samplers without its error.
+            times: setting → seconds. The time of `above` is told as a multiple of the chosen one's. `above` is left out
+                where one of the two has none.
+        """
         parts = []
         if below is not None and not self._over():
             parts.append(f"{_value(below, name)} is off by {_percent(self._error(below))}")

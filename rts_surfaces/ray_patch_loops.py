@@ -91,8 +91,10 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
         flips: (n, 4) bool, as in `rts_surfaces.tiles.Tiles`.
         ids: (N, 1) int32, the patch of each sample; changed.
         params: (N, 2) float32, the samples' start; changed, to 0 without a hit.
-        row: (L, W) int32, the sample in each cell; becomes −1 where the sample's ray does not meet the surface.
-        depth: (L, W) float32, to be filled with the depth of each hit; 0 without one.
+        row: (L, W) int32, the sample in each cell, −1 for none; becomes −1 where the sample's ray does not meet the
+            surface.
+        depth: (L, W) float32, to be filled with the depth of each hit, 0 where a ray does not meet the surface. Cells
+            that have no sample at the start keep their number, which should be 0.
         origins: (N, 3) float64.
         directions: (N, 3) float64; the point at depth z is `origin + z direction`.
         spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.

@@ -94,7 +94,8 @@ def curves(start, stop, found, frames, along, out):
     Args:
         start: first edge.
         stop: one after the last.
-        found: (E, G, 6, 3) float64, points and derivatives in parameters of the patch of a tile beside each edge.
+        found: (E, G, 6, 3) float64, at G points along each edge: the point, and its derivatives in u, v, uu, uv and vv,
+            the parameters of the patch of a tile beside the edge.
         frames: (E, 3, 2) float64, the frame of that tile.
         along: (E, 2) float64, the direction of the edge in the tile's local coordinates.
         out: (E,) float64.

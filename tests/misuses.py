@@ -21,6 +21,7 @@ POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 SAMPLES = SAMPLED.samples[0]
 NDC = rts.Ndc((1.0, 1.0))
+STEPS = rts.LargeSteps(FACES, 4)
 DOUBLE = Operation(
     "misuses.double",
     lambda x: 2 * x,
@@ -142,6 +143,14 @@ def residuals(**options):
     return rts.ImageResiduals(lambda p: scene(p)[0], CAMERA, SIZE, np.ones(SIZE, np.float32), **options)(pose())
 
 
+def of_views(**options):
+    """Residuals of a view, computed once."""
+    view = rts.View(CAMERA, np.ones((*SIZE, 4), np.float32))
+    given = {"scene": lambda p: scene(p)[0], "views": [view], **options}
+    residuals = rts.ViewResiduals(**given)
+    return residuals.of(residuals.load(residuals.draw(0)[0]))(pose())
+
+
 OPERATION = "name", "specification", "ranks", "shape", "forward", "push", "pull", "differentiable", "packed", "keeps"
 RENDERED = (
     "parts",
@@ -177,6 +186,11 @@ GROUPS = {
     "ImageResiduals": open_in(
         residuals, "background", "sampler", "splatter", "layers", "supersample", "capacity", "channels"
     ),
+    "LargeSteps": open_in(
+        lambda **o: rts.LargeSteps(**{"faces": FACES, "count": 4, **o}), "faces", "count", "smoothness"
+    ),
+    "LargeSteps.encode": {"vertices": STEPS.encode},
+    "LargeSteps.decode": {"u": STEPS.decode},
     "Loss": open_in(lambda **o: rts.Loss(**{"name": "huber", **o})(np.ones((2, 2))), "name", "f_scale"),
     "Ndc": open_in(lambda **o: rts.Ndc(**{"scale": (1.0, 1.0), **o}).from_world(POINTS), "scale", "near"),
     "Ndc.of_images": open_in(rts.Ndc.of_images, "size", "focal", "near", size=SIZE, focal=20.0),
@@ -197,13 +211,46 @@ GROUPS = {
     "Subdivision": open_in(
         subdivided, "faces", "scheme", "creases", "corners", "boundary", "chaikin", "indices", "uv_rule", "tolerance"
     ),
+    "View": open_in(
+        lambda **o: rts.View(**{"camera": CAMERA, "image": np.ones((*SIZE, 4), np.float32), **o}),
+        *("camera", "image", "size", "mask"),
+    ),
+    "ViewResiduals": open_in(
+        of_views,
+        *(
+            "scene",
+            "views",
+            "batch",
+            "window",
+            "seed",
+            "cameras",
+            "exposure",
+            "weights",
+            "target",
+            "unreadable",
+            "memory",
+        ),
+        *("background", "sampler", "splatter", "layers", "supersample", "capacity", "channels", "loss", "f_scale"),
+    ),
     "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s"),
     "engine_of": {"trees": rts.engine_of},
     "exact_calibration": {"reach": lambda v: rts.splatting.exact_calibration(0.5, v)},
     "explain": open_in(
         lambda **o: rts.explain(PART, CAMERA, **o), "size", "splatter", "layers", "supersample", size=SIZE
     ),
-    "fit": open_in(lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o), "progress", "jit"),
+    "fit": open_in(
+        lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o),
+        *(
+            "progress",
+            "jit",
+            "method",
+            "learning_rate",
+            "validation",
+            "validate_every",
+            "checkpoint",
+            "checkpoint_every",
+        ),
+    ),
     "gradient": {"points": lambda v: gradient(lambda p: p[:, 0], v)},
     "gradient_image": {
         "parameters": lambda v: rts.gradient_image(lambda p: p, v),
@@ -218,6 +265,7 @@ GROUPS = {
             *("split", "downscale", "linear", "background", "pixel_center", "frame", "near", "far", "cache"),
         ),
     },
+    "save_views": {"path": lambda v: rts.save_views(v, []), "views": lambda v: rts.save_views("views.json", v)},
     "namespace": {"arrays": rts.namespace},
     "plugins": {"details": lambda v: rts.plugins("surfaces", details=v)},
     "render_samples": {"engine": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, engine=v)},

@@ -901,6 +901,13 @@ def of_base(name, change):
     return lambda self, *args: change(getattr(super(type(self), self), name)(*args))
 
 
+def forgetful(self, *args):
+    """An optimiser that does not take its state back."""
+    step = super(type(self), self).optimizer(*args)
+    step.restore = lambda state, parameters: None
+    return step
+
+
 def others(name, function):
     """The namespace of torch with another function."""
     from types import SimpleNamespace
@@ -983,9 +990,12 @@ ODD_ENGINES = {
     },
     "optimizers_step": {
         "too far": engine_with(
-            optimizer=lambda self, name, rate, parameters: super(type(self), self).optimizer(name, 2 * rate, parameters)
+            optimizer=lambda self, name, rate, parameters: super(type(self), self).optimizer(
+                name, 2 * np.asarray(rate) if isinstance(rate, list) else 2 * rate, parameters
+            )
         )
     },
+    "optimizers_go_on_from_their_state": {"afresh": engine_with(optimizer=forgetful)},
     "operations_are_their_specification": {
         "a thousandth more": engine_with(apply=of_base("apply", lambda x: x * 1.001)),
         "half detached": engine_with(apply=of_base("apply", lambda x: (x + x.detach()) / 2)),

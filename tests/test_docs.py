@@ -117,6 +117,20 @@ def test_the_python_of_the_guide_to_plugins_does_what_it_says(tmp_path, monkeypa
     np.testing.assert_allclose(slope[4:-4, 4:-4, 3], -1 / 12, rtol=1e-2)
 
 
+@pytest.mark.thorough
+def test_the_python_of_the_guide_to_many_views_does_what_it_says(tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    names, first = run("docs/many_views.md")
+    shape, cameras = first["fit"], names["fit"]
+    assert shape.loss < 0.3 * shape.validated[0][1] and (tmp_path / "fit.npz").is_file()
+    assert [step for step, _ in shape.validated] == [0, 10, 20, 30, 40, 50, 59]
+    off = np.linalg.norm(names["vertices"].numpy() - names["truth"], axis=1).mean()
+    assert off < 0.7 * np.linalg.norm(names["start"] - names["truth"], axis=1).mean()
+    np.testing.assert_allclose(cameras.parameters["gain"], 1, atol=0.02)
+    assert cameras.loss < 0.3 * cameras.history[0]
+
+
 def shifted_loss(image, target, part, camera, pose, step):
     """The loss of a pose shifted along x, area-sampled."""
     shifted = part.replace(transform=np.asarray(rts.rigid(np.array([*pose[:3], pose[3] + step, *pose[4:]]))))

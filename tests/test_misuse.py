@@ -284,7 +284,7 @@ OPTIONAL = """
     prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
     ImageResiduals.weights ImageResiduals.f_scale fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
-    fit.schedule Stage.supersample pyramid.largest
+    fit.patience fit.schedule Stage.supersample pyramid.largest
     Isosurface.band Isosurface.lipschitz Isosurface.reads Isosurface.attributes Sdf.lipschitz Sdf.steps
     NarrowBand.lipschitz NarrowBand.coarse
 """

@@ -91,10 +91,23 @@ class Engine(Plugin):
         """
         raise self._no_derivatives()
 
-    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """A function `(parameters, gradient) -> new parameters`, a step of "adam" or "sgd".
+    def optimizer(
+        self, method: Any, learning_rate: float | Sequence[float], parameters: Tree, given: Tree = None
+    ) -> Callable[[Tree, Tree], Tree]:
+        """A function `(parameters, gradient) -> new parameters`, a step of a first-order optimiser.
 
-        It keeps state, perhaps the parameters too: call it with the parameters that it returned last.
+        It keeps state, perhaps the parameters too: call it with the parameters that it returned last. To be kept in
+        checkpoints, the function is an object with two more methods: `state() -> bytes`, and `restore(state,
+        parameters)`, which goes on from there.
+
+        Args:
+            method: "adam", "sgd", or an optimiser object of the framework.
+            learning_rate: the rate, or a list of one for each array of the parameters; for a method by name.
+            parameters: where to start; never changed in place.
+            given: a tree like `parameters` whose arrays an optimiser object may hold; None for `parameters`.
+
+        Raises:
+            InputError: another method.
         """
         raise self._no_derivatives()
 

@@ -45,14 +45,15 @@ class Verdict(NamedTuple):
 def judged(
     pose: Pose, parts: Sequence[Part], mask: np.ndarray, picture: np.ndarray | None = None, robust: bool = False
 ) -> Verdict:
-    """The verdict on a pose.
+    """The verdict on a pose: how well its silhouette fits the mask, and doubts about the mask.
 
     Args:
         pose: the fitted pose.
         parts: the model as loaded, NumPy arrays.
         mask: (H, W) the silhouette that it was fitted to, in [0, 1].
-        picture: (H, W, 4) linear; the source of the mask.
-        robust: whether the loss was robust; the pose may then be right although a part of the mask is missing.
+        picture: (H, W, 4) linear, from which the mask was taken; a note says if it is a photo. None to look at none.
+        robust: whether the loss was robust. It changes neither IoU nor verdict: the note on a poor fit then says that
+            the pose may be right all the same, with a part of the mask hidden or wrong.
     """
     drawn = render(posed(parts, pose.matrix, "silhouette"), pose.camera, mask.shape, splatter="single", layers=1)
     iou = intersection_over_union(np.asarray(drawn)[..., 3], mask)

@@ -40,7 +40,11 @@ class Piece(NamedTuple):
 
 
 def check_piece(path: Path, piece: Piece) -> None:
-    """Refuse indices that refer to nothing, rows of another width, values not finite in float32, unsound transforms."""
+    """Refuse a piece, of at least one face, by an InputError.
+
+    Refused are indices that refer to no row, tables of other widths than `WIDTHS`, values not finite in float32, and
+    transforms with a fault (`fault_of`) or that take vertices beyond float32.
+    """
     tables = {"vertices": (piece.vertices, piece.faces), **piece.attributes}
     for name, (rows, table) in tables.items():
         if rows.ndim != 2 or rows.shape[1] not in WIDTHS[name]:

@@ -83,13 +83,14 @@ def writing(path: Path) -> Iterator[None]:
         raise InputError(f"{path} cannot be written ({reason}); choose another name or folder") from error
 
 
-def inside(folder: Path, name: str, referrer: Path) -> Path:
+def inside(folder: Path, name: str, referrer: Path, start: Path | None = None) -> Path:
     """The path of a file that `referrer` names; refused if outside `folder`.
 
     Args:
         folder: the model's folder.
-        name: as written in the file, relative to `referrer`; either slash.
+        name: as written in the file; either slash.
         referrer: the file that names it.
+        start: the folder that the name is relative to; None for that of `referrer`.
 
     Raises:
         InputError: an absolute path, or one that leads out of the folder, symbolic links followed; or a name that no
@@ -97,7 +98,7 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
     """
     plain = name.replace("\\", "/")
     absolute = plain.startswith("/") or PureWindowsPath(plain).drive or "\0" in plain
-    target = folder if absolute else (referrer.parent / plain).resolve()
+    target = folder if absolute else ((start or referrer.parent) / plain).resolve()
     if absolute or not target.is_relative_to(folder.resolve()):
         raise InputError(
             f"{referrer} refers to {name!r}, outside its own folder, which is refused; copy that file beside "

@@ -1,4 +1,4 @@
-"""Fitting parameters to images: Adam, SGD and Levenberg–Marquardt on any differentiable render."""
+"""Fitting parameters to images, by gradient descent or Levenberg–Marquardt, on any differentiable render."""
 
 from __future__ import annotations
 
@@ -17,17 +17,25 @@ from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import checked_plugin, is_count, is_real
 from rts.contracts.residuals import Residuals
 from rts.errors import InputError
-from rts.fitting.dependence import differentiable, refuse_independent
+from rts.fitting.checkpoint import Checkpoint
+from rts.fitting.dependence import differentiable
+from rts.fitting.descent import Method, Validation, checked_rates, descend
 from rts.fitting.least_squares import levenberg_marquardt
 from rts.fitting.losses import SQUARE, Loss
 from rts.fitting.parameter_names import listed, named_leaves, one_line
-from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
+from rts.fitting.processes import Processes
+from rts.fitting.run import LONGEST_REASON, Astray, Report, Run, progress_bar
+from rts.fitting.saving import Saving
 from rts.fitting.schedule import Stage, checked_schedule
+from rts.fitting.terms import Terms
 from rts.plugin_base import overrides
 from rts.sampling.adaptive import finest
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
-LEARNING_RATES = {"adam": 1e-2, "sgd": 1e-1}
+PATIENCE = 50
+"""Steps without gain after which a fit stops; where losses are validated, three of these if that is more."""
+VALIDATION_SHARE = 4
+"""Steps from one validation to the next, in numbers of steps that draw as many terms as a validation has."""
 
 
 class Fit(NamedTuple):
@@ -44,6 +52,8 @@ class Fit(NamedTuple):
             such as "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
         seconds: wall time, compilation included.
         stages: the number of steps at each stage of the schedule; one number without a schedule.
+        validated: losses that decided which parameters are best, each with the number of its step; empty where the
+            losses in `history` did.
 
     With a schedule, parameters, loss and reason are those of the last stage.
 
@@ -57,6 +67,7 @@ class Fit(NamedTuple):
     reason: str
     seconds: float
     stages: tuple[int, ...]
+    validated: list[tuple[int, float]]
 
     def __repr__(self) -> str:
         # Losses of stages are those of other images.
@@ -75,13 +86,17 @@ def fit(
     residuals: Callable[[Tree], Array],
     parameters: Tree,
     *,
-    method: str = "adam",
+    method: Any = "adam",
     loss: Callable[[Array], Array] | None = None,
     steps: int | None = None,
-    learning_rate: float | None = None,
+    learning_rate: float | dict[str, float] | None = None,
     tolerance: float = 1e-6,
-    patience: int = 50,
+    patience: int | None = None,
     schedule: Sequence[Stage] | None = None,
+    validation: Callable[[Tree], Array] | None = None,
+    validate_every: int | None = None,
+    checkpoint: Any = None,
+    checkpoint_every: int = 50,
     callback: Report | None = None,
     progress: bool | None = None,
     jit: bool = True,
@@ -95,21 +110,36 @@ def fit(
     than another of its array, in float32, stays as it is. Parameters of very different units belong in arrays
     of their own.
 
+    Residuals of many terms, such as `ViewResiduals`, are computed term by term. In a process that has joined a job by
+    `torch.distributed.init_process_group`, each process computes its share of a step's terms. All gather gradients, or
+    for "lm" normal equations, of every term, and add them in one order: memory for as many gradients as terms. So every
+    process has the same result. The first alone shows progress, calls `callback`, and reads and writes checkpoints.
+
     Args:
         residuals: parameters → array of any shape, of the parameters' engine, such as an image difference; see
             `ImageResiduals` for residuals with which "lm" needs less time and memory; `rts.Residuals` says why.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
-        method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt, by
-            the forward-mode Jacobian, for up to some hundred unknowns.
+        method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss); or "lm": Levenberg–Marquardt, by
+            the forward-mode Jacobian, for up to some hundred unknowns. Or a `torch.optim.Optimizer` of the tensors in
+            `parameters`, which a copy of it then steps, or an `optax.GradientTransformation`.
         loss: reduces residuals to a scalar; for "lm" an `rts.Loss`, such as `rts.Loss("huber", f_scale=0.1)`. By
             default the loss that the residuals declare, at each stage (`ImageResiduals(loss=…)`), or else the mean
             square.
         steps: the most losses computed at each stage, that of its start included; default 200, for "lm" 50.
-        learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1).
+        learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1); or rates by name, such as
+            `{"vertices": 0.01, "light": 0.1}`, where "light" is of all arrays within it.
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
-        patience: the number of steps that `tolerance` speaks of; not for "lm".
+        patience: the number of steps that `tolerance` speaks of; not for "lm". Default 50, or three validations if
+            these take more steps.
         schedule: stages, one after the other, each from where the one before ended: the resolutions at which images are
             compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or other `rts.Residuals` with `at_stage`.
+        validation: residuals whose loss decides which parameters are best, and when to stop: such as those of views
+            that are held out. None for the loss of each step; where steps draw some of many terms, that of all terms.
+        validate_every: the number of steps from one such loss to the next. By default validations compute a quarter as
+            many terms as the steps.
+        checkpoint: the path of a file in which the state is kept, atomically. If it exists, the fit goes on from it and
+            takes the same steps, bit for bit, as without a break: give the same arguments; `steps` may be more.
+        checkpoint_every: the number of steps from one state to the next. The end of a stage is kept, too.
         callback: called as `callback(step, parameters, loss)`; a true result stops the fit, later stages included.
         progress: show a progress bar with loss and ms/iteration; None for only on a terminal.
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
@@ -120,30 +150,50 @@ def fit(
         EngineError: parameters of two engines, or of another than the arrays that `residuals` holds.
     """
     known = _check_functions(residuals, loss, callback)
-    _check_method(method, loss, steps, learning_rate)
-    _check_limits(tolerance, patience)
+    title = method if isinstance(method, str) else type(method).__name__
+    _check_method(title, method, loss, steps, validation)
+    _check_limits(tolerance, patience, validate_every)
     check_flag("jit", jit)
     stages = _stages(known, schedule)
     taken = [_taken(stage, known, loss) for stage in stages]
     engine = _checked_engine(parameters)
     names = [name for name, _ in named_leaves(parameters)]
+    optimizer = Method(method, checked_rates(learning_rate, method, names), parameters)
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
     parameters = map_leaves(partial(_copied, engine), parameters)
-    rate = LEARNING_RATES.get(method, 0.0) if learning_rate is None else float(learning_rate)
-    start = time.perf_counter()
+    if title != "lm":
+        optimizer.start(engine, parameters)  # Refused before any work.
+    processes = Processes.joined() if overrides(known, "draw", Residuals) else None
+    if processes is not None:
+        progress = progress if processes.rank == 0 else False
+        callback = None if callback is None else partial(_agreed, processes, callback)
+    file, state = None, None
+    if checkpoint is not None:
+        file = Checkpoint(checkpoint, checkpoint_every, parameters, engine, title, processes)
+        state = file.read()
+    start, most = time.perf_counter(), int(steps or STEPS.get(title, STEPS["adam"]))
     runs: list[Run] = []
-    for number, (stage, (reduced, fits)) in enumerate(zip(stages, taken, strict=True), 1):
-        run = Run(int(steps or STEPS[method]), callback, tolerance, patience, sum(len(r.history) for r in runs))
-        bar = method if len(stages) == 1 else f"{method} {number}/{len(stages)}"
+    for numbers in () if state is None else state.about["stages"]:
+        runs.append(Run(most, callback, tolerance, sum(len(r.history) for r in runs)))
+        runs[-1].go_on(numbers, None)
+    for number in range(len(runs), len(stages)):
+        stage, (reduced, fits) = stages[number], taken[number]
+        run = Run(most, callback, tolerance, sum(len(r.history) for r in runs))
+        saving, state = Saving(file, run, tuple(runs), state), None
+        bar = title if len(stages) == 1 else f"{title} {number + 1}/{len(stages)}"
         with progress_bar(progress, run.steps, bar, run):
             try:
-                checked = _checked(stage, engine, run)
-                if isinstance(reduced, Loss) and method == "lm":
-                    own = stage.normal_equations if fits and overrides(stage, "normal_equations", Residuals) else None
+                terms = Terms(stage, engine, processes, partial(_checked, engine=engine, run=run))
+                judge = _validation(terms, reduced, validation, validate_every, engine, run, processes)
+                run.validates = judge is not None
+                run.patience = patience or max(PATIENCE, 3 * judge.every if judge else 0)
+                if isinstance(reduced, Loss) and title == "lm":
+                    own = fits and overrides(stage, "normal_equations", Residuals)
                     supersample = finest(getattr(stage, "supersample", None))
-                    levenberg_marquardt(checked, parameters, engine, run, jit, reduced, own, supersample)
+                    levenberg_marquardt(terms, parameters, engine, run, jit, reduced, own, supersample, saving)
                 else:
-                    _descend(checked, reduced, parameters, engine, method, rate, run, jit)
+                    descend(terms, reduced, parameters, engine, optimizer, run, jit, judge, saving)
+                saving.write()
             except Astray as stop:
                 run.stop(str(stop))
         runs.append(run)
@@ -151,11 +201,44 @@ def fit(
             parameters = run.best
         if run.asked:
             break
+    return _outcome(parameters, runs, runs[-1].told(names), time.perf_counter() - start)
+
+
+def _outcome(parameters: Tree, runs: Sequence[Run], reason: str, seconds: float) -> Fit:
+    """The result of `fit`, after one run for each stage."""
     history = [value for run in runs for value in run.history]
     counts = tuple(len(run.history) for run in runs)
     lowest = [run.best_loss for run in runs if run.history][-1]
-    reason = runs[-1].told(names)
-    return Fit(parameters, lowest, history, len(history), reason, time.perf_counter() - start, counts)
+    validated = [pair for run in runs for pair in run.validated]
+    return Fit(parameters, lowest, history, len(history), reason, seconds, counts, validated)
+
+
+def _agreed(processes: Processes, callback: Report, step: int, parameters: Tree, loss: float) -> bool:
+    """The result of a callback that the first process alone calls."""
+    return processes.agreed(bool(callback(step, parameters, loss)) if processes.rank == 0 else None)
+
+
+def _validation(
+    terms: Terms,
+    loss: Callable[[Array], Array],
+    validation: Callable[[Tree], Array] | None,
+    every: int | None,
+    engine: Engine,
+    run: Run,
+    processes: Processes | None,
+) -> Validation | None:
+    """The loss that decides; None where the loss of each step does."""
+    if validation is None:
+        if terms.whole:
+            return None
+        judges = terms
+    else:
+        known = _residuals(validation, "validation")
+        processes = processes if overrides(known, "draw", Residuals) else None
+        judges = Terms(known, engine, processes, partial(_checked, engine=engine, run=run))
+        loss = _taken(known, known, None)[0] if _own_loss(known) else loss
+    share = -(-len(judges.drawn(None)) // len(terms.drawn(0)))
+    return Validation(judges, loss, every or VALIDATION_SHARE * share)
 
 
 def _copied(engine: Engine, x: Array) -> Array:
@@ -164,48 +247,6 @@ def _copied(engine: Engine, x: Array) -> Array:
     except (TypeError, ValueError, RuntimeError) as error:  # Such as a sparse one.
         raise InputError(f"parameters holds an array whose values cannot be read ({one_line(str(error))})") from None
     return engine.namespace.astype(engine.constant(values, x), x.dtype, copy=False)
-
-
-def _descend(
-    residuals: Callable,
-    loss: Callable,
-    parameters: Tree,
-    engine: Engine,
-    method: str,
-    rate: float,
-    run: Run,
-    jit: bool,
-) -> None:
-    """Run Adam or SGD on the loss of residuals."""
-    xp = engine.namespace
-    value_and_grad = engine.value_and_grad(_scalar(lambda p: loss(residuals(p)), engine))
-
-    def evaluate(p: Tree) -> tuple[Array, Tree, list[Array], list[Array]]:
-        value, gradient = value_and_grad(p)
-        gradients = list(leaves(gradient))
-        return value, gradient, [xp.all(xp.isfinite(g)) for g in gradients], [xp.any(g != 0) for g in gradients]
-
-    evaluate = engine.jit(evaluate) if jit else evaluate
-    step = engine.optimizer(method, rate, parameters)
-    while True:
-        start = run.fresh
-        value, gradient, finite, mattered = run.attempt(engine, evaluate, parameters)
-        require(math.isfinite(value), f"the loss is {float(value)}", start)
-        run.note_gradient([*map(bool, mattered)])
-        if not run.history and not any(run.mattered):
-            refuse_independent(residuals, _scalar(loss, engine), parameters, engine)
-        if not run.record(parameters, float(value)):
-            return
-        require(all(map(bool, finite)), "the gradient is not finite", start)
-        if run.stalled():
-            run.stop(f"no gain in {run.patience} steps" + ("" if any(run.mattered) else f": {_flat(run.best_loss)}"))
-            return
-        parameters = run.attempt(engine, step, parameters, gradient)
-
-
-def _flat(loss: float) -> str:
-    """The reason, in words, of a gradient that was zero throughout."""
-    return "the loss is zero" if loss == 0 else NO_GRADIENT
 
 
 # -------------------------------------------------------------------------------------------------- checks
@@ -275,24 +316,27 @@ def _own_loss(residuals: Residuals) -> Loss | None:
     raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
 
 
-def _check_method(method: str, loss: Callable | None, steps: int | None, learning_rate: float | None) -> None:
-    if not isinstance(method, str) or method not in STEPS:
-        raise InputError(f"method is {quoted(method)}; expected one of {', '.join(STEPS)}")
-    if method == "lm" and not (loss is None or isinstance(loss, Loss)):
+def _check_method(title: str, method: Any, loss: Callable | None, steps: int | None, validation: Any) -> None:
+    """Refuse methods by other names, and arguments that do not go with the method. `title` is its name."""
+    if (method is title and method not in STEPS) or isinstance(method, (type, type(None), bool, int, float)):
+        raise InputError(f"method is {quoted(method)}; expected one of {', '.join(STEPS)}, or an optimiser object")
+    if title == "lm" and not (loss is None or isinstance(loss, Loss)):
         raise InputError(
             f'method "lm" takes no loss but an rts.Loss, such as rts.Loss("huber", f_scale=0.1); it is {quoted(loss)}: '
             f'use "adam", or leave it out'
         )
+    if title == "lm" and validation is not None:
+        raise InputError('method "lm" takes no validation, since its loss decides; use "adam", or leave it out')
     if steps is not None:
         _check_count("steps", steps)
-    if learning_rate is not None and not (is_real(learning_rate) and 0 < learning_rate < math.inf):
-        raise InputError(f"learning_rate is {quoted(learning_rate)}; expected a positive number")
 
 
-def _check_limits(tolerance: float, patience: int) -> None:
+def _check_limits(tolerance: float, patience: int | None, validate_every: int | None) -> None:
     if not (is_real(tolerance) and tolerance >= 0):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
-    _check_count("patience", patience)
+    for name, value in (("patience", patience), ("validate_every", validate_every)):
+        if value is not None:
+            _check_count(name, value)
 
 
 def _check_count(name: str, value: Any) -> None:
@@ -324,20 +368,5 @@ def _checked(residuals: Callable[[Tree], Array], engine: Engine, run: Run) -> Ca
                 f"expected floats, and at least one"
             )
         return result
-
-    return call
-
-
-def _scalar(loss: Callable, engine: Engine) -> Callable[[Array], Array]:
-    """A function like `loss` that refuses a result which is no floating scalar of the engine."""
-
-    def call(residuals: Array) -> Array:
-        value = loss(residuals)
-        if not engine.owns(value) or tuple(value.shape) != ():
-            what = f"an array of shape {tuple(value.shape)}" if engine.owns(value) else kind_of(value)
-            raise InputError(f"loss gave {what}; expected a {engine.name} scalar, of shape ()")
-        if not engine.namespace.isdtype(value.dtype, "real floating"):
-            raise InputError(f"loss gave a number of dtype {value.dtype}; expected a floating one")
-        return value
 
     return call

@@ -388,7 +388,17 @@ class _Fields(NamedTuple):
 
 
 def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
-    """Fields for the coarse grid, weights zero at active pixels; and for the layout of `fine`, zero elsewhere in it."""
+    """The fields for the coarse and for the fine grid of an adaptive image; each pixel counts on one of them alone.
+
+    Args:
+        fields: fields of the image, or of a band of it, (H, W, …).
+        pixel: (H, W), `fine.pixel` in the engine of the fields: the index of an active pixel in the layout, else −1.
+        fine: the fine samples, whose layout is h × w pixels without its apron.
+
+    Returns:
+        The fields, with weights zero at active pixels; and fields (h, w, …) in which each pixel of the layout has the
+        values of the active pixel that it shows, and zeros if it shows none. Weights of None become ones.
+    """
     xp, engine = namespace(pixel), engine_of(pixel)
     height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
 

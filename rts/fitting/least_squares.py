@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,6 +16,8 @@ from rts.fitting.dependence import directions_in_words, refuse_independent
 from rts.fitting.losses import SQUARE, Loss
 from rts.fitting.parameter_names import named_leaves
 from rts.fitting.run import NO_GRADIENT, Run, require
+from rts.fitting.saving import Saving
+from rts.fitting.terms import Terms
 
 FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12
@@ -77,19 +80,46 @@ class _Model:
         return step, float(along @ (damping * along + self._downhill))
 
 
+class _Control:
+    """The control of the damping.
+
+    Attributes:
+        damping: the damping of the next step.
+        growth: the factor by which it grows if the step gains nothing.
+        promising: True if the last step gained.
+        jumps: True if a step that should have gained more than rounding gained nothing.
+    """
+
+    def __init__(self):
+        self.damping, self.growth, self.promising, self.jumps = FIRST_DAMPING, 2.0, True, False
+
+    def packed(self, vector: np.ndarray) -> bytes:
+        """The control, and the vector that it belongs to, as bytes."""
+        file = io.BytesIO()
+        np.savez(file, vector=vector, **vars(self))
+        return file.getvalue()
+
+    def unpacked(self, packed: bytes) -> np.ndarray:
+        """The vector of `packed`; the control is set, too."""
+        with np.load(io.BytesIO(packed)) as known:
+            self.__dict__.update({name: known[name].item() for name in vars(self)})
+            return known["vector"]
+
+
 def _split(x: np.ndarray, sizes: Sequence[int]) -> list[np.ndarray]:
     return np.split(x, np.cumsum(sizes)[:-1])
 
 
 def levenberg_marquardt(
-    residuals: Callable,
+    terms: Terms,
     parameters: Tree,
     engine: Engine,
     run: Run,
     jit: bool,
     loss: Loss,
-    own: Callable | None = None,
-    supersample: int | None = None,
+    own: bool,
+    supersample: int | None,
+    saving: Saving,
 ) -> None:
     """Minimise a loss of residuals by normal equations; `run` records the steps and keeps the result.
 
@@ -101,31 +131,47 @@ def levenberg_marquardt(
     2.7 times as many (benchmarks/RESULTS.md).
 
     Args:
-        residuals: a checked function of the parameters.
+        terms: the terms of the loss; all of them count at every step.
         parameters: where to start; a private copy.
         engine: the engine of the parameters.
         run: takes note of each step, and says when to stop.
         jit: True to compile.
         loss: the loss of the residuals.
-        own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
+        own: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
         supersample: samples a pixel along each axis, for residuals of an image.
+        saving: keeps checkpoints, and gives the state to go on from.
     """
+    if not terms.whole:
+        raise InputError('method "lm" needs all terms at every step; leave out batch and window, or use "adam"')
     vector, unflatten = flatten(parameters)
     sizes = [math.prod(x.shape) for x in leaves(parameters)]
-    linearize, loss_at = _least_squares(residuals, loss, own, parameters, engine, run, jit)
+    linearize, loss_at = _least_squares(terms, loss, own, parameters, engine, run, jit)
+    control = _Control()
 
     def taken(linear: _Linear, start: bool) -> tuple[_Linear, _Model]:
         linear = linear.checked(start)
         run.note_gradient([bool(d.any()) for d in _split(np.diag(linear.matrix), sizes)])
         return linear, _Model(linear, sizes)
 
+    def state() -> bytes:
+        return control.packed(engine.to_numpy(vector))
+
+    def restore(packed: bytes, _: Tree) -> None:
+        nonlocal vector
+        vector = engine.namespace.astype(engine.constant(control.unpacked(packed), vector), vector.dtype, copy=False)
+
+    going = True
+    if saving.resumes:
+        saving.resumed(parameters, restore)
+        going = run.left > 0
     current, model = taken(linearize(vector), start=run.fresh)
-    going = run.record(unflatten(vector), current.value)
-    damping, growth = FIRST_DAMPING, 2.0
-    promising, jumps = True, False
+    if not run.history:
+        going = run.record(unflatten(vector), current.value)
     while going:
+        packed = state()
+        saving.note(unflatten(vector), lambda packed=packed: packed)
         if not current.matrix.any() and len(run.history) == 1:
-            refuse_independent(residuals, None, parameters, engine)
+            refuse_independent(terms.of(terms.first()), None, parameters, engine)
         if not current.value or not current.gradient.any():
             run.stop(
                 "the loss is zero"
@@ -135,28 +181,28 @@ def levenberg_marquardt(
                 else NO_GRADIENT
             )
             break
-        damping = max(damping, model.least)
+        damping = max(control.damping, model.least)
         delta, predicted = model.step(damping)
         trial = vector + engine.constant(delta, vector)
         # A trial after an accepted one is probably accepted, too: its normal equations come with its loss.
-        at_trial = linearize(trial) if promising and run.left > 1 else None
+        at_trial = linearize(trial) if control.promising and run.left > 1 else None
         trial_value = loss_at(trial) if at_trial is None else at_trial.value
         going = run.record(unflatten(trial), trial_value)
         if not going:
             break
         gain = current.value - trial_value
-        promising = gain > 0  # False for a trial that is not finite, too.
-        if not promising:
+        control.promising = gain > 0  # False for a trial that is not finite, too.
+        if not control.promising:
             if damping >= 1 and predicted > RESOLVED * _loss_rounding(current, run.residuals):
-                jumps = math.isfinite(trial_value)
-            damping, growth = damping * growth, growth * 2
-            going = damping <= LARGEST_DAMPING or run.stop(_no_step(jumps, supersample))
+                control.jumps = math.isfinite(trial_value)
+            control.damping, control.growth = damping * control.growth, control.growth * 2
+            going = control.damping <= LARGEST_DAMPING or run.stop(_no_step(control.jumps, supersample))
         elif gain <= run.tolerance * current.value:
             going = run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
         else:
             ratio = gain / max(predicted, gain)
-            damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
-            vector, jumps = trial, False
+            control.damping, control.growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
+            vector, control.jumps = trial, False
             current, model = taken(at_trial or linearize(vector), start=False)
     _note_open(model, parameters, sizes, run)
 
@@ -214,29 +260,32 @@ def normal_equations(
 
 
 def _least_squares(
-    residuals: Callable, loss: Loss, own: Callable | None, parameters: Tree, engine: Engine, run: Run, jit: bool
+    terms: Terms, loss: Loss, own: bool, parameters: Tree, engine: Engine, run: Run, jit: bool
 ) -> tuple[Callable, Callable]:
     """Two functions of a vector (U,): to a `_Linear`, loss and normal equations on the host; and to the loss alone."""
     vector, unflatten = flatten(parameters)
 
-    def equations(v: Array) -> tuple[Array, Array, Array]:
-        if own is None:
-            return normal_equations(residuals, unflatten(v), engine, loss)
-        return _checked_equations(own(unflatten(v)), v.shape[0], engine)
+    def equations(v: Array, data: Tree) -> tuple[Array, Array, Array]:
+        if own:
+            return _checked_equations(terms.own(data).normal_equations(unflatten(v)), v.shape[0], engine)
+        return normal_equations(terms.of(data), unflatten(v), engine, loss)
 
-    def value_at(v: Array) -> Array:
-        return loss(residuals(unflatten(v)))
+    def value_at(v: Array, data: Tree) -> tuple[Array]:
+        return (loss(terms.of(data)(unflatten(v))),)
 
     if jit:
         equations, value_at = engine.jit(equations), engine.jit(value_at)
 
+    def mean(compute: Callable, v: Array) -> list[Array]:
+        return terms.mean(lambda key: run.attempt(engine, lambda: compute(v, terms.load(key))), None)
+
     def linearize(v: Array) -> _Linear:
-        value, *rest = run.attempt(engine, equations, v)
+        value, *rest = mean(equations, v)
         rounding = float(engine.namespace.finfo(rest[0].dtype).eps)
         matrix, gradient = (engine.to_numpy(x).astype(np.float64) for x in rest)
         return _Linear(float(value), matrix, gradient, rounding)
 
-    return linearize, lambda v: float(run.attempt(engine, value_at, v))
+    return linearize, lambda v: float(mean(value_at, v)[0])
 
 
 def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:

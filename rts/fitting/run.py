@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from typing import Any
 
 from rts.arrays.engines import Engine
@@ -35,11 +36,16 @@ class Run:
         remarks: further remarks on the outcome, beside the reason.
         residuals: the number of residuals, once it is known.
         asked: True if the callback has asked to stop.
+        patience: the number of steps after which `stalled` holds, if none gained.
+        validates: True if other losses than those of the steps decide which parameters are best, and when to stop.
+        validated: these losses, each with the number of its step in all stages.
     """
 
-    def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int, before: int = 0):
-        self.before, self.asked = before, False
-        self.steps, self.callback, self.tolerance, self.patience = steps, callback, tolerance, patience
+    def __init__(self, steps: int, callback: Report | None, tolerance: float, before: int = 0):
+        self.before, self.asked, self.validates = before, False, False
+        self.validated: list[tuple[int, float]] = []
+        self.patience = steps
+        self.steps, self.callback, self.tolerance = steps, callback, tolerance
         self.history: list[float] = []
         self.best: Tree = None
         self.best_loss = math.inf
@@ -52,18 +58,37 @@ class Run:
 
     def record(self, parameters: Tree, loss: float) -> bool:
         """Note the parameters and loss of one step. Returns True if the fit goes on."""
-        margin = self.tolerance * abs(self._reference) if self.history else 0.0
         self.history.append(loss)
         self.show(loss)
-        if loss < self.best_loss:
-            self.best, self.best_loss = parameters, loss
-        if loss < self._reference - margin:
-            self._reference, self._last_gain = loss, len(self.history)
+        if not self.validates:
+            self._judge(parameters, loss)
         if self.callback is not None:
             self.asked = bool(self.callback(self.before + len(self.history) - 1, parameters, loss))
         if self.asked:
             return self.stop("the callback asked to")
         return self.left > 0
+
+    def validate(self, parameters: Tree, loss: float) -> None:
+        """Note the deciding loss of the parameters of the last step."""
+        self.validated.append((self.before + len(self.history) - 1, loss))
+        self._judge(parameters, loss)
+
+    def _judge(self, parameters: Tree, loss: float) -> None:
+        margin = self.tolerance * abs(self._reference) if math.isfinite(self._reference) else 0.0
+        if loss < self.best_loss:
+            self.best, self.best_loss = parameters, loss
+        if loss < self._reference - margin:
+            self._reference, self._last_gain = loss, len(self.history)
+
+    def numbers(self) -> dict[str, Any]:
+        """The record so far, but for the best parameters, as JSON holds it."""
+        own = "history", "best_loss", "mattered", "validated", "_last_gain", "_reference"
+        return {name: copy(getattr(self, name)) for name in own}
+
+    def go_on(self, numbers: dict[str, Any], best: Tree) -> None:
+        """Go on from the `numbers` of an earlier run, and its best parameters."""
+        self.__dict__.update(numbers)
+        self.validated, self.best = [(step, loss) for step, loss in self.validated], best
 
     @property
     def fresh(self) -> bool:
@@ -179,10 +204,11 @@ def progress_bar(wanted: bool | None, steps: int, method: str, run: Run) -> Iter
         TextColumn("{task.fields[status]}"),
     )
     with Progress(*columns, console=Console(stderr=True)) as bar:
-        task, start = bar.add_task(method, total=steps, status=""), time.perf_counter()
+        before, start = len(run.history), time.perf_counter()
+        task = bar.add_task(method, total=steps, completed=before, status="")
 
         def show(loss: float) -> None:
-            pace = (time.perf_counter() - start) / len(run.history) * 1e3
+            pace = (time.perf_counter() - start) / (len(run.history) - before) * 1e3
             bar.update(task, advance=1, status=f"loss {loss:.3e}  {pace:.1f} ms/iteration")
 
         run.show = show

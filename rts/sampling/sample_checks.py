@@ -105,11 +105,11 @@ def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
 
 
 def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samples:
-    """A sampler's samples of a part, refused where their arrays do not fit the grid, or one another.
+    """A sampler's samples of a part, if arrays on cells fit the grid and refer to rows of `ids`; else an InputError.
 
     Args:
         samples: the samples; of traced ones only shapes and dtypes are checked.
-        grid: (H, W) of the cells.
+        grid: (H, W) of the cells, or the shape of the list of cells.
         sampler: the sampler.
     """
     count, shape = samples.ids.shape[-2], tuple(samples.row.shape)

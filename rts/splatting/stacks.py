@@ -208,7 +208,12 @@ def _nearest(depth: list[Array], level: Array, at: Array, xp: Any) -> Array:
 
 
 def advanced(source: Source, left: Left, s: Array, level: int, xp: Any) -> Left:
-    """The layers that a source of number s at `level` has left for the levels behind it."""
+    """The layers that a source has left behind `level`, where it has the number s (H, W), see `pairing`.
+
+    Where it takes part with s ≥ 0, its layers up to start + s are used up. It joins at the next level, or never (K) if
+    its layer start + s is not covered. Where it takes part with s < 0, nothing is used up, and it joins at level − s,
+    or never if its layer start is not covered. Where it does not take part yet, nothing changes.
+    """
     count, never = len(source.depth), xp.full_like(s, len(source.depth))
     here, at = left.joins <= level, left.start + s
     taken = here & (s >= 0)

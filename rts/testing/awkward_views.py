@@ -28,7 +28,7 @@ def image_and_gradient(part: Part, camera: Camera, sampler: Any, engine: Engine)
 
 
 def claim_unseen_is_nothing(part: Part, sampler: Any, engine: Engine) -> None:
-    """Fail unless a part that no pixel shows gives an image and a gradient of zeros."""
+    """Fail unless a part gives an image and a gradient of zeros for each camera of `scenes.UNSEEN`, which miss it."""
     for view, camera in scenes.UNSEEN.items():
         with no_error(f"{view}, in {engine.name}"):
             image, gradient = image_and_gradient(part, camera, sampler, engine)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.engines import engine_of
+from rts.fitting.large_steps import LargeSteps
 from rts.operations.combine import combine, interpolate
 from rts.operations.linear import affine_map, matmul
 from rts.operations.projection import projective_map
@@ -25,6 +26,7 @@ def numbers(*shape: int, seed: int = 0) -> np.ndarray:
 IDS = np.array([(0, 2, 1), (3, 3, 0), (1, 2, 3), (2, 0, 1), (0, 1, 3), (3, 2, 2)], np.int32)
 WITH_DIVISOR = numbers(4, 4)
 WITH_DIVISOR[2, 3] += 6
+STEPS = LargeSteps(IDS, 4, 0.3)
 
 OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
     "matmul": (matmul, [numbers(4, 4), numbers(4, 4, seed=1)]),
@@ -33,6 +35,7 @@ OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
     "take": (lambda rows: take(rows, _index(rows)), [numbers(4, 3)]),
     "interpolate": (lambda rows, w: interpolate(rows, _ids(rows), 0, w), [numbers(4, 3), numbers(N, 2, seed=1)]),
     "combine": (lambda rows, w: combine(rows, _ids(rows), w), [numbers(4, 3), numbers(N, 3, seed=1)]),
+    "large_steps": (STEPS.decode, [numbers(4, 3)]),
     "rigid": (rigid, [numbers(6), numbers(3, seed=1)]),
 }
 """The library's own operations, with operands."""

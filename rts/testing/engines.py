@@ -317,6 +317,26 @@ class EngineConformance(Conformance):
                 for x, v in zip(leaves(derivatives.host(chosen, parameters)), leaves(given), strict=True):
                     claim_close(x, v, 0, f"what {name} was given")
 
+    def test_optimizers_go_on_from_their_state(self, engine: Any) -> None:
+        """An optimiser restored from another one's `state` takes the same step; one array may have its own rate."""
+        chosen = _differentiating(engine)
+        slopes = {"x": numbers(3, seed=2), "y": [numbers(2, seed=3)]}
+        with owning(chosen):
+            for name in ("sgd", "adam"):
+                parameters = map_leaves(chosen.constant, {"x": numbers(3), "y": [numbers(2, seed=1)]})
+                first: Any = chosen.optimizer(name, [0.1, 0.3], parameters)
+                if not hasattr(first, "state"):
+                    pytest.skip("its optimisers have no state to keep")
+                once = first(parameters, map_leaves(chosen.constant, slopes))
+                state = first.state()
+                other = map_leaves(lambda v: chosen.constant(-3 * v), slopes)
+                expected = derivatives.host(chosen, first(once, other))
+                second: Any = chosen.optimizer(name, [0.1, 0.3], parameters)
+                second.restore(state, once)
+                stepped = derivatives.host(chosen, second(once, other))
+                for x, v in zip(leaves(stepped), leaves(expected), strict=True):
+                    claim_close(x, v, 0, f"the step of {name} after `restore`")
+
     # --------------------------------------------------------------------------------------- operations
 
     @pytest.mark.parametrize("name", OPERATIONS)

@@ -88,7 +88,10 @@ def find(part: Part, camera: Camera = CAMERA, sampler: Any = "auto", layers: int
 
 
 def frozen(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Sampled:
-    """Samples in NumPy arrays of `CAPACITY` rows, to evaluate in any engine."""
+    """Samples of a part whose θ holds NumPy arrays, in `CAPACITY` rows, to evaluate in any engine.
+
+    Fails if there are fewer than 20: the part should be at the origin, at a size of about one.
+    """
     sampled = find(part, camera, sampler, capacity=CAPACITY)
     claim(
         (np.asarray(sampled.row) >= 0).sum() >= 20,

@@ -119,7 +119,7 @@ class Scene:
         self._check()
 
     def move(self, *, rebuild: bool) -> None:
-        """Follow vertices that have changed in place: refit the structure, or build it anew."""
+        """Follow the vertices given to `Scene`, changed in place: build the structure anew (`rebuild`) or refit it."""
         library = self._library
         library.rtcSetGeometryBuildQuality(self._geometry, QUALITY_MEDIUM if rebuild else QUALITY_REFIT)
         library.rtcUpdateGeometryBuffer(self._geometry, BUFFER_VERTEX, 0)

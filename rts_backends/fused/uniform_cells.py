@@ -117,9 +117,15 @@ def survey(
 
 @compiled
 def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins, kinds):
-    """Fill the marks of row y of cells: those of column x at index x + 1, but in `kinds` at x.
+    """Mark row y of cells: the cell of column x at index x + 1, but in `kinds` at x.
 
-    `covered`: with a sample. `calm`: amid three alike. `joins`: like the cell `above`. `kinds`: bits NOTHING to LOOSE.
+    `cells` and `above` (W,) are the samples of this row and of the row above, or −1. `covered`, `calm` and `joins`
+    (W + 2,) must be zeros, since only ones are written; `kinds` (W,) is filled. A cell is plain if its sample is within
+    `reach` of the cell's centre, along each axis, and opaque (any alpha will do with `fronts`).
+
+    `covered`: with a sample. `calm`: plain, as are its left and right neighbours, all three of equal rgba. `joins`:
+    plain, with the rgba of the cell above, which need not be centred. `kinds`: NOTHING | LOOSE without a sample,
+    COVERED if centred within `reach`, else COVERED | LOOSE.
     """
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0

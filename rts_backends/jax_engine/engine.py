@@ -12,6 +12,7 @@ from jax.core import Tracer
 
 from rts import Engine, InputError, RtsError
 from rts.plugin_api.arrays import Tree
+from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.jax_engine import host, operations, row_blocks
@@ -252,21 +253,13 @@ class JaxEngine(Engine):
         """`jax.jit`."""
         return jax.jit(f)
 
-    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """Optax's `adam` or `sgd`."""
-        import optax
+    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
+        """Optax's `adam` or `sgd`, or an `optax.GradientTransformation`."""
+        from rts_backends.jax_engine.optimizer import Optimizer
 
-        transform = {"adam": optax.adam, "sgd": optax.sgd}[name](learning_rate)
-        state = transform.init(parameters)
-
-        @jax.jit
-        def update(parameters: Tree, gradient: Tree, state: Any) -> tuple[Tree, Any]:
-            updates, state = transform.update(gradient, state)
-            return optax.apply_updates(parameters, updates), state
-
-        def step(parameters: Tree, gradient: Tree) -> Tree:
-            nonlocal state
-            parameters, state = update(parameters, gradient, state)
-            return parameters
-
-        return step
+        if not isinstance(method, str) and not (callable(getattr(method, "init", None)) and hasattr(method, "update")):
+            raise InputError(
+                f"method is {quoted(method)}; expected 'adam', 'sgd', 'lm' or an optax.GradientTransformation, such as "
+                f"optax.adam(0.01), for jax arrays"
+            )
+        return Optimizer(method, learning_rate, parameters)

@@ -244,7 +244,7 @@ class _Seen:
 
 
 def _flat(fragments: Fragments) -> tuple[np.ndarray, ...]:
-    """Views of triangle ids (K, M), barycentrics (K, M, 2) and depths (K, M), with the axes of cells flattened."""
+    """Writable views of ids (K, M), barycentrics (K, M, 2) and depths (K, M), the axes of cells flattened to M."""
     triangle_ids, barycentrics, depth = fragments
     layers, count = len(depth), depth[0].size
     return triangle_ids.reshape(layers, count), barycentrics.reshape(layers, count, 2), depth.reshape(layers, count)

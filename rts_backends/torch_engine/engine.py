@@ -13,6 +13,7 @@ from torch.utils import _pytree
 
 from rts import Engine, InputError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
+from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import operations, torch_internals
@@ -284,16 +285,13 @@ class TorchEngine(Engine):
 
         return call
 
-    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """`torch.optim.Adam` or `torch.optim.SGD` on private copies of the parameters."""
-        variables = [p.detach().clone() for p in leaves(parameters)]
-        optimizer = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[name](variables, lr=learning_rate)
+    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
+        """`torch.optim.Adam` or `torch.optim.SGD`, or a `torch.optim.Optimizer`, on private copies of parameters."""
+        from rts_backends.torch_engine.optimizer import Optimizer
 
-        def step(_: Tree, gradient: Tree) -> Tree:
-            for variable, g in zip(variables, leaves(gradient), strict=True):
-                variable.grad = g
-            optimizer.step()
-            copies = iter([v.clone() for v in variables])
-            return map_leaves(lambda _: next(copies), parameters)
-
-        return step
+        if not isinstance(method, (str, torch.optim.Optimizer)):
+            raise InputError(
+                f"method is {quoted(method)}; expected 'adam', 'sgd', 'lm' or a torch.optim.Optimizer, such as "
+                f"torch.optim.Adam([parameters], lr=0.01), for torch tensors"
+            )
+        return Optimizer(method, learning_rate, parameters, parameters if given is None else given)

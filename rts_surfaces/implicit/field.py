@@ -203,7 +203,7 @@ class Implicit(Surface):
         return unit(self.field.slope(theta, position))
 
     def gbuffer(self, theta: Mapping[str, Tree], position: Array) -> GBuffer:
-        """The G-buffer of positions (N, 3) on the surface: with unit normals, outwards, and the attributes, if read.
+        """The G-buffer of positions (N, 3) on the surface: with unit normals, outwards, and attributes, made when read.
 
         All are differentiable in θ and in the positions. A normal is zero where the field has no slope.
         """

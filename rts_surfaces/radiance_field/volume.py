@@ -26,9 +26,10 @@ class VolumeImage(NamedTuple):
     """A picture of a volume, and its cost.
 
     Attributes:
-        image: (H, W, 3) RGB on the background, or (H, W, 4) premultiplied RGBA, in the encoding of the network.
-        coarse: evaluations of the coarse network.
-        fine: evaluations of the fine network.
+        image: (H, W, 3) RGB on the background, or (H, W, 4) premultiplied RGBA, encoded like the images that the
+            field was trained on.
+        coarse: number of points at which the coarse network was evaluated.
+        fine: number of points at which the fine network was evaluated.
     """
 
     image: np.ndarray

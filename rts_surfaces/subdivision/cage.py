@@ -262,7 +262,14 @@ def _check_sizes(cage: Cage) -> None:
 
 
 def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (n, len(columns) − 1) int64 of rows, and sharpness (n,) float32, the last column, at most `INFINITE`."""
+    """The rows of creases or corners, a column each of `columns`: all but the last as indices, the last as sharpness.
+
+    Returns:
+        (n, len(columns) − 1) int64 and (n,) float32, at most `INFINITE`.
+
+    Raises:
+        InputError: traced rows, or anything else.
+    """
     expected = f"rows ({', '.join(columns)})"
     if shape_of(rows)[:1] == (0,) or (isinstance(rows, (list, tuple)) and not rows):
         return np.zeros((0, len(columns) - 1), np.int64), np.zeros(0, np.float32)

@@ -105,7 +105,7 @@ class Subject:
         return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
 
     def image(self, parameters: Tree, change: Change | None = None, **options: Any) -> Array:
-        """The image (H, W, 4) of the scene at some parameters, after a change."""
+        """The image (H, W, 4) of the scene at some parameters, parts and camera changed by `change`; see `drawn`."""
         return self.drawn(self.shown(parameters), change, **options)
 
     def require_dependence(self) -> None:

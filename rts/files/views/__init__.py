@@ -1,0 +1,1 @@
+"""Views: pictures with the cameras that took them, a file for each format."""

@@ -1,0 +1,55 @@
+"""Optimisers of optax as step functions, for `rts.fit`."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+
+from rts.plugin_api.arrays import Tree, map_leaves
+
+
+class Optimizer:
+    """A step function `(parameters, gradient) -> parameters` of an optax transformation.
+
+    Args:
+        method: "adam", "sgd", or an `optax.GradientTransformation`.
+        rates: the learning rate, or a list of one for each array, for a method by name.
+        parameters: where to start.
+    """
+
+    def __init__(self, method: str | optax.GradientTransformation, rates: float | Sequence[float], parameters: Tree):
+        transform: Any = {"adam": optax.adam, "sgd": optax.sgd}[method](1.0) if isinstance(method, str) else method
+        self._state = transform.init(parameters)
+
+        @jax.jit
+        def update(parameters: Tree, gradient: Tree, state: Any) -> tuple[Tree, Any]:
+            updates, state = transform.update(gradient, state, parameters)
+            if isinstance(method, str):
+                scale = iter(rates) if isinstance(rates, Sequence) else itertools.repeat(rates)
+                updates = map_leaves(lambda x: next(scale) * x, updates)
+            return optax.apply_updates(parameters, updates), state
+
+        self._update = update
+
+    def __call__(self, parameters: Tree, gradient: Tree) -> Tree:
+        """The parameters after a step."""
+        parameters, self._state = self._update(parameters, gradient, self._state)
+        return parameters
+
+    def state(self) -> bytes:
+        """The arrays of the transformation's state, as `numpy.savez` writes them."""
+        file = io.BytesIO()
+        np.savez(file, *map(np.asarray, jax.tree.leaves(self._state)))
+        return file.getvalue()
+
+    def restore(self, state: bytes, parameters: Tree) -> None:
+        """Go on from a `state`; the parameters are given to each step."""
+        with np.load(io.BytesIO(state)) as known:
+            arrays = [jax.numpy.asarray(known[f"arr_{i}"]) for i in range(len(known.files))]
+        self._state = jax.tree.unflatten(jax.tree.structure(self._state), arrays)

@@ -1,0 +1,82 @@
+"""Optimisers of torch.optim as step functions, for `rts.fit`."""
+
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from rts import InputError
+from rts.plugin_api.arrays import Tree, leaves, map_leaves
+
+
+class Optimizer:
+    """A step function `(parameters, gradient) -> parameters` of a torch optimiser on private copies of tensors.
+
+    Args:
+        method: "adam", "sgd", or a `torch.optim.Optimizer` of the tensors in `given`. The optimiser itself stays as it
+            is: a copy steps. Tensors that it does not hold keep their values.
+        rates: the learning rate, or a list of one for each tensor, for a method by name.
+        parameters: where to start.
+        given: a tree like `parameters`, whose tensors the optimiser was made for.
+
+    Raises:
+        InputError: an optimiser of other tensors, or one that needs a function of the loss (LBFGS).
+    """
+
+    def __init__(
+        self, method: str | torch.optim.Optimizer, rates: float | Sequence[float], parameters: Tree, given: Tree
+    ):
+        self._variables = [p.detach().clone() for p in leaves(parameters)]
+        if isinstance(method, str):
+            kind = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[method]
+            each = rates if isinstance(rates, Sequence) else [rates] * len(self._variables)
+            groups = [{"params": [v], "lr": rate} for v, rate in zip(self._variables, each, strict=True)]
+            self._optimizer = kind(groups, lr=each[0])
+        else:
+            self._optimizer = self._copied(method, list(leaves(given)))
+        self._like = parameters
+
+    def _copied(self, method: torch.optim.Optimizer, given: Sequence[torch.Tensor]) -> torch.optim.Optimizer:
+        """A copy of an optimiser, its state included, that steps the private tensors."""
+        if isinstance(method, torch.optim.LBFGS):
+            raise InputError('method is LBFGS, which evaluates the loss by itself; use Adam, or method="lm"')
+        places = {id(x): i for i, x in enumerate(given)}
+        held = [p for group in method.param_groups for p in group["params"]]
+        if not held or any(id(p) not in places for p in held):
+            raise InputError(
+                "method is an optimiser of other tensors than those in parameters; make it of the same tensors, such "
+                'as torch.optim.Adam([parameters["vertices"]], lr=0.01)'
+            )
+        own = copy.deepcopy(method)
+        copies = [p for group in own.param_groups for p in group["params"]]
+        for new, old in zip(copies, held, strict=True):
+            place = places[id(old)]
+            new.requires_grad_(False).copy_(self._variables[place])
+            self._variables[place] = new
+        return own
+
+    def __call__(self, _: Tree, gradient: Tree) -> Tree:
+        """The parameters after a step from the last ones."""
+        for variable, g in zip(self._variables, leaves(gradient), strict=True):
+            variable.grad = g
+        with torch.no_grad():
+            self._optimizer.step()
+        copies = iter([v.clone() for v in self._variables])
+        return map_leaves(lambda _: next(copies), self._like)
+
+    def state(self) -> bytes:
+        """Moments and settings, as `torch.save` writes them."""
+        file = io.BytesIO()
+        torch.save(self._optimizer.state_dict(), file)
+        return file.getvalue()
+
+    def restore(self, state: bytes, parameters: Tree) -> None:
+        """Go on from a `state` and the parameters that belong to it."""
+        known: Any = torch.load(io.BytesIO(state), weights_only=True)
+        self._optimizer.load_state_dict(known)
+        for variable, value in zip(self._variables, leaves(parameters), strict=True):
+            variable.copy_(value)
