@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.spatial
 import torch
 import trimesh
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import rts
@@ -116,7 +116,7 @@ class Model(NamedTuple):
         return rts.Part(rts.Mesh(self.mesh.faces), theta, "unlit")
 
     def finer(self) -> Model:
-        """The same with four faces for each."""
+        """The model with four faces for each."""
         both = np.concatenate([self.mesh.vertices, self.colors], axis=1)
         both, faces = trimesh.remesh.subdivide(both, self.mesh.faces)
         return self._replace(
@@ -156,7 +156,7 @@ def camera_of(p: Any, camera: rts.Camera, view: Any) -> rts.Camera:
 def chamfer(a: trimesh.Trimesh, b: trimesh.Trimesh) -> float:
     """The mean distance of points of each mesh to the other, percent of the diagonal of b's bounds."""
     p, q = (trimesh.sample.sample_surface(m, POINTS, seed=0)[0] for m in (a, b))
-    ways = scipy.spatial.cKDTree(p).query(q)[0].mean(), scipy.spatial.cKDTree(q).query(p)[0].mean()
+    ways = KDTree(p).query(q)[0].mean(), KDTree(q).query(p)[0].mean()
     return 50 * float(sum(ways)) / float(np.linalg.norm(b.bounds[1] - b.bounds[0]))
 
 

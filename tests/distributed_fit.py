@@ -5,6 +5,7 @@ python -m torch.distributed.run --nproc-per-node 2 tests/distributed_fit.py METH
 Where END is "1:70", process 1 ends without a word before it reads its 70th picture, once.
 """
 
+import datetime
 import os
 import sys
 
@@ -47,7 +48,7 @@ TRUTH = {"vertices": VERTICES * np.array([1.1, 0.9, 1.0], np.float32), "pose": n
 if __name__ == "__main__":
     torch.set_num_threads(1)
     if "RANK" in os.environ:
-        torch.distributed.init_process_group("gloo")
+        torch.distributed.init_process_group("gloo", timeout=datetime.timedelta(seconds=100))
     cameras = [rts.Camera.look_at(eye, (0, 0, 0)) for eye in EYES]
     views = [rts.View(camera, rts.render(part(TRUTH), camera, SIZE), name=f"{i}") for i, camera in enumerate(cameras)]
     pose = torch.tensor([0.05, -0.03, 0.02, 0.02, 0.0, -0.02])

@@ -19,7 +19,12 @@ def run(count, *args, restarts=0):
     launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
     command = [sys.executable, *(launch if count > 1 else []), *(["--max-restarts", str(restarts)] if restarts else [])]
     paths = [str(SCRIPT.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+        "OMP_NUM_THREADS": "1",
+        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Restarts may hang without, see docs/many_views.md.
+    }
     done = subprocess.run(
         [*command, str(SCRIPT), *map(str, args)], env=environment, capture_output=True, text=True, timeout=300
     )
