@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 from typer.testing import CliRunner
@@ -125,8 +126,8 @@ def test_the_python_of_the_guide_to_many_views_does_what_it_says(tmp_path, monke
     shape, cameras = first["fit"], names["fit"]
     assert shape.loss < 0.3 * shape.validated[0][1] and (tmp_path / "fit.npz").is_file()
     assert [step for step, _ in shape.validated] == [0, 10, 20, 30, 40, 50, 59]
-    off = np.linalg.norm(names["vertices"].numpy() - names["truth"], axis=1).mean()
-    assert off < 0.7 * np.linalg.norm(names["start"] - names["truth"], axis=1).mean()
+    away = [KDTree(v).query(names["truth"])[0].mean() for v in (names["start"], names["vertices"].numpy())]
+    assert away[1] < 0.6 * away[0]
     np.testing.assert_allclose(cameras.parameters["gain"], 1, atol=0.02)
     assert cameras.loss < 0.3 * cameras.history[0]
 
