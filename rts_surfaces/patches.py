@@ -119,7 +119,7 @@ class Patches(Parametric):
         return Bicubic(self.nets(points), self.across, self.whole.flips)
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
-        """Positions, normals, and the `ATTRIBUTES` that θ has, in the engine and dtype of the control points."""
+        """Positions, normals, and those of `ATTRIBUTES` that θ has."""
         points = self.control_points(theta)
         engine = engine_of(points, samples.params)
         if not engine.owns(points):

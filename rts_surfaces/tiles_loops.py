@@ -153,9 +153,9 @@ def _square(faces, params, t, i, j, rs, rt, frame, base):
 
 @compiled
 def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
-    """Set corner `place` of triangle t to point m of the ring of points within a tile next to its border.
+    """Set corner `place` of triangle t to point m of those within a tile that lie next to a side.
 
-    Along the ring's part next to `side`, m counts from 1 in the direction of the side.
+    Along the side, in its direction around the tile, m counts from 1. `base` is the first vertex within the tile.
     """
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
     j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m

@@ -56,7 +56,7 @@ def _codes(low, high, y, count, out):
 
 @compiled
 def _mixed(codes, count, found):
-    """List the places in a row of the n cells whose corners differ in sign in `found[:n]`. Returns n.
+    """List in `found[:n]` the places, along a row, of the n cells whose corners differ in sign. Returns n.
 
     `codes` uint8 holds the cases of `count` cells, and zeros up to a multiple of eight: eight are tested at once. The
     rest of `found`, which has `count` places, may be overwritten.

@@ -79,7 +79,7 @@ class Limit:
 
     Attributes:
         table: (F, W) int32, the vertices on which each face depends, padded with one of them; read-only. For faces
-            without a limit surface, any vertex that is used.
+            without a limit surface, the first of `used`.
         uv_table: (F, W') int32, the rows of face-varying data on which each face depends; None without such data.
         kinds: (F,) int32, `NONE`, `QUAD`, `TRIANGLE` or `SUBFACES`.
         used: (U,) int32, the vertices that faces refer to, in increasing order; read-only.
