@@ -94,7 +94,11 @@ def _range(indices: np.ndarray) -> str:
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices, from 0 on, and points of an .npz."""
+    """The arrays "indices" and "points", in float64, of an .npz, of any shape.
+
+    Raises:
+        InputError: it is no .npz with both, or its indices are no integers.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             indices, points = np.asarray(file["indices"]), np.asarray(file["points"], np.float64)
@@ -107,7 +111,12 @@ def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Indices, from 0 on, and points of a text of patches."""
+    """Indices (n, 16), from 0 on, and points (m, 3) float64 of a text in the format of `Bezier.load`.
+
+    Raises:
+        InputError: the text is cut short, or a line has other numbers than are expected; lines after the end are
+            ignored.
+    """
     lines = [(i, t) for i, t in enumerate(path.read_bytes().decode(errors="replace").splitlines(), 1) if t.strip()]
     at = 0
 

@@ -59,7 +59,7 @@ def _second(p, u, v):
 
 @loop
 def points(start, stop, powers, patch, params, out):
-    """Fill `out` (N, 1, 3): points of patches (N,) at params (N, 2)."""
+    """Fill rows `start` to before `stop` of `out` (N, 1, 3): points of patches (N,) at params (N, 2)."""
     for n in range(start, stop):
         for c in range(3):
             out[n, 0, c] = first(powers[patch[n], c], params[n, 0], params[n, 1])[0]
@@ -67,7 +67,7 @@ def points(start, stop, powers, patch, params, out):
 
 @loop
 def expansions(start, stop, powers, patch, params, out):
-    """Fill `out` (N, 6, 3): points of patches (N,) at params (N, 2), and derivatives in u, v, uu, uv, vv."""
+    """As `points`, but `out` is (N, 6, 3): the point, and its derivatives in u, v, uu, uv, vv."""
     for n in range(start, stop):
         p, u, v, to = powers[patch[n]], params[n, 0], params[n, 1], out[n]
         for c in range(3):
@@ -79,12 +79,15 @@ def expansions(start, stop, powers, patch, params, out):
 
 
 def values(rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (N, C) with points of patches (N,) at params (N, 2); control points are `table` (n, 16) of `rows`."""
+    """Fill `out` (N, C) with values of patches (N,) at params (N, 2).
+
+    The control points of each patch are the 16 rows of `rows` (V, C) that its row of `table` (n, 16) names.
+    """
     parallel(_sum_values, len(out), _nets(rows, table), patch, params, out, work=30 * len(out))
 
 
 def push_values(_: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray) -> None:
-    """Fill the second of `moved` (N, C) with the tangents of the values; the first (V, C) are those of the rows."""
+    """Fill the second of `moved`, (N, C), with derivatives of the values along the first, (V, C), tangents of rows."""
     values(moved[0], params, patch, table, moved[1])
 
 
@@ -111,7 +114,7 @@ def normals(
 def push_normals(
     collapsed: float, rows: np.ndarray, params: np.ndarray, patch: np.ndarray, table: np.ndarray, *moved: np.ndarray
 ) -> None:
-    """Fill the second of `moved` (N, 3) with the tangents of the normals; the first (V, 3) are those of the rows."""
+    """Fill the second of `moved`, (N, 3), with the derivatives of normals along the first, (V, 3), tangents of rows."""
     tangents, out = moved
     given = _nets(rows, table), _nets(tangents, table), patch, params, rows.dtype.type(collapsed)
     parallel(_move_normals, len(out), *given, out, work=120 * len(out))
@@ -163,7 +166,7 @@ def _gather(start, stop, rows, table, out):
 
 @loop
 def _scatter(table, found, out):
-    """Add to `out` (V, C) the gradients of patches in all shares (S, n, 16, C)."""
+    """Add to `out` (V, C) the gradients `found` (S, n, 16, C) of control points in S shares; `table` (n, 16)."""
     for n in range(len(table)):
         for k in range(16):
             for c in range(out.shape[1]):
@@ -189,7 +192,10 @@ def _sum_values(start, stop, nets, patch, params, out):
 
 @loop
 def _pull_shares(start, stop, patch, params, g, found):
-    """Add to `found` (S, n, 16, C) the gradients of control points from g (N, C), for each of S shares of samples."""
+    """Add to `found` (S, n, 16, C) the gradients of control points from g (N, C), each share's in its own part.
+
+    `start` and `stop` count shares: share i is the i-th of S equal parts of the N samples.
+    """
     for share in range(start, stop):
         _pull_values(*_share(share, len(found), len(patch)), patch, params, g, found[share])
 
@@ -225,8 +231,8 @@ def _tangents(net, u, v, collapsed, work):
     `net` (16, 3) are the control points. The last three rows of `work` are vectors in its first three columns.
 
     Where one side of a patch is a single point, one tangent is zero, and beside it mostly rounding. The mixed slope,
-    the second derivative in u and v, has the direction in which that tangent grows. It replaces the tangent, times a
-    sign.
+    the second derivative in u and v, has the direction in which that tangent grows. It replaces a tangent shorter than
+    the share `collapsed` of the other, times a sign.
 
     Returns:
         The signs for the tangents along u and along v; 0 for a tangent that stays.
@@ -263,7 +269,10 @@ def _tangents(net, u, v, collapsed, work):
 
 @compiled
 def _unit_product(work, normal):
-    """Fill `normal` (3,) with the normalised cross product of both tangents, or zero. Returns its length, or 1."""
+    """Fill `normal` (3,) with the normalised cross product of rows 4 and 5 of `work`, the tangents; or with zero.
+
+    Returns the length of the product, or 1 if that is zero.
+    """
     for c in range(3):
         p, q = (c + 1) % 3, (c + 2) % 3
         normal[c] = work[4, p] * work[5, q] - work[4, q] * work[5, p]
@@ -276,7 +285,7 @@ def _unit_product(work, normal):
 
 @loop
 def _fill_normals(start, stop, nets, patch, params, collapsed, out):
-    """Fill `out` (N, 3) with unit normals; `collapsed` as in `normals`."""
+    """Fill `out` (N, 3) with unit normals, or zero; `nets` (n, 16, 3), `collapsed` as in `normals`."""
     work = np.zeros((7, 4), nets.dtype)
     for n in range(start, stop):
         _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)
@@ -310,7 +319,10 @@ def _move_normals(start, stop, nets, tangents, patch, params, collapsed, out):
 
 @loop
 def _pull_normal_shares(start, stop, nets, patch, params, collapsed, g, found):
-    """Add to `found` (S, n, 16, 3) the gradients of control points from g (N, 3), for each of S shares of samples."""
+    """Add to `found` (S, n, 16, 3) the gradients of control points from g (N, 3), that of normals.
+
+    `start` and `stop` count shares, as in `_pull_shares`; `nets` (n, 16, 3), `collapsed` as in `normals`.
+    """
     for share in range(start, stop):
         _pull_normals(*_share(share, len(found), len(patch)), nets, patch, params, collapsed, g, found[share])
 

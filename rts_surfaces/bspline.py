@@ -65,7 +65,10 @@ class BSpline(Patches):
         )
 
     def bezier_rows(self, values: Array) -> Array:
-        """Values (M, C) at the Bézier control points of all patches, by knot insertion, whose weights are ≥ 0."""
+        """Values (M, C) at the Bézier control points of all patches, from those at control points, (nu, nv, C).
+
+        They come by knot insertion, whose weights are ≥ 0.
+        """
         xp, engine = namespace(values), engine_of(values)
         a, b = (engine.constant(m, values) for m in self._along)
         (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
@@ -75,12 +78,12 @@ class BSpline(Patches):
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """See `Patches`: two axes (nu, nv), those of the grid."""
+        """See `Patches`: exactly (nu, nv), the shape of the grid."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
 
 
 def _product(a: Array, b: Array) -> Array:
-    """The product of matrices (n, m) and (m, k) in full precision; matrix units of some devices have less."""
+    """The product of matrices a (n, m) and b (m, k) in full precision; matrix units of some devices have less."""
     engine = engine_of(b)
     return a @ b if engine.exact_products(a, b) else engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)
 
@@ -138,7 +141,7 @@ class Revolution(BSpline):
         return radii[:, None, None] * engine.constant(self._around, radii) + engine.constant(self._up, radii)
 
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
-        """See `Patches`."""
+        """See `Patches`; for "radii" the shape is (n,)."""
         if name != "radii":
             return super().expected(name, shape)
         return None if shape == self.shape[:1] else f"({self.shape[0]},)"
@@ -179,9 +182,9 @@ def _blossom(knots: np.ndarray, span: int, arguments: list[int], count: int) -> 
     """The weights (count,) of control points in the polar form (blossom) of one piece, by de Boor's recursion.
 
     Args:
-        knots: (count + 4,), the knots.
-        span: the number of the piece.
-        arguments: the three arguments of the polar form.
+        knots: (count + 4,), the knots, in increasing order.
+        span: the number of the piece, from 0 on: it lies between knots `span + 3` and `span + 4`.
+        arguments: the three arguments of the polar form; (t, t, t) gives the point at t.
         count: the number of control points.
     """
     points = np.zeros((4, count))

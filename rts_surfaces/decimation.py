@@ -27,11 +27,13 @@ class Decimated(NamedTuple):
 
 
 def fewer_faces(vertices: np.ndarray, faces: np.ndarray) -> Iterator[Decimated]:
-    """Copies of the mesh with 1/16, then 1/4 of its faces; none below `FEWEST`, or without fast-simplification.
+    """Copies of a mesh with about 1/16, then 1/4 of its faces.
+
+    Yields none if the mesh has fewer than `FEWEST` faces, or if fast-simplification is not installed.
 
     Args:
-        vertices: (V, 3).
-        faces: (T, 3).
+        vertices: (V, 3) float.
+        faces: (T, 3) integers.
     """
     try:
         import fast_simplification

@@ -90,7 +90,7 @@ class Mesh(TriangleSurface):
         return Part(cls(faces), theta, shader="lambert")
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ whose entries have wrong shapes or dtypes."""
+        """Refuse θ that lacks an entry of `reads`, or has one of wrong shape or dtype."""
         for name in self.reads(theta):
             check_rows("a mesh", theta, name, self._extents[self._columns.get(name, 0) // 3])
 
@@ -98,7 +98,7 @@ class Mesh(TriangleSurface):
         return self.reads(theta)[1:]
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """The entries of θ that `evaluate` needs."""
+        """The entries of θ that `evaluate` needs: "vertices", known attributes that θ has, and all declared ones."""
         names = tuple(theta)
         if names not in self._reads:
             known = (name for name in self._columns if name in theta or name not in VERTEX_ATTRIBUTES)
@@ -106,9 +106,9 @@ class Mesh(TriangleSurface):
         return self._reads[names]
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
-        """Meshes of fewer faces, by `rts_surfaces.decimation`.
+        """Meshes of fewer faces, by `rts_surfaces.decimation.fewer_faces`, which may yield none.
 
-        None if the vertices are of torch or jax, if θ has normals or uv, or if an attribute has a table of its own.
+        Empty if the vertices are of torch or jax, if θ has normals or uv, or if an attribute has a table of its own.
         """
         from rts_surfaces.decimation import fewer_faces
 
@@ -122,7 +122,10 @@ class Mesh(TriangleSurface):
         return rates
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
-        """θ with fewer `vertices`; each has the attributes of an old vertex, whose index is in `nearest`."""
+        """θ with fewer `vertices` (V', 3); each has the attributes of an old vertex, whose index is in `nearest` (V',).
+
+        Further entries of θ stay.
+        """
         kept = {name: theta[name] for name in self._attributes(theta)}
         attributes = {name: take(x, engine_of(x).constant(nearest, x)) for name, x in kept.items()}
         return {**theta, **attributes, "vertices": vertices}

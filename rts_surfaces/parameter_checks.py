@@ -45,7 +45,10 @@ def check_entry(
 
 
 def check_rows(who: str, theta: Mapping[str, Tree], name: str, rows: int) -> None:
-    """Refuse an entry that is not (V, C) with V of at least `rows`, and C as in `WIDTHS`; see `check_entry`."""
+    """Refuse an entry that is not (V, C) with V of at least `rows`, and C as in `WIDTHS`; see `check_entry`.
+
+    Names that are not in `WIDTHS` may have any C.
+    """
     widths = WIDTHS.get(name)
 
     def expected(shape: tuple[int, ...]) -> str | None:

@@ -36,18 +36,19 @@ class Geometry(abc.ABC):
 
     @abc.abstractmethod
     def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
-        """Points and derivatives of the surface, with arguments and results as in `rts_surfaces.tiles.Points`."""
+        """Points of the surface, with derivatives if `order` is 2; see `rts_surfaces.tiles.Points`."""
 
     @abc.abstractmethod
     def meet(self, samples: Samples, rays: Rays) -> Samples:
         """Samples moved onto their rays, by Newton's method with `LIMITS`; they may change patch.
 
         Args:
-            samples: ids (N, 1), params (N, 2), row and depth (K, H, W), from which the method starts.
-            rays: the ray of each row, float64.
+            samples: ids (N, 1), params (N, 2), row and depth (K, H, W), from which the method starts; not changed.
+            rays: the ray of each of the N samples, float64.
 
         Returns:
-            The samples. Where a ray does not meet the surface, `row` is −1, and the sample's params are zero.
+            The samples, in the same N rows. Where a ray does not meet the surface, `row` is −1, the depth is zero, and
+            so are the sample's params.
         """
 
 
@@ -104,18 +105,28 @@ class Parametric(TriangleSurface):
 
     @abc.abstractmethod
     def geometry(self, points: np.ndarray) -> Geometry:
-        """The patches of control points (..., 3) that are finite, float64."""
+        """The patches for control points (..., 3) float64, which are finite."""
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
         """The control points."""
         return self.control_points(theta)
 
     def proxy_key(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """The cell of views that holds the camera: all views in it have the same triangles."""
+        """The cell of views that holds the camera: all views in it have the same triangles.
+
+        Raises:
+            InputError: control points that are NaN or infinite.
+        """
         return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
-        """Triangles that are off the surface by about `tolerance` pixels at most near outlines; `coarse` elsewhere."""
+        """Triangles that are off the surface by about `tolerance` pixels at most near outlines.
+
+        Elsewhere they may be off by `coarse` times as much. They fit all views of the camera's cell, see `proxy_key`.
+
+        Raises:
+            InputError: control points that are NaN or infinite, or too many triangles.
+        """
         points = self.finite(inputs)
         geometry, center = self.geometry(points), self._center(points)
         tile_shapes = self.shapes(geometry)
@@ -124,7 +135,7 @@ class Parametric(TriangleSurface):
         return triangles(self.tiles, geometry.points, *by_error(self.tiles, tile_shapes, allowed))
 
     def shapes(self, geometry: Geometry) -> Shapes:
-        """The shapes of the tiles."""
+        """The shapes of the smaller tiles, `tiles`."""
         return shapes(self.tiles, geometry.points, self.beside)
 
     def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +168,11 @@ class Parametric(TriangleSurface):
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
-        """Samples moved to where their rays meet the patches, by Newton's method; `row` is −1 where a ray misses."""
+        """Samples moved to where their rays meet the patches, by Newton's method; `row` is −1 where a ray misses.
+
+        Raises:
+            InputError: control points that are NaN or infinite.
+        """
         return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:

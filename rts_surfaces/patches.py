@@ -22,10 +22,10 @@ ATTRIBUTES = ("colors", "uv")
 
 
 class Bicubic(Geometry):
-    """Patches of Bézier control points (n, 4, 4, 3) float64.
+    """Bézier patches for given control points.
 
     Args:
-        nets: the control points.
+        nets: (n, 4, 4, 3) float64, the control points, first along u, then along v.
         across: (n, 4) int32, the result of the function `across`.
         flips: (n, 4) bool, the `flips` of the patches as `Tiles`.
     """
@@ -81,14 +81,14 @@ class Patches(Parametric):
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:
-        """Values (M, C) at the control points of the Bézier patches, from those of an entry of θ, linear in these.
+        """Values (M, C) at the control points of the Bézier patches, linear in `values`.
 
-        `values` may be a NumPy array in float64, too.
+        `values` (…, C) are those of an entry of θ, in any engine, or NumPy in float64.
         """
 
     @abc.abstractmethod
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
-        """The expected shape of an entry of θ, in words; None if `shape`, its own without the last axis, is right."""
+        """The expected shape of an entry of θ, in words; None if `shape`, that of all but its last axis, is right."""
 
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
         """The control points, as `bezier_rows` takes them."""
@@ -102,7 +102,7 @@ class Patches(Parametric):
         return wrong
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ whose entries have wrong shapes or dtypes."""
+        """Refuse θ that lacks an entry of `reads`, or has one of wrong shape or dtype."""
         for name in self.reads(theta):
             check_entry(repr(self), theta, name, partial(self.expected, name))
 
@@ -111,7 +111,7 @@ class Patches(Parametric):
         return *self.shaped_by, *(name for name in ATTRIBUTES if name in theta)
 
     def nets(self, points: np.ndarray) -> np.ndarray:
-        """(n, 4, 4, 3) float64 control points of the Bézier patches."""
+        """(n, 4, 4, 3) float64 control points of the Bézier patches, for `points` as `control_points` returns them."""
         return self.bezier_rows(np.asarray(points, np.float64))[self.table].reshape(-1, 4, 4, 3)
 
     def geometry(self, points: np.ndarray) -> Geometry:
@@ -119,7 +119,7 @@ class Patches(Parametric):
         return Bicubic(self.nets(points), self.across, self.whole.flips)
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
-        """Positions, normals, and the attributes of control points."""
+        """Positions, normals, and those of `ATTRIBUTES` that θ has."""
         points = self.control_points(theta)
         engine = engine_of(points, samples.params)
         if not engine.owns(points):
@@ -140,7 +140,7 @@ class Patches(Parametric):
 
 
 def across(sides: np.ndarray) -> np.ndarray:
-    """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
+    """The side beyond each side, (n, 4) int32, by its number 4 × patch + side; −1 at the border of the surface.
 
     Where m > 2 sides share an edge, in order of their numbers, each leads to the one ⌊m / 2⌋ after it, cyclically. So
     a side that is a single point leads to the patch on the other side of the point.
@@ -159,7 +159,7 @@ def across(sides: np.ndarray) -> np.ndarray:
 
 
 def _tiles(table: np.ndarray) -> Tiles:
-    """Patches (n, 16) as tiles; two sides are one edge if they have the same control points, in either order."""
+    """Patches (n, 16) as tiles; sides are one edge if they have the same four control points, forwards or backwards."""
     net, count = table.reshape(-1, 4, 4), len(table)
     # Sides run around the patch: v = 0, u = 1, v = 1 backwards, u = 0 backwards.
     sides = np.stack([net[:, :, 0], net[:, 3, :], net[:, ::-1, 3], net[:, 0, ::-1]], axis=1).reshape(-1, 4)

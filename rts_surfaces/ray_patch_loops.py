@@ -12,7 +12,7 @@ from rts_surfaces.bicubic_loops import compiled, first, loop
 
 @loop
 def bounds(nets, out):
-    """Fill `out` (n, 3) with upper bounds of the lengths of second derivatives: in u, in u and v, in v.
+    """Fill `out` (n, 3) with upper bounds of the lengths of second derivatives in a patch: in u, in u and v, in v.
 
     `nets` (n, 4, 4, 3) are the patches' control points.
     """
@@ -47,7 +47,8 @@ def _differences(net, i, j):
 def _crossed(across, flips, patch, u, v, inside):
     """The patch across the side beyond which (u, v) lies farthest, and (u, v) in it, `inside` away from the side.
 
-    The patch is −1, and (u, v) unchanged, if (u, v) lies within its patch or nothing lies beyond the side.
+    The patch is −1, and (u, v) unchanged, if (u, v) lies within its patch or nothing lies beyond the side. `across` and
+    `flips` (n, 4) are those of `meet`.
     """
     side, most = 0, -v
     if u - 1 > most:
@@ -82,14 +83,14 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
     surface by more than thin patches are wide.
 
     Args:
-        start: first line of cells.
+        start: first of the L lines of cells, those of all layers.
         stop: one after the last.
         powers: (n, 3, 4, 4), the patches.
         bounds: (n, 3), the result of `bounds`. Where they prove that a step ends near enough to the ray, the surface is
             not evaluated again.
         across: (n, 4) int32, see `rts_surfaces.patches.across`.
         flips: (n, 4) bool, as in `rts_surfaces.tiles.Tiles`.
-        ids: (N, 1) int32, the patch of each sample; changed.
+        ids: (N, 1) int32, the patch of each sample; changed where the hit is on another patch.
         params: (N, 2) float32, the samples' start; changed, to 0 without a hit.
         row: (L, W) int32, the sample in each cell, −1 for none; becomes −1 where the sample's ray does not meet the
             surface.
@@ -114,7 +115,10 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
 
 @compiled
 def _meet(n, powers, bounds, across, flips, ids, params, origins, directions, spread, limits):
-    """Move the params of sample n until its point lies on its ray. Returns True and the depth, or False and 0."""
+    """Move the patch `ids` and the params of sample n until its point lies on its ray; arguments as for `meet`.
+
+    Returns True and the depth; or False and 0 without a hit, with `ids` and params unchanged.
+    """
     residual, steps, largest, beyond, crossings = limits[0], int(limits[1]), limits[2], limits[3], int(limits[4])
     patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
     dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]

@@ -25,7 +25,10 @@ def _dot(a, b):
 
 @compiled
 def _slopes(found, frame, slopes):
-    """Fill `slopes` (2, 3) with derivatives in s and in t, from `found` (6, 3), a point and derivatives in (u, v)."""
+    """Fill `slopes` (2, 3) with derivatives in s and in t, for a tile's `frame` (3, 2).
+
+    `found` (6, 3) are a point of the tile and its derivatives in u, v, uu, uv and vv.
+    """
     for k in range(2):
         for c in range(3):
             slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
@@ -33,7 +36,10 @@ def _slopes(found, frame, slopes):
 
 @compiled
 def _second(found, a, b, c):
-    """The component c of the second derivative along a (2,) and b (2,), directions in (u, v), from `found` (6, 3)."""
+    """Coordinate c, 0 to 2, of the second derivative along a (2,) and b (2,), directions in (u, v).
+
+    `found` (6, 3) as in `_slopes`.
+    """
     return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
 
 
@@ -55,18 +61,19 @@ def _normal(slopes, out):
 
 @loop
 def shapes(start, stop, found, frames, normals, places, bends):
-    """Fill normals, places and bends of tiles.
+    """Fill normals, places and bends of tiles `start` to before `stop`.
 
     Args:
         start: first tile.
         stop: one after the last.
-        found: (n, G G, 6, 3) float64, points and derivatives in parameters of patches, on a grid of G points a side.
-        frames: (n, 3, 2) float64.
-        normals: (n, G, G, 3), of unit length, or zero.
-        places: (n, G, G, 3), the points of the grid.
-        bends: (n, 3), the largest absolute second derivatives along the normal: in s, in s and t, in t; where there is
-            no normal, their lengths. Triangles leave the surface by these components alone; the others move points
-            within it.
+        found: (n, G G, 6, 3) float64, on a grid of G points a side: the point, and its derivatives in u, v, uu, uv and
+            vv, the parameters of the patch.
+        frames: (n, 3, 2) float64, as in `Tiles`.
+        normals: (n, G, G, 3) to be filled, of unit length, or zero where there is none.
+        places: (n, G, G, 3) to be filled with the points of the grid.
+        bends: (n, 3) to be filled with the largest absolute second derivatives along the normal: in s, in s and t, in
+            t; where there is no normal, their lengths. Triangles leave the surface by these components alone; the
+            others move points within it.
     """
     grid, slopes = normals.shape[1], np.empty((2, 3))
     for n in range(start, stop):
@@ -89,7 +96,7 @@ def shapes(start, stop, found, frames, normals, places, bends):
 
 @loop
 def curves(start, stop, found, frames, along, out):
-    """Fill `out` (E,): of second derivatives along edges, the largest length of the part at right angles to the edge.
+    """Fill `out` (E,): the largest part, at right angles to the edge, of second derivatives along each edge.
 
     Args:
         start: first edge.
@@ -124,7 +131,8 @@ def outlines(
 ):
     """Fill `chord`, `edge` and `facing`: allowed distances of triangles from the surface, in units of space.
 
-    Distances are infinite out of view.
+    The view is a `View` of `rts_surfaces.view_cells`. Out of a perspective view distances are infinite, and `facing`
+    is 0. No distance is below 1e-4 of the tile's radius.
 
     Args:
         start: first tile.
@@ -132,17 +140,18 @@ def outlines(
         places: (n, G, G, 3), points on a grid of each tile.
         normals: (n, G, G, 3), unit normals at these points, or zero.
         bends: (n, 3), the result of `shapes`.
-        eye: (3,), or the direction towards the viewer if `parallel`.
+        eye: (3,), or the unit direction towards the viewer if `parallel`.
         toward: (3,) unit, from the middle of the surface to the eye.
         parallel: True if rays are parallel.
         aside: how far the eye may be off sideways; if `parallel`, how far the direction may be off.
         depth: how far the eye may be off along `toward`.
-        spread: (2,), at distance d from the eye a pixel is `spread[0] + spread[1] d` wide.
-        cone: (5,): the axis of the view, sine and cosine of half the angle of the cone that holds it.
+        spread: (2,), the width of a pixel: `spread[0]` if `parallel`, else `spread[1] d` at distance d from the eye.
+        cone: (5,): axis of the cone that holds the view, sine and cosine of half its angle; not used if `parallel`.
         wanted: (2,), the allowed distance in pixels where a tile may have an outline, and elsewhere.
-        chord: (n,), the allowed distance for each tile.
-        edge: (n,), the allowed distance for those of its edges that are outlines.
-        facing: (n,) int8: 1 for a tile that faces the viewer everywhere, −1 for one that does nowhere, else 0.
+        chord: (n,) to be filled: the allowed distance for each tile.
+        edge: (n,) to be filled: the allowed distance for those of its edges that are outlines.
+        facing: (n,) int8 to be filled: 1 for a tile that faces the viewer everywhere, −1 for one that faces away
+            everywhere, else 0.
     """
     grid, move = places.shape[1], aside + depth
     faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
@@ -197,6 +206,8 @@ def outlines(
 @loop
 def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
     """Fill the numbers of pieces into which tiles and edges are cut: inner (n, 2) along s and t, edges (E,).
+
+    All are 1 to `most`. Tiles out of view have 1, or `least` if a neighbour cuts one of their edges.
 
     Args:
         bends: (n, 3), as in `shapes`.

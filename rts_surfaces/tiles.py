@@ -46,7 +46,7 @@ class Tiles(NamedTuple):
         patch: (n,) int32, the patch of which each tile is a part.
         frames: (n, 3, 2) float64: (s, t) has the patch parameters `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
         corners: (n, k) int32, the numbers of the tile's corners, counter-clockwise from (0, 0).
-        sides: (n, k) int32, the edge from each corner to the next.
+        sides: (n, k) int32, the number of the edge from each corner to the next.
         flips: (n, k) bool, whether a side, which runs around the tile, runs against its edge.
         corner_tiles: (C, 2) int32, for each corner a tile that has it, and its index among this tile's corners.
         edge_tiles: (E, 2) int32, for each edge a tile that has it, and its index among this tile's sides.
@@ -64,14 +64,18 @@ class Tiles(NamedTuple):
     def of(
         cls, patch: np.ndarray, frames: np.ndarray, corners: np.ndarray, sides: np.ndarray, flips: np.ndarray
     ) -> Tiles:
-        """Tiles from tables whose corners and edges have any integers as names, equal where tiles share them."""
+        """Tiles from tables as in the attributes, where any integers name corners and edges.
+
+        Names in `corners` and in `sides` are equal where tiles share a corner or an edge. They become numbers from 0
+        on, in increasing order of the names.
+        """
         corners, corner_tiles = _numbered(corners)
         sides, edge_tiles = _numbered(sides)
         patch, frames, flips = patch.astype(np.int32), frames.astype(np.float64), np.array(flips, bool)
         return cls(*(read_only(x) for x in (patch, frames, corners, sides, flips, corner_tiles, edge_tiles)))
 
     def params(self, tiles: np.ndarray, local: np.ndarray) -> np.ndarray:
-        """Parameters (N, 2) of the patch, at local coordinates `local` (N, 2) of tiles (N,)."""
+        """Parameters (N, 2) in the patches of tiles, by their numbers (N,), at local coordinates `local` (N, 2)."""
         frames = self.frames[tiles]
         return frames[:, 0] + local[:, :1] * frames[:, 1] + local[:, 1:] * frames[:, 2]
 
@@ -80,10 +84,10 @@ class Shapes(NamedTuple):
     """Shapes of tiles, float64, by which the distances between their triangles and the surface are estimated.
 
     Attributes:
-        normals: (n, G, G, 3) normals of unit length, or zero, at a grid of G points a side.
+        normals: (n, G, G, 3) unit normals at a grid of G points a side; zero where the tile has none.
         places: (n, G, G, 3), the points of the grid.
         bends: (n, 3), absolute values of second derivatives along the normal: in s, in s and t, in t; each the largest
-            over the grid.
+            over the grid. Where there is no normal, the whole length counts.
         curves: (E,), lengths of second derivatives along edges, their parts at right angles to the edge; each the
             largest over G points of the edge.
     """
@@ -95,14 +99,20 @@ class Shapes(NamedTuple):
 
 
 def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Names (n, k) as numbers from 0 on, and for each number the (row, column) of its first occurrence."""
+    """Names (n, k), any integers, as numbers (n, k) int32 from 0 on, in increasing order of the names.
+
+    Also returns, for each number, the row and column (·, 2) int32 of its first occurrence in `names`.
+    """
     _, place, numbers = np.unique(names, return_index=True, return_inverse=True)
     where = np.stack(np.divmod(place, names.shape[1]), axis=1).astype(np.int32)
     return numbers.reshape(names.shape).astype(np.int32), where
 
 
 def split(tiles: Tiles) -> Tiles:
-    """Tiles cut into smaller ones, all alike, as `ENOUGH` says; triangles and many tiles are returned unchanged."""
+    """Quadrilateral tiles, each cut into k × k smaller ones, with k as `ENOUGH` says.
+
+    Returns `tiles` itself if they are triangles, or so many that k is 1.
+    """
     count, width = tiles.corners.shape
     cuts = int(np.clip(np.sqrt(ENOUGH / count), 1, FINEST))
     if width == 3 or cuts == 1:
@@ -115,7 +125,10 @@ def split(tiles: Tiles) -> Tiles:
 
 
 def _pieces(tiles: Tiles, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners, sides and flips (n cuts², 4) of quadrilaterals cut into cuts² tiles each; see `Tiles.of` for names."""
+    """Corners, sides and flips (n cuts², 4), as `Tiles.of` takes them, of n quadrilaterals cut into cuts² tiles each.
+
+    The cuts² tiles of one quadrilateral follow one another, in the order of s, then of t.
+    """
     count, points, edges, steps = len(tiles.corners), len(tiles.corner_tiles), len(tiles.edge_tiles), np.arange(cuts)
     # Points: the corners, those within edges, those within tiles.
     corner = points + edges * (cuts - 1) + np.arange(count * (cuts + 1) ** 2).reshape(count, cuts + 1, cuts + 1)
@@ -152,7 +165,7 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
 
     Args:
         tiles: the tiles.
-        points: the surface.
+        points: the function that evaluates the surface.
         beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
     from rts_surfaces import tile_rates_loops
@@ -184,7 +197,11 @@ def _slices(count: int) -> list[slice]:
 
 
 def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """Points and derivatives (n, P, 6, 3), see `Points`, of tiles (n,) at local coordinates (n or 1, P, 2)."""
+    """Points and derivatives (n, P, 6, 3) of tiles (n,), by number, at P places in each.
+
+    The places are local coordinates (n, P, 2), or (1, P, 2) for the same in all tiles. Derivatives are in the patch's u
+    and v, as in `Points`, not in s and t.
+    """
     frames, width = tiles.frames[tile][:, None], local.shape[1]
     params = frames[:, :, 0] + local[..., :1] * frames[:, :, 1] + local[..., 1:] * frames[:, :, 2]
     derivatives = points(np.repeat(tiles.patch[tile], width), params.reshape(-1, 2), 2)
@@ -197,7 +214,8 @@ class Allowed(NamedTuple):
     Attributes:
         chord: (n,), for each tile.
         edge: (n,), for the edges of each tile that are outlines.
-        facing: (n,) int8: 1 for a tile that faces the viewer everywhere, −1 for one that does nowhere, else 0.
+        facing: (n,) int8: 1 for a tile that faces the viewer everywhere, −1 for one that faces away everywhere, else 0,
+            which also stands for "unknown".
     """
 
     chord: np.ndarray
@@ -206,7 +224,7 @@ class Allowed(NamedTuple):
 
     @classmethod
     def everywhere(cls, count: int, chord: float) -> Allowed:
-        """The distance `chord` for all of `count` tiles and their edges."""
+        """The distance `chord` for all of `count` tiles and their edges, of which no facing is known."""
         return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
 
 
@@ -231,7 +249,10 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
 
 
 def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, at which triangles keep allowed distances; at most `MOST`."""
+    """Rates of edges (E,) and of tiles (n, 2), int32, at which triangles keep allowed distances, by estimate.
+
+    No rate is above `MOST`, even if distances are then exceeded.
+    """
     from rts_surfaces import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
@@ -242,7 +263,10 @@ def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.nd
 
 
 def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, all equal to `rate`, except where `LEAST` needs more in tiles."""
+    """Rates of edges (E,) and of tiles (n, 2), int32: `rate` everywhere, but in tiles `LEAST` if that is more.
+
+    A `rate` of 1 stays 1 in tiles, too: they are not cut at all.
+    """
     edges = np.full(len(tiles.edge_tiles), rate, np.int32)
     least = 1 if rate == 1 else max(rate, LEAST[tiles.corners.shape[1]])
     return edges, np.full((len(tiles.patch), 2), least, np.int32)
@@ -256,13 +280,14 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
 
     Args:
         tiles: the tiles.
-        points: the surface.
+        points: the function that evaluates the surface.
         edges: (E,) int32, into how many pieces each edge is cut.
         inner: (n, 2) int32, into how many pieces each tile is cut along s and t; triangular tiles use the first alone.
             Where a tile or an edge of it is cut at all, the tile's numbers are at least `LEAST` of its number of sides.
 
     Returns:
-        Vertices and faces; ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2), (u, v) in that patch.
+        Vertices (V, 3) float32: the tiles' corners, by their numbers, then the points within edges, then those within
+        tiles. Faces (T, 3); ids (T, 1), the patch of each triangle; corner parameters (T, 3, 2), (u, v) in that patch.
 
     Raises:
         InputError: more than `MOST_TRIANGLES` triangles.
@@ -289,9 +314,10 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
 def _places(
     tiles: Tiles, edges: np.ndarray, edge_first: np.ndarray, inner: np.ndarray, inner_first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Patches (V,) and parameters (V, 2) of vertices: first those at corners, then within edges, then within tiles.
+    """Patches (V,) int32 and parameters (V, 2) float64 of vertices: those at corners, within edges, within tiles.
 
-    `edge_first` (E + 1,) and `inner_first` (n + 1,) are the first vertex within each edge and each tile.
+    `edges` (E,) and `inner` (n, 2) are rates. `edge_first` (E + 1,) and `inner_first` (n + 1,) are the first vertex
+    within each edge and each tile, and one after the last.
     """
     from rts_surfaces import tiles_loops
 

@@ -12,16 +12,16 @@ from rts.plugin_api.loops import compiled, loop
 
 @loop
 def within_edges(owner, starts, ends, edges, edge_first, patch, params):
-    """Fill patch (V,) and params (V, 2) of the points within edges.
+    """Write the points within edges, ends excluded, to their rows of `patch` (V,) and `params` (V, 2).
 
     Args:
         owner: (E,) int32, the patch on which each edge is evaluated.
         starts: (E, 2) float64, the patch's parameters at the start of the edge.
         ends: (E, 2) float64, at its end.
         edges: (E,) int32, into how many pieces each edge is cut.
-        edge_first: (E + 1,) int32, the first of the points within each edge.
-        patch: (V,) int32.
-        params: (V, 2) float64.
+        edge_first: (E + 1,) int32, the row of the first of the points within each edge.
+        patch: (V,) int32, written in these rows alone.
+        params: (V, 2) float64, written in these rows alone.
     """
     for e in range(len(edges)):
         for k in range(1, edges[e]):
@@ -39,7 +39,11 @@ def _put(frame, s, t, out):
 
 @loop
 def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
-    """Fill `patch` (V,) and `params` (V, 2) at points within tiles; t changes fastest. See `quadrilaterals`."""
+    """Write the points within tiles, border excluded, to `patch` (V,) int32 and `params` (V, 2) float64.
+
+    Points of tile n have the rows from `inner_first[n]` on; t changes fastest. Other rows stay. Arguments are those of
+    `quadrilaterals`.
+    """
     for n in range(len(inner)):
         v, rs, rt = inner_first[n], inner[n, 0], inner[n, 1]
         for i in range(1, rs):
@@ -51,7 +55,7 @@ def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
 
 @loop
 def within_triangles(owner, frames, inner, inner_first, patch, params):
-    """Fill `patch` (V,) and `params` (V, 2) at points within triangular tiles; s changes fastest. See `triangles`."""
+    """As `within_quadrilaterals`, of triangular tiles, cut into `inner[n, 0]` along each side; s changes fastest."""
     for n in range(len(inner)):
         v, r = inner_first[n], inner[n, 0]
         for j in range(1, r):
@@ -63,7 +67,10 @@ def within_triangles(owner, frames, inner, inner_first, patch, params):
 
 @compiled
 def _count(rates, sides, edges):
-    """The number of triangles of a tile with these rates (2,) and sides (k,); `edges` (E,) are the rates of edges."""
+    """The number of triangles of a tile with these rates (2,); its sides (k,) are numbers of edges.
+
+    `edges` (E,) are the rates of all edges. A tile whose first rate is 1 must have edges of rate 1.
+    """
     width, rs, rt = len(sides), rates[0], rates[1]
     if rs == 1:
         return width - 2
@@ -75,7 +82,7 @@ def _count(rates, sides, edges):
 
 @loop
 def counted(inner, sides, edges):
-    """The number of triangles of all tiles, from rates `inner` (n, 2) and `edges` (E,)."""
+    """The number of triangles of all tiles, from their rates `inner` (n, 2), sides (n, k), and rates `edges` (E,)."""
     total = 0
     for n in range(len(inner)):
         total += _count(inner[n], sides[n], edges)
@@ -84,7 +91,10 @@ def counted(inner, sides, edges):
 
 @loop
 def counts(inner, sides, edges, first):
-    """Fill `first` (n + 1,): the index of the first triangle of each tile, and last the number of all triangles."""
+    """Fill `first` (n + 1,): the index of the first triangle of each tile, and last the number of all triangles.
+
+    Other arguments are those of `counted`.
+    """
     first[0] = 0
     for n in range(len(inner)):
         first[n + 1] = first[n] + _count(inner[n], sides[n], edges)
@@ -102,9 +112,10 @@ def _set(faces, params, t, place, vertex, frame, x, y):
 
 @compiled
 def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
-    """Set corner `place` of triangle t to point k, from 0 to `cuts`, of a side of tile n.
+    """Set corner `place` of triangle t, in `faces` and `params`, to point k of a side of tile n.
 
-    `base` is the first of the vertices within the side's edge.
+    Points count around the tile: 0 is corner `side`, `cuts` is the next corner. `frame` (3, 2) is the tile's, `corners`
+    and `flips` (n, width) are those of all tiles, and `base` is the first vertex within the side's edge.
     """
     width = corners.shape[1]
     if k == 0 or k == cuts:
@@ -129,6 +140,7 @@ def _square(faces, params, t, i, j, rs, rt, frame, base):
     """Set both triangles, t and t + 1, of a cell between points within a tile. Returns t + 2.
 
     The cell's lowest point is (i, j), counted along s and t from (1, 1); border points of the tile have 0, rs or rt.
+    `base` is the first of the vertices within the tile.
     """
     for half in range(2):
         for k in range(3):
@@ -141,7 +153,10 @@ def _square(faces, params, t, i, j, rs, rt, frame, base):
 
 @compiled
 def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
-    """Set corner `place` of triangle t to point m, from 1 on, of the points within a tile that are next to a side."""
+    """Set corner `place` of triangle t to point m of those within a tile that lie next to a side.
+
+    Along the side, in its direction around the tile, m counts from 1. `base` is the first vertex within the tile.
+    """
     i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
     j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
     _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
@@ -151,7 +166,7 @@ def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
 def quadrilaterals(
     start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out
 ):
-    """Fill the triangles of quadrilateral tiles.
+    """Write the triangles of quadrilateral tiles `start` to before `stop`; two for a tile whose rates are 1.
 
     Args:
         start: first tile.
@@ -166,7 +181,7 @@ def quadrilaterals(
         inner: (n, 2) int32, into how many pieces each tile is cut along s and t.
         inner_first: (n + 1,) int32, the first of the vertices within each tile.
         first: (n + 1,) int32, the first triangle of each tile.
-        out: faces (T, 3) int32, ids (T, 1) int32, params (T, 3, 2) float32.
+        out: the arrays to be filled: faces (T, 3) int32, ids (T, 1) int32, params (T, 3, 2) float32, see `Proxy`.
     """
     faces, ids, params = out
     for n in range(start, stop):
@@ -207,7 +222,7 @@ def _triangle_point(faces, params, t, place, i, j, r, frame, base):
 
 @compiled
 def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
-    """As `_square_ring`, of a triangular tile."""
+    """As `_square_ring`, of a triangular tile with r pieces a side; m is from 1 to r − 2."""
     i = m if side == 0 else r - 1 - m if side == 1 else 1
     j = 1 if side == 0 else m if side == 1 else r - 1 - m
     _triangle_point(faces, params, t, place, i, j, r, frame, base)
@@ -215,7 +230,7 @@ def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
 
 @loop
 def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
-    """Fill the triangles of triangular tiles; arguments as for `quadrilaterals`, but (n, 3) corners, sides, flips.
+    """Write the triangles of triangular tiles; arguments as for `quadrilaterals`, but (n, 3) corners, sides, flips.
 
     Of `inner` the first column alone is used.
     """

@@ -27,7 +27,8 @@ class View(NamedTuple):
         toward: (3,) unit, from the surface's centre to the eye.
         spread: (2,): at distance d from the eye a pixel is at least `spread[0] + spread[1] d` wide, local units.
         axis: (3,) unit, the direction in which the camera looks.
-        angle: half the angle of a cone around the axis that holds all views of the cell, radians.
+        angle: half the angle of a cone around the axis that holds all views of the cell, radians; π where rays are
+            parallel.
     """
 
     eye: np.ndarray
@@ -41,7 +42,7 @@ class View(NamedTuple):
 
 
 def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple:
-    """The cell of views that holds a camera, as whole numbers; `view_of` takes them.
+    """The cell of views that holds a camera, as a tuple for `view_of`: True if rays are parallel, and whole numbers.
 
     Args:
         camera: a camera of NumPy arrays, in the surface's local space.
@@ -66,7 +67,7 @@ def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple
 
 
 def view_of(key: tuple, center: np.ndarray) -> View:
-    """The cell of a `view_key`, for a surface with this centre (3,)."""
+    """The cell of views with a key, the result of `view_key`, for a surface with this centre (3,)."""
     parallel, toward, distance, width, axis, wide = key
     direction, half = _direction(toward), 0.75 / CELLS  # Of a cell's diagonal, the tangent at most.
     narrow = STEP ** (width - 0.5)
@@ -83,7 +84,10 @@ def _power(x: float) -> int:
 
 
 def _cell(vector: np.ndarray) -> tuple[int, int, int]:
-    """The cell of a direction (3,) on the sides of a cube, as whole numbers from −`CELLS` to `CELLS`."""
+    """The cell of a direction (3,), of any length, on the sides of a cube: whole numbers from −`CELLS` to `CELLS`.
+
+    A direction of length 0 counts as z.
+    """
     largest = float(np.abs(vector).max())
     x, y, z = (round(CELLS * c / largest) for c in vector.tolist()) if largest > 0 else (0, 0, CELLS)
     return x, y, z

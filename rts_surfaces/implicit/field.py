@@ -107,7 +107,8 @@ class Field(ScalarField):
         """See `ScalarField`.
 
         Raises:
-            InputError: `f` fails, or its result has another shape, dtype or engine.
+            InputError: `f` fails, or its result has another shape, dtype or engine. Only in NumPy a float32 result is
+                accepted for float64 points.
         """
         try:
             value = self.f(theta, points)
@@ -185,9 +186,11 @@ class Implicit(Surface):
     def at_hits(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """The G-buffer where rays met the field, at x₀ − (f(x₀) − f₀) w, with x₀, w and f₀ the parameters of samples.
 
+        f is the level of the field. Rows of zeros, which only pad, have the result of the first row.
+
         Args:
             theta: θ.
-            samples: samples with the parameters (N, 7) of `rts_surfaces.implicit.casting.moving`.
+            samples: samples with the parameters (N, 7) of `rts_surfaces.implicit.casting.moving`: x₀, w and f₀.
         """
         params = self.field.suited(theta, samples.params)
         xp = namespace(params)
@@ -239,7 +242,10 @@ def known_number(name: str, value: np.ndarray | None) -> float:
 
 
 def check_function(name: str, f: Any) -> None:
-    """Refuse anything but a function of θ and points; classes are refused, callable objects are not."""
+    """Refuse anything but a function of θ and points; classes are refused, callable objects are not.
+
+    Compiled functions, whose arguments are unknown, pass.
+    """
     if not callable(f) or isinstance(f, type):
         raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
     try:

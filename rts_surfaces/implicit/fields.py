@@ -2,7 +2,7 @@
 
 Each field reads entries of θ by fixed names. If two fields share a name, give each its own dict:
 `union(lambda theta, p: sphere(theta["left"], p), lambda theta, p: sphere(theta["right"], p))`.
-All have finite derivatives everywhere, both in θ and in points.
+All have finite derivatives everywhere, both in θ and in points; unions have them if their fields do.
 """
 
 from __future__ import annotations
@@ -98,7 +98,10 @@ def _check_fields(fields: tuple[Function, ...]) -> None:
 
 
 def _nearest(points: Array, centers: Array, radii: Array) -> Array:
-    """The index (M,) int32 of the sphere that is nearest to each point (M, 3)."""
+    """The index (M,) int32 of the sphere with the least signed distance to each point (M, 3).
+
+    `centers` (n, 2) are x and z in the plane y = 0, `radii` is (n,).
+    """
     engine = engine_of(points)
     xp, count = engine.namespace, centers.shape[0]
     if engine.exact_products(points, centers):

@@ -31,7 +31,11 @@ def differences(values: Array, points: Array, lattice: Lattice) -> Array:
 def _cells(
     shape: Sequence[int], points: Array, low: Sequence[float], step: Sequence[float]
 ) -> tuple[list[Array], list[Array]]:
-    """Along each axis, the lowest corners (M,) int32 of the points' cells, and the points' places in them, 0 to 1."""
+    """The cells of points (M, 3): a list of their lowest corners (M,) int32, and one of places in them, 0 to 1 (M,).
+
+    Each list has an array for each axis. Points beyond the lattice count as their nearest ones on its bounds. Places
+    are differentiable. `low` and `step` are the lattice's, of the given `shape`.
+    """
     xp, engine = namespace(points), engine_of(points)
     lowest, shares = [], []
     for axis in range(3):
@@ -44,7 +48,10 @@ def _cells(
 
 
 def _corners(shape: Sequence[int], lowest: Sequence[Array], shares: Sequence[Array]) -> tuple[Array, Array]:
-    """Numbers (M, 8) in the lattice of the corners of cells, and their weights (M, 8), products of linear ones."""
+    """Numbers (M, 8) in the lattice of the corners of cells, and their weights (M, 8) in linear interpolation.
+
+    `lowest` and `shares` are the lists that `_cells` returns. Corner i has the offsets (i & 1, i >> 1 & 1, i >> 2 & 1).
+    """
     xp = namespace(lowest[0])
     first = (lowest[0] * shape[1] + lowest[1]) * shape[2] + lowest[2]
     ids, weights = [], []

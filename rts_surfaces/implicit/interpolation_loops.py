@@ -11,7 +11,7 @@ Numbers = tuple[float, ...]
 
 
 def forward(values: np.ndarray, points: np.ndarray, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
-    """Fill `out` (N, 3) with the differences of values (X, Y, Z) at points (N, 3); NaN where these are not finite."""
+    """Fill `out` (N, 3) with the differences of values (X, Y, Z) at points (N, 3); NaN where a point is not finite."""
     parallel(_value, len(points), values, points, low, step, out, work=150 * len(points))
 
 
@@ -27,7 +27,7 @@ def push(
 ) -> None:
     """Fill `out` (N, 3) with derivatives of the differences along `t_values` (X, Y, Z) and `t_points` (N, 3).
 
-    A tangent that is None counts as zeros.
+    A tangent that is None counts as zeros. NaN where a point is not finite.
     """
     out[...] = 0
     if t_values is not None:
@@ -48,7 +48,7 @@ def pull(
 ) -> None:
     """Pull back g (N, 3), the gradient of the differences: add to `g_values` (X, Y, Z), and fill `g_points` (N, 3).
 
-    One that is None is not wanted.
+    Either is None if it is not wanted. A point that is not finite adds nothing, and its gradient is zero.
     """
     if g_values is not None:
         _pull_values(points, g, low, step, g_values)
@@ -60,8 +60,9 @@ def pull(
 def _place(point, shape, low, step, lowest, near, slopes):
     """Fill `lowest` (3,), `near` (3, 2) and `slopes` (3,) for the cell of a point.
 
-    They are its lowest corner, the weights of both ends along each axis, and the derivatives of the upper end's weight.
-    Returns False if the point is not finite: the arrays are then unfinished.
+    They are its lowest corner, the weights of both ends along each axis, and the derivatives of the upper end's weight
+    by the point's coordinates. Beyond the bounds the point counts as on them, and these derivatives are 0. Returns
+    False if the point is not finite: the arrays are then unfinished.
     """
     for axis in range(3):
         at = (point[axis] - low[axis]) / step[axis]
@@ -90,7 +91,7 @@ def _difference(values, at, axis, step):
 
 @loop
 def _value(start, stop, values, points, low, step, out):
-    """Fill `out` (N, 3) with the differences at points from `start` to before `stop`."""
+    """Fill `out` (N, 3) with the differences at points from `start` to before `stop`; NaN as in `forward`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     for n in range(start, stop):
         out[n] = 0
@@ -138,7 +139,10 @@ def _push_points(start, stop, values, points, tangents, low, step, out):
 
 @loop
 def _pull_points(start, stop, values, points, g, low, step, results):
-    """Fill `results` (N, 3) with the gradients of the points, from g (N, 3), those of the differences."""
+    """Fill `results` (N, 3) with the gradients of the points, from g (N, 3), those of the differences.
+
+    0 where a point is not finite.
+    """
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
     own = np.empty(3)
     for n in range(start, stop):

@@ -27,7 +27,7 @@ class Lattice:
         step: (3,) float64, the distance of neighbours along each axis.
 
     Raises:
-        InputError: bounds without extent along an axis, or a wrong shape.
+        InputError: bounds that are traced, not finite, or not lower in each coordinate of the first; a wrong shape.
     """
 
     def __init__(self, bounds: Any, shape: Any):
@@ -43,7 +43,7 @@ class Lattice:
         return self
 
     def of_shape(self, shape: tuple[int, ...]) -> Lattice:
-        """A lattice of another shape with the same first and last point."""
+        """A lattice of another shape, checked, with the same first and last point."""
         extent = self.step * (np.array(self.shape) - 1)
         return Lattice((self.low, self.low + extent), shape)
 
@@ -72,7 +72,11 @@ class Lattice:
 
 
 def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and the upper corner (3,) float64 of a box; an InputError unless all of the first is lower."""
+    """The lower and the upper corner (3,) float64 of a box, from two rows of three finite numbers.
+
+    Raises:
+        InputError: bounds of another shape, traced ones, or a coordinate of the first corner that is not lower.
+    """
     known = check_numbers("bounds", bounds, (2, 3))
     if known is None:
         raise InputError("bounds are traced; expected known numbers ((x0, y0, z0), (x1, y1, z1))")

@@ -23,7 +23,7 @@ class LatticeField(ScalarField):
 
     Args:
         bounds: two corners ((x0, y0, z0), (x1, y1, z1)) of the lattice, the lower one first.
-        isovalue: where the level is zero.
+        isovalue: the value on the surface, where the level is zero.
         sign: 1 if values below the isovalue are inside, −1 if values above it are.
         shape: (X, Y, Z) that the values must have, or None for any.
 
@@ -43,7 +43,7 @@ class LatticeField(ScalarField):
         return ("values",)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ without floating values of the lattice's shape; or, if it has none, of three axes of two points."""
+        """Refuse θ without floating "values" of `shape`; if that is None, of three axes of at least two points each."""
 
         def expected(shape: tuple[int, ...]) -> str | None:
             if len(shape) != 3:
@@ -58,7 +58,10 @@ class LatticeField(ScalarField):
         return Lattice(self.bounds, shape_of(theta["values"]))
 
     def resampled(self, theta: Mapping[str, Tree]) -> Iterator[Resampled]:
-        """Lattices of every fourth value along each axis, and of every second, if these include the lattice's ends."""
+        """Lattices of every fourth value along each axis, then of every second.
+
+        Yields only those that include the lattice's ends along all axes.
+        """
         for stride in (4, 2):
             shape = tuple((n - 1) // stride + 1 for n in shape_of(theta["values"]))
             if min(shape) >= 2 and all((n - 1) % stride == 0 for n in shape_of(theta["values"])):
@@ -80,11 +83,11 @@ class LatticeField(ScalarField):
     def in_tables(
         self, points: np.ndarray, tables: Mapping[str, np.ndarray]
     ) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-        """Ids of samples with these lattice points, and the tables: both unchanged."""
+        """Ids of samples for their lattice points, by number, and the tables: both unchanged."""
         return points, tables
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
-        """All values (M,), float32 at least, and the indices (N, 6) among them of the six values of each sample."""
+        """All values (M,), float32 at least, and the indices (N, 6) among them of each sample's six values."""
         values = self.suited(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 

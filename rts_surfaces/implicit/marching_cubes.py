@@ -32,7 +32,7 @@ class Triangles(NamedTuple):
         ends: (V, 2) int32, the lattice points at the ends of each vertex's edge: their numbers, or their rows in a
             band. Twice the same point if the vertex is on a cap.
         cells: (T,) int32, the cell of each triangle: the number of its lowest corner, or its row in a band.
-        caps: (T,) int8; bit i is set if the triangle lies in the bounds' side across axis i.
+        caps: (T,) int8; bit i is set if the triangle belongs to a cap, in a side of the bounds across axis i; else 0.
         differences: (V,) float32, the field's absolute difference between the ends of each vertex's edge; 0 on caps.
     """
 
@@ -76,11 +76,11 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
     """The isosurface of a field whose values are known at all points of a lattice.
 
     Args:
-        values: (X, Y, Z) float.
+        values: (X, Y, Z) float32 or float64.
         lattice: the lattice.
         isovalue: points are inside where `sign * (value - isovalue)` is below zero.
         sign: 1 or −1.
-        closed: True to cap the inside at the bounds.
+        closed: True to cap the inside at the bounds; else the surface ends there.
 
     Raises:
         PluginError: see `cases`.
@@ -123,9 +123,12 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
 
 
 def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
-    """The isosurface in the cells of a band, whose values are negative inside; see `of_lattice`.
+    """The surface of value 0 in the cells of a band, whose values are negative inside; `closed` as for `of_lattice`.
 
-    `Triangles.ends` and `cells` are rows of the band.
+    `Triangles.ends` are rows of `band.numbers`, and `Triangles.cells` are rows of `band.cells`.
+
+    Raises:
+        PluginError: see `cases`.
     """
     from rts_surfaces.implicit import marching_cubes_loops as loops
     from rts_surfaces.implicit.distinct_loops import distinct
@@ -153,11 +156,12 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
 
 
 def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray, ...]:
-    """The band's cells, and for a closed surface the cells around the lattice, whose outer corners are outside.
+    """The band's cells, and for a closed surface the cells beyond the lattice next to them.
 
     Returns:
-        For each cell its row of the band (C,) int32; the rows of its corners (C, 8) int32, in place of outer ones those
-        next to them; which of its corners are outer ones (C,) uint8, a bit each; and `Triangles.caps` (C,) int8.
+        For each cell its row of the band, or that of the cell next to it, (C,) int32; the rows of its corners (C, 8)
+        int32, in place of corners beyond the lattice those next to them; which corners lie beyond, and so outside,
+        (C,) uint8, a bit each; and `Triangles.caps` of the cell's triangles (C,) int8.
     """
     count = len(band.corners)
     own = np.arange(count, dtype=np.int32)

@@ -3,6 +3,7 @@
 Cells are processed layer by layer along x. Each cell owns the three edges that begin at its lowest corner, so that
 threads can work on different layers: the first loop counts, the second writes. So that every edge has an owner, there
 is one more cell along each axis than fit between the points; for a closed surface one lies before the first point, too.
+`of_lattice`, `Triangles`, `EDGES` and the cases' tables are in `rts_surfaces.implicit.marching_cubes`.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from rts.plugin_api.loops import compiled, loop
 
 @compiled(inline="always")
 def _signs(values, isovalue, sign, closed, x, out):
-    """Fill `out` with 1 for each point of plane x that is inside, else 0.
+    """Fill `out` uint8 with 1 for each point of plane x of `values` (X, Y, Z) that is inside, else 0.
 
-    With the border of cells: if closed, a frame of zeros around the points, and planes beyond the lattice are zero; if
-    not, one row and one column more, which repeat the last ones, as does a plane after the last.
+    If closed, `out` is (Y + 2, Z + 2), with a frame of zeros around the points, and all zero for x of −1 or X. If not,
+    it is (Y + 1, Z + 1): one row and one column more, which repeat the last ones, as plane X repeats the one before.
     """
     shape_x, shape_y, shape_z = values.shape
     outside = x < 0 or x >= shape_x
@@ -42,7 +43,10 @@ def _signs(values, isovalue, sign, closed, x, out):
 
 @compiled(inline="always")
 def _codes(low, high, y, count, out):
-    """Fill `out` with the cases, see `marching_cubes.cases`, of row y of cells between two planes of `_signs`."""
+    """Write the cases, see `marching_cubes.cases`, of row y of cells to the first `count` places of `out` uint8.
+
+    The cells lie between the planes `low` and `high`, results of `_signs` for one x and the next.
+    """
     a, b, c, d = low[y], high[y], low[y + 1], high[y + 1]
     for z in range(count):
         below = a[z] | b[z] << 1 | c[z] << 2 | d[z] << 3
@@ -52,9 +56,10 @@ def _codes(low, high, y, count, out):
 
 @compiled
 def _mixed(codes, count, found):
-    """Fill `found` with the places of cells in a row whose corners differ in sign. Returns the number of such cells.
+    """List in `found[:n]` the places, along a row, of the n cells whose corners differ in sign. Returns n.
 
-    `codes` holds the cases of `count` cells, and zeros up to a multiple of eight: eight are tested at once.
+    `codes` uint8 holds the cases of `count` cells, and zeros up to a multiple of eight: eight are tested at once. The
+    rest of `found`, which has `count` places, may be overwritten.
     """
     words, full, many = codes.view(np.uint64), np.uint64(0xFFFFFFFFFFFFFFFF), 0
     for w in range(len(words)):
@@ -68,7 +73,7 @@ def _mixed(codes, count, found):
 
 @compiled
 def _crossed(code):
-    """A bit for each axis along which the edge that a cell owns is crossed, from the cell's case `code`."""
+    """The crossed ones of the three edges that a cell owns, as bits 0 to 2 for x, y, z; from the cell's case `code`."""
     own = code & 1
     return (own != code >> 1 & 1) | np.int64(own != code >> 2 & 1) << 1 | np.int64(own != code >> 4 & 1) << 2
 
@@ -81,9 +86,9 @@ def _is_real(x, y, z, shape, closed):
 
 @loop
 def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
-    """Fill `tally` (layers, 3) with the numbers of mixed cells, vertices and triangles of each layer.
+    """Fill `tally` (layers, 3) with the numbers of mixed cells, vertices and triangles of layers `start` to `stop` − 1.
 
-    A mixed cell is one whose corners differ in sign.
+    A mixed cell is one whose corners differ in sign. A layer's vertices are those on the edges that its cells own.
 
     Args:
         start: the first layer.
@@ -121,7 +126,7 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
 def vertices(
     start, stop, values, isovalue, sign, closed, origin, step, offsets, cells, codes_of, first_of, ends, places, apart
 ):
-    """List the mixed cells of layers, and the vertices on the edges that they own.
+    """List the mixed cells of layers `start` to `stop` − 1, and the vertices on the edges that they own.
 
     Args:
         start: the first layer.
@@ -135,8 +140,8 @@ def vertices(
         offsets: (layers, 3), the numbers of mixed cells, vertices and triangles in the layers before.
         cells: (C,) to be filled: y * (number of cells along z) + z within its layer.
         codes_of: (C,) to be filled: the case of each of `cells`.
-        first_of: (layers, cells along y, cells along z), filled at mixed cells: eight times the first vertex that it
-            owns, plus a bit for each axis along which its own edge is crossed.
+        first_of: (layers, cells along y, cells along z), written at mixed cells alone: eight times the number of the
+            first vertex that the cell owns, plus the bits of `_crossed`.
         ends: (V, 2) to be filled, see `Triangles`.
         places: (V, 3) to be filled with `Triangles.vertices`.
         apart: (V,) to be filled with `Triangles.differences`.
@@ -166,9 +171,10 @@ def vertices(
 
 @compiled
 def _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart):
-    """Fill `ends`, `places` and `apart` of the vertices on the edges that a cell owns, from number `vertex` on.
+    """Write rows of `ends`, `places` and `apart` for the vertices on the edges that a cell owns, from `vertex` on.
 
-    Returns the next free number.
+    `crossed` are the bits of `_crossed`; `own` is the point (x, y, z) of the cell's lowest corner, −1 along an axis
+    before the lattice. Other arguments are those of `vertices`. Returns the next free row.
     """
     shape = values.shape
     ax, ay, az = max(own[0], 0), max(own[1], 0), max(own[2], 0)
@@ -197,9 +203,10 @@ def _bit_count(x):
 def faces(
     start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
 ):
-    """Fill `out` (T, 3), `owners` (T,) and `caps` (T,): `Triangles.faces`, `cells` and `caps` of layers.
+    """Fill `out` (T, 3), `owners` (T,) and `caps` (T,): `Triangles.faces`, `cells` and `caps` of some layers.
 
-    Other arguments are those of `vertices`, which fills them, and of `edges_of_cells`.
+    `shape` (X, Y, Z) is the lattice's. `cells`, `codes_of` and `first_of` are filled by `vertices`, which must have
+    seen all layers. Other arguments are those of `vertices` and of `edges_of_cells`.
     """
     cells_z = first_of.shape[2]
     shift = 1 if closed else 0
@@ -229,10 +236,10 @@ def faces(
 
 @loop
 def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys, pairs):
-    """Fill the edges on which corners of triangles lie, for mixed cells in any order.
+    """Fill `keys` and `pairs`: the edges on which corners of triangles lie, cell by cell.
 
     Args:
-        corners: (C, 8) int32, rows of points.
+        corners: (C, 8) int32, the rows of each cell's corners in a table of points; cells are in any order.
         virtual: (C,) uint8, a bit for each corner that lies beyond the lattice, next to the point in `corners`.
         codes: (C,) uint8, the case of each cell.
         triangles_of: (256,), the number of triangles of each case.

@@ -1,6 +1,7 @@
 """Operations that move an isosurface's samples with the field: along its gradient, or along the lattice's edges.
 
-Both take values (M,), params (N, P) in the values' dtype, and rows (N, 6) int32: indices of each sample's six values.
+Each takes values (M,), the field's at lattice points; params (N, P) in the values' dtype; and rows (N, 6) int32, the
+indices of each sample's six values. The six belong to the ends of three edges of the lattice, edge by edge.
 """
 
 from __future__ import annotations
@@ -84,9 +85,10 @@ def _by_crossings(
 
 
 def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """The place (N,) along an edge, 0 to 1, where the level is zero; 0 if both ends are equal.
+    """The places (N,) along edges where the level is zero, 0 at the first end and 1 at the second.
 
-    Derivatives are as if the ends differed by `least` where they differ by less.
+    `f_a` and `f_b` (N,) are the levels at the ends. The place is 0 if they are equal. Where they differ by less than
+    `least` (N,), derivatives are as if they differed by that.
     """
     engine = engine_of(f_a)
     xp, apart = engine.namespace, f_b - f_a
@@ -120,4 +122,5 @@ ALONG_EDGES = Operation.of_loops(
 )
 """Positions (N, 3) of samples in triangles whose corners lie where three edges of a lattice cross the isovalue. The
 last operand are the numbers (N, 6) of the lattice points at the edges' ends. A sample's params (4) are barycentrics
-(3), and the least difference of an edge's ends that derivatives assume."""
+(3), and the least difference of an edge's ends that derivatives assume. An edge whose ends are one point is a fixed
+corner."""

@@ -1,7 +1,8 @@
 """Motion of samples with the field, and its derivatives, compiled.
 
-Arguments are as in `rts_surfaces.implicit.motion`: values (M,), params (N, P), rows (N, 6), numbers (N, 6). A lattice
-is its shape, first point and step.
+Arguments are as in `rts_surfaces.implicit.motion`: values (M,), params (N, P), rows (N, 6), numbers (N, 6). P is 16 for
+motion along the gradient, see `ALONG_NORMAL`, and 4 for motion along edges, see `ALONG_EDGES`. A lattice is its shape,
+first point and step.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ def along(
 def push_along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, moved: np.ndarray, out: np.ndarray, **given: float
 ) -> None:
-    """Fill `out` (N, 3) with the derivatives of the positions of `along`; `moved` (M,) are tangents of the values."""
+    """Fill `out` (N, 3) with the derivatives of the positions of `along`; `moved` (M,) are tangents of the values.
+
+    `given` are the keywords of `along`.
+    """
     sign = values.dtype.type(given["sign"])
     parallel(_push, len(rows), moved, params, rows, sign, out, work=30 * len(rows))
 
@@ -31,14 +35,17 @@ def push_along(
 def pull_along(
     values: np.ndarray, params: np.ndarray, rows: np.ndarray, g: np.ndarray, result: np.ndarray, **given: float
 ) -> None:
-    """Add to `result` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `along`."""
+    """Add to `result` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `along`.
+
+    `given` are the keywords of `along`.
+    """
     _pull(g, params, rows, values.dtype.type(given["sign"]), result)
 
 
 def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
     """Fill the last of `rest`, out (N, 3), with positions of samples in triangles whose corners slide along edges.
 
-    Before it are params, rows and numbers.
+    Before it are params, rows and numbers. The corners lie where values reach `isovalue` on edges of the `lattice`.
     """
     *given, out = rest
     count, level = len(out), values.dtype.type(isovalue)
@@ -77,7 +84,7 @@ def _move(start, stop, values, params, rows, isovalue, sign, out):
 
 @loop
 def _push(start, stop, tangents, params, rows, sign, out):
-    """Fill `out` (N, 3) with the derivatives of the positions of `_move` along tangents (M,) of the values."""
+    """Fill `out` (N, 3), from `start` to before `stop`: derivatives of `_move` along tangents (M,) of the values."""
     for n in range(start, stop):
         level = tangents.dtype.type(0)
         for i in range(6):
@@ -98,11 +105,12 @@ def _pull(g, params, rows, sign, results):
 
 @compiled(inline="always")
 def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
-    """Edge k, 0 to 2, of sample n.
+    """Edge k, 0 to 2, of sample n, between its lattice points 2 k and 2 k + 1.
 
     Returns:
         Its axis; its length, negative if it runs against the axis; the place along it, 0 to 1, where the isovalue is
-        crossed; and the number that derivatives divide by. All are zero for an edge whose ends are one point.
+        crossed, or 0 if both values are equal; and the number that derivatives divide by, the difference of the values
+        or `params[n, 3]` with its sign if that is larger. All are zero for an edge whose ends are one point.
     """
     a, b = np.int64(numbers[n, 2 * k]), np.int64(numbers[n, 2 * k + 1])
     if a == b:
@@ -135,7 +143,7 @@ def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, ste
 
 @loop
 def _push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
-    """Fill `out` (N, 3) with the derivatives of the positions of `_cross` along tangents (M,) of the values."""
+    """Fill `out` (N, 3), from `start` to before `stop`: derivatives of `_cross` along tangents (M,) of the values."""
     for n in range(start, stop):
         out[n] = 0
         for k in range(3):

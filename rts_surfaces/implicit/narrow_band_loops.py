@@ -29,7 +29,7 @@ RELATIVE = 1e-9
 
 @compiled
 def _copy(source, s, target, t):
-    """Copy row s of one array to row t of another, faster than by slices."""
+    """Copy row s of `source` (·, n) to row t of `target`, faster than by slices."""
     for i in range(source.shape[1]):
         target[t, i] = source[s, i]
 
@@ -61,7 +61,20 @@ def halved(blocks, counts):
 
 @loop
 def centres(start, stop, blocks, side, shape, low, step, places):
-    """Fill `places` (B, 3) float64 with the centres of blocks (B, 3), from `start` to before `stop`."""
+    """Fill rows `start` to before `stop` of `places` (B, 3) float64: the centres of blocks (B, 3), in space.
+
+    The centre of a block that is cropped at the lattice's end is that of the rest.
+
+    Args:
+        start: first block.
+        stop: one after the last.
+        blocks: (B, 3) int32.
+        side: cells along each side of a block.
+        shape: the number of points of the lattice along each axis.
+        low: the place of the lattice's first point.
+        step: the distances of neighbours along each axis.
+        places: (B, 3) float64 to be filled.
+    """
     for b in range(start, stop):
         for a in range(3):
             first = blocks[b, a] * side
@@ -70,7 +83,10 @@ def centres(start, stop, blocks, side, shape, low, step, places):
 
 @loop
 def centre_numbers(blocks, side, shape):
-    """The numbers (B,) int64 in the lattice of the centres of blocks of an even side; −1 where a block is cropped."""
+    """The numbers (B,) int64 in the lattice of the centres of blocks (B, 3); −1 where a block is cropped.
+
+    `side`, the cells along each side of a block, is even. `shape` is the number of points along each axis.
+    """
     numbers = np.empty(len(blocks), np.int64)
     for b in range(len(blocks)):
         number, whole = 0, True
@@ -114,7 +130,10 @@ def near(blocks, values, side, shape, step, lipschitz, slack, closed):
 
 @loop
 def widened(blocks, margin, counts):
-    """The blocks, and all blocks at most `margin` blocks away along each axis: (K, 3), in the order of the grid."""
+    """The blocks (B, 3), and all blocks at most `margin` blocks away along each axis.
+
+    Returns (K, 3) int32, each block once, x changing slowest. `counts` is the number of blocks along each axis.
+    """
     marked = np.zeros(counts, np.bool_)
     for b in range(len(blocks)):
         x, y, z = blocks[b]
@@ -136,7 +155,7 @@ def widened(blocks, margin, counts):
 
 @compiled
 def _grown(array, count):
-    """A longer copy of an array: its first `count` rows, and unset ones."""
+    """A copy of an array with `2 * count + 64` rows: its first `count` rows, and others that are unset."""
     longer = np.empty((2 * count + 64, *array.shape[1:]), array.dtype)
     longer[:count] = array[:count]
     return longer
@@ -151,7 +170,7 @@ def _brick(x, y, z, counts):
 
 @loop
 def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, count):
-    """Give rows to the corners of blocks.
+    """Look up the rows of the corners of blocks; a corner that has none gets the next, from `count` on.
 
     Args:
         blocks: (B, 3) int32.
@@ -193,7 +212,11 @@ def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, coun
 
 @loop
 def given_rows(known, side, shape, counts, directory, bricks, used, numbers, count):
-    """Give rows to corners, by numbers `known` (M,), all different and new. As `numbered`, but returns no `rows`."""
+    """Give the rows from `count` on to M corners, in the order of `known`.
+
+    `known` (M,) are their numbers in the lattice, all different, of corners that have no row. Other arguments and
+    results are those of `numbered`, without the first result.
+    """
     for m in range(len(known)):
         number = known[m]
         xy = number // shape[2]
@@ -217,7 +240,10 @@ def given_rows(known, side, shape, counts, directory, bricks, used, numbers, cou
 
 @loop
 def places_of(start, stop, numbers, shape, low, step, places):
-    """Fill `places` (M, 3) float64 with the points of the lattice that have the numbers (M,)."""
+    """Fill rows `start` to before `stop` of `places` (M, 3) float64: points of the lattice, in space.
+
+    `numbers` (M,) int64 are the points' numbers in the lattice; `shape`, `low` and `step` as for `centres`.
+    """
     for m in range(start, stop):
         number = numbers[m]
         xy = number // shape[2]
@@ -238,7 +264,10 @@ OPPOSITE = 0b111
 
 @compiled
 def _inside(rows, b, values):
-    """The corners of block b whose levels are negative, inside, as bits."""
+    """The corners of block b whose levels are negative, that is inside: bit i is set for corner i.
+
+    `rows` (B, 8) are indices into `values`. A level of NaN or 0 counts as outside.
+    """
     inside = 0
     for i in range(8):
         inside |= (values[rows[b, i]] < 0) << i
@@ -247,7 +276,7 @@ def _inside(rows, b, values):
 
 @compiled
 def _border(blocks, b, counts):
-    """The corners of block b that lie on the lattice's boundary, as bits."""
+    """The corners of block b that lie on the lattice's boundary, as bits; `counts` is the number of blocks."""
     border = 0
     for a in range(3):
         if blocks[b, a] == 0:
@@ -267,16 +296,17 @@ def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step,
         blocks: (B, 3) int32.
         centre_numbers: (B,) int64, −1 where a block is cropped; all cells of such blocks are chosen.
         centre_values: (B,) the levels at centres.
-        rows: (B, 8) int32, of `values`.
+        rows: (B, 8) int32, the indices into `values` of each block's corners.
         values: the levels at corners of blocks.
         counts: the number of cells along each axis.
         step: the distances of neighbours along each axis.
-        lipschitz: how fast the level changes at most.
+        lipschitz: how fast the level changes at most, per unit of length.
         slack: how far a level may be off by rounding.
-        closed: True if the surface is capped at the lattice's boundary.
+        closed: True if the surface is capped at the lattice's boundary: cells inside and at the boundary are chosen,
+            too.
 
     Returns:
-        Cells (K, 3) int32.
+        Cells (K, 3) int32, none beyond the lattice.
     """
     reach = np.empty(8)  # How much the level may change to the corner across such axes; not at all to itself.
     for i in range(8):
@@ -313,13 +343,13 @@ def crossed(blocks, rows, values, counts, closed):
 
     Args:
         blocks: (B, 3) int32.
-        rows: (B, 8) int32, of `values`.
-        values: the levels.
+        rows: (B, 8) int32, the indices into `values` of each block's corners.
+        values: the levels at corners.
         counts: the number of blocks along each axis.
         closed: True if the surface is capped at the lattice's boundary.
 
     Returns:
-        The chosen ones of `blocks` and of `rows`.
+        The chosen ones of `blocks`, (K, 3), and of `rows`, (K, 8).
     """
     kept, kept_rows, count = np.empty_like(blocks), np.empty_like(rows), 0
     for b in range(len(blocks)):
@@ -333,7 +363,10 @@ def crossed(blocks, rows, values, counts, closed):
 
 @compiled
 def _mark(x, y, z, counts, directory, bricks, used):
-    """Mark a block; `bricks` must have room for one more. Returns True if it was not marked before, and `used`."""
+    """Mark block (x, y, z) in `bricks`, see `marked`, which must have room for one more brick.
+
+    Returns True if the block was not marked before, and the number of bricks now in use.
+    """
     place, at = _brick(x, y, z, counts)
     brick = directory[place]
     if brick < 0:
@@ -347,7 +380,18 @@ def _mark(x, y, z, counts, directory, bricks, used):
 
 @loop
 def marked(blocks, counts, directory, bricks, used):
-    """Mark blocks (B, 3) by ones in `bricks` (·, 64) uint8. Returns `bricks`, perhaps a longer copy, and `used`."""
+    """Mark blocks (B, 3) by ones in `bricks` (·, 64) uint8, which hold blocks here as they hold corners elsewhere.
+
+    Args:
+        blocks: (B, 3) int32.
+        counts: the number of blocks along each axis.
+        directory: (D,) int32, changed.
+        bricks: (·, 64) uint8, changed, or replaced by a longer copy where it is full.
+        used: the number of bricks in use.
+
+    Returns:
+        `bricks` and `used` as they are now.
+    """
     for b in range(len(blocks)):
         if used == len(bricks):
             bricks = _grown(bricks, used)
@@ -359,18 +403,21 @@ def marked(blocks, counts, directory, bricks, used):
 def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
     """Find and mark the unmarked blocks into which the surface goes on, across sides that it crosses.
 
+    The surface crosses a side whose four corners differ in sign.
+
     Args:
         blocks: (B, 3) int32.
-        rows: (B, 8) int32, of `values`.
-        values: the levels.
+        rows: (B, 8) int32, the indices into `values` of each block's corners.
+        values: the levels at corners.
         counts: the number of blocks along each axis.
-        closed: True if the surface is capped at the lattice's boundary.
+        closed: True if the surface is capped at the lattice's boundary: it then crosses sides with a corner inside and
+            on the boundary, too.
         directory: (D,) int32, of `marked`.
         bricks: (·, 64) uint8, of `marked`; changed, or replaced by a longer copy where it is full.
         used: the number of bricks in use.
 
     Returns:
-        Blocks (K, 3) int32; then `bricks` and `used`, as they are now.
+        The new blocks (K, 3) int32, each once; then `bricks` and `used`, as they are now.
     """
     found, count = np.empty((64, 3), np.int32), 0
     for b in range(len(blocks)):
@@ -395,7 +442,12 @@ def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
 
 @loop
 def compact(rows, numbers, values):
-    """Drop the points that no cell has, and renumber `rows` (C, 8) accordingly, in place.
+    """Drop the points that no cell has as a corner, and renumber `rows` (C, 8) accordingly, in place.
+
+    Args:
+        rows: (C, 8) int32, for each cell the indices of its corners in `numbers` and `values`; changed.
+        numbers: the points' numbers in the lattice; not changed.
+        values: the levels at the points; not changed.
 
     Returns:
         Numbers (M,) int64 and values (M,) of the points that are left, in order of first appearance in `rows`.

@@ -49,7 +49,8 @@ def progress_bar(wanted: bool | None, what: str, total: int) -> Iterator[Callabl
     """A progress bar on standard error; the context's value is a function that advances the bar by a number.
 
     Args:
-        wanted: True to show the bar; None to show it in a terminal only.
+        wanted: True to show the bar, None to show it in a terminal only, False for none: the function then does
+            nothing.
         what: the work's name, for the bar.
         total: the number at which the bar is full.
     """

@@ -88,7 +88,7 @@ class RadianceField:
         return lattice(self, bounds, shape, network=network, keep=keep, progress=progress)
 
     def on_host(self) -> Tree:
-        """The weights as NumPy arrays, without derivatives."""
+        """The weights of both networks, nested as `weights` is, as NumPy arrays without derivatives."""
         return map_leaves(engine_of(self.weights).to_numpy, self.weights)
 
 
@@ -149,7 +149,12 @@ def load_radiance_field(path: Any) -> RadianceField:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz by name, as float32; an InputError if one is not of finite floating-point numbers."""
+    """The arrays of an .npz by name, as float32.
+
+    Raises:
+        InputError: the file is damaged, holds pickles or more than `LARGEST` bytes, or an array is of other than
+            floating-point numbers, finite in float32.
+    """
     arrays = {}
     try:
         # NumPy leaves files open that are damaged, if it opens them.

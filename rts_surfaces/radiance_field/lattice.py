@@ -35,7 +35,7 @@ def lattice(
     """Densities at points at equal distances along three axes of a box.
 
     Args:
-        field: the field.
+        field: a `RadianceField`.
         bounds: two corners ((x0, y0, z0), (x1, y1, z1)) of the box, in the field's space; both are points of the
             lattice.
         shape: (X, Y, Z), at least 2 each.
@@ -43,7 +43,7 @@ def lattice(
         keep: where to keep the densities, and to look for them: True for the user's cache, a folder, or False for
             nowhere. Weights, bounds and shape make the file's name. A damaged file is computed anew. If the folder
             cannot be written to, nothing is kept.
-        progress: True to show a progress bar; None to do so in a terminal.
+        progress: True to show a progress bar, None to do so in a terminal, False for none.
 
     Returns:
         (X, Y, Z) float32, per unit of length in the field's space; [i, j, k] is at step i of x, j of y, k of z.
@@ -88,7 +88,7 @@ def _key(weights: Any, points: Lattice) -> str:
 
 
 def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
-    """The densities (X, Y, Z) in a file; None if the file is missing or damaged (zip files hold checksums)."""
+    """The densities in a file; None if it is missing or damaged (zip files hold checksums), or of another shape."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             values = file["density"]

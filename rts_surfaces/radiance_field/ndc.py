@@ -76,6 +76,9 @@ class Ndc:
 
         Returns:
             Origins and directions, (N, 3) each; equal steps of t are equal steps of disparity.
+
+        Raises:
+            InputError: arrays that are not (N, 3), or of different shapes.
         """
         origins, directions = _checked("origins", origins), _checked("directions", directions)
         if origins.shape != directions.shape:

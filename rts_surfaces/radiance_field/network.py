@@ -159,7 +159,7 @@ def density_and_radiance(weights: Mapping[str, Tree], points: Array, directions:
 
 
 def _alike(*trees: Tree) -> tuple[Any, ...]:
-    """Weights, points and directions as arrays of one engine and dtype, if not all are NumPy's."""
+    """The trees, NumPy arrays made constants in the engine and dtype of those of torch or jax, if there are any."""
     return constants(trees, engine_of(trees), exemplar(trees))
 
 

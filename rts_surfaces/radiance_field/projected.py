@@ -82,9 +82,9 @@ class Projected(TriangleSurface):
         return self.surface.proxy_inputs(theta)
 
     def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
-        """The surface's triangles in the world, without those deeper than `DEEPEST`.
+        """The surface's triangles in the world, without those with a corner deeper than `DEEPEST` near planes.
 
-        The last three ids of each are the depths of its corners, float32, their bits read as int32.
+        Each triangle has three more ids: the depths of its corners, float32, their bits read as int32.
         """
         inner = self.surface.proxy(inputs, camera, size)
         vertices = np.asarray(inner.vertices, np.float64)
@@ -102,7 +102,10 @@ class Projected(TriangleSurface):
         return np.ones(1, np.int16)
 
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
-        """Samples with their barycentrics in NDC, refined by the surface there."""
+        """Samples refined by the surface in NDC, with its ids and its params.
+
+        Before, the three depths are dropped from `ids`, and the barycentrics become those in NDC.
+        """
         depths = np.ascontiguousarray(samples.ids[:, -3:]).view(np.float32).astype(np.float64)
         second, third = samples.params[:, 1].astype(np.float64), samples.params[:, 0].astype(np.float64)
         shares = np.stack([1 - second - third, second, third], axis=1) * np.maximum(depths, 1e-30)
@@ -135,7 +138,10 @@ class Projected(TriangleSurface):
         return gbuffer
 
     def _normals(self, position: Array, normals: Array) -> Array:
-        """Unit normals (N, 3) in the world: normals in NDC times the transposed Jacobian of world to NDC."""
+        """Unit normals (N, 3) in the world, from those in NDC (N, 3), at positions (N, 3) in the world.
+
+        They are multiplied by the transposed Jacobian of the map from the world to NDC.
+        """
         xp, (x_scale, y_scale) = namespace(position), self.ndc.scale
         x, y, depth = position[:, 0], position[:, 1], -position[:, 2]
         a, b = x_scale * normals[:, 0], y_scale * normals[:, 1]

@@ -66,7 +66,7 @@ def volume_render(
         samples: (N_c, N_f), at least 3 and 1.
         background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.
         ndc: the map from the world to the field's space; None if the field's space is the world.
-        progress: whether to show a progress bar; None to do so in a terminal.
+        progress: True to show a progress bar, None to do so in a terminal, False for none.
 
     Returns:
         A named tuple: `image` (H, W, 3) float32 on the background, or (H, W, 4) premultiplied RGBA, in the encoding of
@@ -118,7 +118,11 @@ def volume_render(
 
 
 def _planes(near: float | None, far: float | None, ndc: Ndc | None) -> tuple[float, float]:
-    """The ray parameters t at which rays begin and end: depths, or 0 and 1 with `ndc`."""
+    """The ray parameters t at which rays begin and end: depths, 2 and 6 by default, or 0 and 1 with `ndc`.
+
+    Raises:
+        InputError: `ndc` is no `Ndc`, or depths come with it; or not 0 < near < far.
+    """
     if ndc is not None and not isinstance(ndc, Ndc):
         raise InputError(f"ndc is {quoted(ndc)}; expected an Ndc, or None")
     if ndc is not None and not near is far is None:
@@ -145,7 +149,11 @@ def _color(background: Any) -> np.ndarray:
 
 
 def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
-    """A function of origins, directions, unit directions (R, 3) each, and t (R, S) → colours and density (R, S, 4)."""
+    """A function that evaluates the network "coarse" or "fine" at S points along each of R rays.
+
+    It takes origins, directions, and unit directions in the world (R, 3) each, and t (R, S): points are
+    `origin + t direction`. It returns colours and density (R, S, 4).
+    """
     engine = fast_engine()
     weights = constants(field.on_host()[name], engine, None)
     xp = engine.namespace
@@ -164,7 +172,13 @@ def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
 
 
 def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied RGBA (R, 4) of rays, and each sample's weight (R, S) in it, from colours and density (R, S, 4)."""
+    """Premultiplied RGBA (R, 4) of rays, and each sample's weight (R, S) in it.
+
+    Args:
+        radiance: (R, S, 4), colours and density of samples.
+        t: (R, S), the samples' places along their rays, in increasing order.
+        directions: (R, 3), of the length of one unit of t.
+    """
     lengths = np.concatenate([np.diff(t, axis=1), np.full_like(t[:, :1], LAST)], axis=1)
     lengths = lengths * np.linalg.norm(directions, axis=1, keepdims=True)
     passed = np.exp(-radiance[..., 3] * lengths)
@@ -177,7 +191,7 @@ def _composited(radiance: np.ndarray, t: np.ndarray, directions: np.ndarray) -> 
 def _placed(t: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
     """Places t (R, count) at equal steps of the cumulative distribution of the weights (R, S) of samples at t (R, S).
 
-    The first and the last weight do not count.
+    The samples' t increase. The first and the last weight do not count: S is at least 3.
     """
     edges = (t[:, 1:] + t[:, :-1]) / 2
     share = weights[:, 1:-1] + np.float32(1e-5)

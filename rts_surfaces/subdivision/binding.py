@@ -78,11 +78,13 @@ class Limit:
         uv: (H,) int32, the row of face-varying data of each corner of each face, or None.
 
     Attributes:
-        table: (F, W) int32, the vertices on which each face depends, padded with one of them; read-only.
+        table: (F, W) int32, the vertices on which each face depends, padded with one of them; read-only. For faces
+            without a limit surface, the first of `used`.
         uv_table: (F, W') int32, the rows of face-varying data on which each face depends; None without such data.
         kinds: (F,) int32, `NONE`, `QUAD`, `TRIANGLE` or `SUBFACES`.
         used: (U,) int32, the vertices that faces refer to, in increasing order; read-only.
-        corners: (H, 2) float64, parameters at the corners of each face; for sub-faces their least parameters.
+        corners: (H, 2) float64, parameters at the corners of each face; for sub-faces their least parameters; zero for
+            faces without a limit surface.
 
     Raises:
         InputError: OpenSubdiv refuses the cage, or its faces depend on too many vertices.
@@ -160,14 +162,17 @@ class Limit:
     ) -> np.ndarray:
         """Weights (N, W) of the control points in the table, for points on the limit surface.
 
+        All are zero on a face without a limit surface.
+
         Args:
             faces: (N,) integers.
             params: (N, 2) float.
             dtype: float32 or float64.
-            channel: `VERTEX` or `UV`.
+            channel: `VERTEX`; or `UV`, for weights (N, W') of rows in `uv_table`, which must not be None.
 
         Raises:
-            InputError: there is no such face, or parameters lie far outside of their face.
+            InputError: there is no such face, or parameters are of another shape, not finite, or far outside of their
+                face.
         """
         out = np.empty((len(faces), self._width(channel)), dtype)
         self._stencils(faces, params, channel, out, None, None)
@@ -176,7 +181,7 @@ class Limit:
     def derivative_stencils(
         self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Weights (N, W) for the derivatives along u and along v; see `stencils`.
+        """Weights (N, W) of vertices for the derivatives of points along u, and along v; see `stencils`.
 
         At points whose derivatives are parallel for any control points, as at the corner of a sheet with a smooth
         boundary, the weights are those of a point beside.
@@ -202,7 +207,11 @@ class Limit:
         parallel(some, len(faces), work=500 * len(faces))
 
     def _samples(self, faces: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Checked faces (N,) int32 and parameters (N, 2) float64, contiguous, as the C++ library takes them."""
+        """Checked faces (N,) int32 and parameters (N, 2) float64, contiguous, as the C++ library takes them.
+
+        Raises:
+            InputError: there is no such face, or parameters are of another shape, or not finite.
+        """
         faces, params = np.ascontiguousarray(faces, np.int32), np.ascontiguousarray(params, np.float64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(self.kinds):
             raise InputError(f"samples lie on faces {faces.min()} to {faces.max()} of {len(self.kinds)}; sample anew")
@@ -213,7 +222,7 @@ class Limit:
         return faces, params
 
     def points(self, vertices: np.ndarray) -> Points:
-        """The limit surface for vertices (V, 3), prepared to be evaluated many times."""
+        """The limit surface for vertices (V, 3), prepared to be evaluated many times; see `Points`."""
         return Points(self, vertices)
 
 
@@ -251,6 +260,8 @@ class Points:
     def evaluate(self, faces: np.ndarray, params: np.ndarray, derivatives: int = 0) -> np.ndarray:
         """Points and derivatives (N, D, 3) float64, D = 1, 3 or 6: the point; in u, v; in uu, uv, vv.
 
+        All are zero on a face without a limit surface.
+
         Args:
             faces: (N,) integers.
             params: (N, 2) float.
@@ -259,7 +270,8 @@ class Points:
                 four.
 
         Raises:
-            InputError: there is no such face, or parameters lie far outside of their face.
+            InputError: there is no such face, or parameters are of another shape, not finite, or far outside of their
+                face.
         """
         faces, params = self.limit._samples(faces, params)
         out = np.empty((len(faces), (1, 3, 6)[derivatives], 3))
@@ -293,7 +305,11 @@ class Points:
 
         Returns:
             Faces (N,) int32, parameters (N, 2) float64, depth (N,) float64, and (N,) bool, True for a hit. Without a
-            hit the first three mean nothing.
+            hit the first three mean nothing. The arguments are not changed.
+
+        Raises:
+            InputError: there is no such face, arrays have other shapes, or parameters are not finite, or far outside of
+                their face.
         """
         faces, params = (x.copy() for x in self.limit._samples(faces, params))
         rays = [np.ascontiguousarray(x, np.float64) for x in (origins, directions, spread, limits)]

@@ -36,7 +36,7 @@ class Cage(NamedTuple):
         twins: (H,) int32, the half edge of the neighbouring face on the same edge, or −1 at a boundary.
         creases: (C, 2) int32, the vertices of sharp edges.
         crease_sharpness: (C,) float32, from 0 to `INFINITE`.
-        corners: (D,) int32, sharp vertices.
+        corners: (D,) int32, sharp vertices; not the corners of faces.
         corner_sharpness: (D,) float32, from 0 to `INFINITE`.
         holes: (E,) int32, faces that shape the surface but are not part of it.
     """
@@ -108,7 +108,8 @@ def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
     """Lengths (F,) of lists of indices, and their indices (H,), one list after the other; both int32.
 
     Raises:
-        InputError: there is no list, all lists are empty, or one holds other than integers from 0 to 2**27 − 1.
+        InputError: there is no list, all lists are empty, one holds other than integers from 0 to 2**27 − 1, an array
+            has other than two axes, or values are traced.
     """
     wrong = InputError(f"{name} is {quoted(lists)}; expected lists of integers, one for each face, or an array (F, n)")
     if isinstance(lists, (list, tuple)):
@@ -147,7 +148,7 @@ def _known(name: str, table: Any, wrong: InputError) -> np.ndarray:
 
 
 def _check_faces(cage: Cage) -> None:
-    """Refuse faces that are not polygons of the scheme."""
+    """Refuse faces of fewer than 3 corners, for Loop of more than 3, and with a vertex at two corners."""
     least, most = cage.sizes.min(), cage.sizes.max()
     if least < 3:
         f = int(cage.sizes.argmin())
@@ -168,7 +169,10 @@ def _ends(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
-    """A number for each edge between two vertices, the same in both directions."""
+    """A number (n,) int64 for each edge between vertices a and b (n,), the same in both directions.
+
+    `count` is greater than the number of any vertex, so that numbers of edges differ.
+    """
     return np.minimum(a, b).astype(np.int64) * count + np.maximum(a, b)
 
 
@@ -265,10 +269,11 @@ def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, n
     """The rows of creases or corners, a column each of `columns`: all but the last as indices, the last as sharpness.
 
     Returns:
-        (n, len(columns) − 1) int64 and (n,) float32, at most `INFINITE`.
+        (n, len(columns) − 1) int64 and (n,) float32, at most `INFINITE`; n is 0 for an empty list or array.
 
     Raises:
-        InputError: traced rows, or anything else.
+        InputError: traced rows, rows of another width, numbers that are not finite, indices that are not whole numbers
+            from 0 on, or a negative sharpness.
     """
     expected = f"rows ({', '.join(columns)})"
     if shape_of(rows)[:1] == (0,) or (isinstance(rows, (list, tuple)) and not rows):
@@ -292,7 +297,11 @@ def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, n
 
 
 def _checked_holes(holes: Any, faces: int) -> np.ndarray:
-    """Numbers of faces (E,) int32, each once, in increasing order; an InputError for anything else."""
+    """Numbers of faces (E,) int32, each once, in increasing order, from a list or array of them.
+
+    Raises:
+        InputError: values are traced, or other than integers from 0 to `faces` − 1.
+    """
     if isinstance(holes, (list, tuple)) and not holes:
         return np.zeros(0, np.int32)
     wrong = InputError(f"holes is {quoted(holes)}; expected numbers of faces, from 0 to {faces - 1}")

@@ -13,7 +13,7 @@ from rts_surfaces.tiles import Tiles
 
 
 def tiles_of(limit: Limit) -> Tiles:
-    """The tiles of all faces that have a limit surface."""
+    """The tiles of all faces that have a limit surface, one a face, or one at each corner where faces are quartered."""
     cage = limit.cage
     owner, start, end = cage.faces(), cage.indices.astype(np.int64), cage.indices[cage.next()].astype(np.int64)
     count = int(start.max()) + 1
@@ -42,7 +42,10 @@ def tiles_of(limit: Limit) -> Tiles:
 
 
 def _quarters(limit: Limit) -> np.ndarray:
-    """`Tiles.frames` (H, 3, 2) of the quarters of faces, one at each corner of each face."""
+    """`Tiles.frames` (H, 3, 2) of the quarters of faces, one at each corner of each face.
+
+    At a quarter's (0, 0) is the corner; at (1, 1) is the middle of the face.
+    """
     cage = limit.cage
     frames = np.zeros((len(cage.indices), 3, 2))
     frames[:, 0] = limit.corners

@@ -93,7 +93,14 @@ def _material(mesh: Any, theta: dict[str, Any]) -> bool:
 
 
 def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
-    """Keywords of `Subdivision` from tags, which are (line of the file, text)."""
+    """Keywords of `Subdivision` from tags, which are (line of the file, text).
+
+    Raises:
+        InputError: a known tag is malformed.
+
+    Warns:
+        FileWarning: a tag is unknown.
+    """
     options: dict[str, Any] = {"creases": [], "corners": [], "holes": []}
     for number, text in tags:
         name, whole, real, words = _split(path, number, text)
@@ -120,7 +127,7 @@ def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
 
 
 def _split(path: Path, number: int, text: str) -> tuple[str, list[int], list[float], list[str]]:
-    """Name, integers, floats and words of a tag."""
+    """Name, integers, floats and words of a tag; an InputError unless their numbers are as the tag says."""
     name, counts, *rest = [*text.split(), "", ""][: max(2, len(text.split()))]
     try:
         i, f, s = (int(x) for x in counts.split("/"))

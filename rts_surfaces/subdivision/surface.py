@@ -119,7 +119,12 @@ class Subdivision(Parametric):
         super().__init__(tiles_of(self.limit), tolerance, self.limit.used)
 
     def _attribute_indices(self, indices: Mapping[str, Any] | None) -> tuple[tuple[str, ...], np.ndarray | None]:
-        """Names of attributes, and the rows of a face-varying uv (H,) or None."""
+        """Names of known and declared attributes, and the rows (H,) of a face-varying uv, or None.
+
+        Raises:
+            InputError: `indices` is no dict of names that attributes may have, or has lists of another shape, or for
+                another name than "uv".
+        """
         if indices is not None and not isinstance(indices, Mapping):
             raise InputError(f"indices is {quoted(indices)}; expected a dict of name → None, or lists for 'uv'")
         check_names(indices or (), ("normals",))
@@ -136,7 +141,7 @@ class Subdivision(Parametric):
         return tuple(dict.fromkeys((*VERTEX_ATTRIBUTES, *(indices or {})))), uv
 
     def _prepare(self) -> None:
-        """Make OpenSubdiv's objects, which copies must make anew."""
+        """Make OpenSubdiv's objects, which copies must make anew; an InputError if no face has a surface."""
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
             raise InputError(
@@ -187,12 +192,12 @@ class Subdivision(Parametric):
     # ---------------------------------------------------------------------------------------------- checks
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ whose entries have wrong shapes or dtypes."""
+        """Refuse θ that lacks an entry of `reads`, or has one of wrong shape or dtype."""
         for name in self.reads(theta):
             check_rows(repr(self), theta, name, self._uv_count if name == "uv" else self._count)
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """The entries of θ that `evaluate` needs."""
+        """The entries of θ that `evaluate` needs: "vertices", known attributes that θ has, and all declared ones."""
         known = (name for name in self._declared if name in theta or name not in VERTEX_ATTRIBUTES)
         return "vertices", *known
 
@@ -210,7 +215,7 @@ class Subdivision(Parametric):
         return LimitGeometry(kept[1])
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
-        """See `Parametric`."""
+        """See `Parametric`. Where faces are quartered, an odd `rate` is rounded up."""
         # A quarter of a face has half of each side, and half of the pieces.
         quarters = len(self.whole.patch) != np.count_nonzero(self.limit.kinds >= 0)
         return super().uniform(-(-rate // 2) if quarters else rate)
@@ -247,7 +252,10 @@ class Subdivision(Parametric):
         return gbuffer
 
     def _weights(self, like: Array, faces: Array, params: Array, channel: int, derivatives: bool) -> tuple[Array, ...]:
-        """Weights (N, W) of control points for points of the surface; for `derivatives` two arrays, along u and v."""
+        """Weights (N, W) of control points for points of the surface; for `derivatives` two arrays, along u and v.
+
+        Returns a tuple of one array or two, in the dtype of `like`, float32 at least. `channel` is `VERTEX` or `UV`.
+        """
         engine = engine_of(like, params)
         dtype = np.float64 if engine.namespace.finfo(like.dtype).bits == 64 else np.float32
         table = self.limit.table if channel == VERTEX else self.limit.uv_table
