@@ -78,7 +78,7 @@ def _painted_shape(
 
 
 def _no_colors(like: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Empty arrays in place of color, row and settled."""
+    """Empty arrays in place of color, row and settled; the first in the dtype of `like`."""
     return (
         read_only(np.empty(0, like.dtype)),
         read_only(np.empty((0, 0), np.int32)),
