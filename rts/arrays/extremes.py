@@ -27,10 +27,7 @@ def extent(x: np.ndarray) -> tuple[int, int]:
 
 
 def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """A bool mask, true where integers `x` are not negative; the least of them, or −1 if less; the largest, or −1 if more.
-
-    Of an empty array both are −1.
-    """
+    """A bool mask, true where integers `x` are not negative; and the least and the largest number in `x` and −1."""
     if not x.size:
         return np.zeros(x.shape, np.bool_), -1, -1
     if x.dtype == np.int32:

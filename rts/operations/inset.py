@@ -107,6 +107,7 @@ def _put(
     side: int,
     out: np.ndarray,
 ) -> None:
+    """Fill `out` (H, W, C) by `inset_loops.put`, on all cores."""
     from rts.operations import inset_loops
 
     parallel(inset_loops.put, len(out), image, color, row, settled, fine, pixel, side, out, work=out.size)
@@ -147,6 +148,7 @@ def _pulled(
     sums: np.ndarray,
     fine: np.ndarray,
 ) -> None:
+    """Pull back `g` (H, W, C) to `image`, `sums` and `fine` by `inset_loops.pull`, on all cores."""
     from rts.operations import inset_loops
 
     given = read_only(g), read_only(pixel), row, settled, side

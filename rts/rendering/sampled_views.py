@@ -357,7 +357,7 @@ def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
 
 
 def _scales_of(depth: Array, picture: Picture) -> Array:
-    """The `depth_scales` of the depths (K, height, width) of views."""
+    """The `depth_scales` (B,) of the views, from depths (K, height, width) of the picture."""
 
     def host(depth: np.ndarray) -> tuple[np.ndarray]:
         return (depth_scales(_largest(depth, picture)),)
@@ -368,7 +368,7 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
     """The number (B,) of samples of each view, from `row` (K, height, width), in which each has one cell.
 
-    If there are more than these, `rows` in all, the others count as the first view's.
+    If the table has more rows than these, `rows` in all, the others count as the first view's.
     """
     from rts.sampling import packing_loops
 
