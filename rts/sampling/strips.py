@@ -73,7 +73,7 @@ class FineGrid(NamedTuple):
         return self.high + self.gap
 
     def room(self, capacity: int | None, layers: int) -> Room:
-        """Room for `capacity` rows in `layers` layers, if a strip needs the share `FILLED`; None for the worst case."""
+        """Room for `capacity` rows in `layers` layers, if strips are `FILLED`; None for the worst case."""
         cells, columns = self.fine[0] * self.fine[1], self.strips * (self.size[1] + self.gap)
         if capacity is None:
             return Room(columns, cells)
