@@ -117,7 +117,7 @@ def _check_camera(camera: Camera) -> Camera:
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
-    """A part whose fields pass the checks; else an InputError that names part `index`. Lists become arrays."""
+    """The part at an index of the scene, if its fields pass the checks; else an InputError. Lists become arrays."""
     surface = _check_surface(part.surface, f"the surface of part {index}")
     if min(surface.sample_widths) < 0:
         raise InputError(f"{surface!r} has no sample_widths; expected (I, P), the integers and reals of a sample")
