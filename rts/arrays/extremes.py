@@ -27,7 +27,7 @@ def extent(x: np.ndarray) -> tuple[int, int]:
 
 
 def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """A bool mask, true where integers `x` are not negative; the least of them and −1; the largest of them and −1."""
+    """A bool mask, true where integers `x` are not negative; and the least and the largest number in `x` and −1."""
     if not x.size:
         return np.zeros(x.shape, np.bool_), -1, -1
     if x.dtype == np.int32:
@@ -51,7 +51,7 @@ def _ends(x: np.ndarray, mask: np.ndarray) -> tuple[int, int]:
 def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
     """Index tuples of the least covered number, if negative, then of the largest, if positive; the first of equal ones.
 
-    `covered` is a bool mask of the shape of `x`, floats.
+    So there are none, one or two. `covered` is a bool mask of the shape of `x`, floats.
     """
     if x.dtype != np.float32:
         sizes = np.where(covered, x, 0).reshape(1, -1)

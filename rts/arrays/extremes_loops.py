@@ -13,10 +13,10 @@ UNSIGNED = np.int32(2**31 - 1)
 
 @loop
 def find(first, last, bits, maxima):
-    """Fill `maxima`, for chunks [first, last) of float32 numbers, with their largest absolute value, or NaN.
+    """Fill `maxima` (M,), for chunks [first, last) of `CHUNK` float32 numbers, with their largest absolute value.
 
-    Numbers are given and returned as their bits, int32. Without the sign bit, bits are in the order of the floats, and
-    NaN comes last.
+    It is NaN if one is NaN. Numbers, `bits` (N,), are given and returned as their bits, int32. Without the sign bit,
+    bits are in the order of the floats, and NaN comes last.
     """
     for chunk in range(first, last):
         most, block = np.int32(0), bits[chunk * CHUNK : (chunk + 1) * CHUNK]
@@ -27,9 +27,9 @@ def find(first, last, bits, maxima):
 
 @loop
 def ends(first, last, numbers, extremes, mask):
-    """Fill `extremes` (·, 2), for chunks [first, last) of int32 `numbers`, with the least and the largest.
+    """Fill `extremes` (M, 2), for chunks [first, last) of `CHUNK` numbers (N,) int32, with the least and the largest.
 
-    Unless empty, `mask` is filled with True where numbers are not negative, else False.
+    Unless empty, `mask` (N,) is filled with True where numbers are not negative, else False. No chunk may be empty.
     """
     for chunk in range(first, last):
         block = numbers[chunk * CHUNK : (chunk + 1) * CHUNK]
@@ -44,9 +44,10 @@ def ends(first, last, numbers, extremes, mask):
 
 @loop
 def bounds(first, last, bits, covered, sizes):
-    """Fill `sizes` (·, 2), for chunks [first, last), with the largest distances of covered floats below and above zero.
+    """Fill `sizes` (M, 2), for chunks [first, last), with the largest distances of covered floats below and above zero.
 
-    Floats are given and returned as their bits, int32, which are negative where the float is.
+    A chunk has `CHUNK` floats; without covered ones its distances are 0. Floats, `bits` (N,), are given and returned as
+    their bits, int32, which are negative where the float is. `covered` is (N,) bool.
     """
     zero = np.int32(0)
     for chunk in range(first, last):

@@ -68,7 +68,7 @@ class _Job:
         return self._unclaimed.acquire(blocking=False)
 
     def withdraw(self) -> bool:
-        """Claim the job so that nobody does it, and release its arrays; False if it is already claimed."""
+        """Claim the job so that nobody does it, and release its arrays. False if it is claimed already."""
         mine = self.claim()
         if mine:
             self.work = _nothing
@@ -82,7 +82,7 @@ class _Job:
             self.error = error
 
     def end(self) -> None:
-        """Release the threads that wait for the job."""
+        """Release the one thread that waits for the job, now or later."""
         self._going.release()
 
     def wait(self) -> None:
@@ -104,7 +104,7 @@ class _Helpers:
         self._placed: set[int] | None = None
 
     def free(self, count: int) -> int:
-        """The number of helpers, out of `count`, that are idle or not started yet."""
+        """The number of helpers, out of `count`, that are idle or not started yet; at least 0."""
         return max(0, count - len(self._under_way))
 
     def start(self, count: int) -> None:
@@ -169,6 +169,7 @@ class _Helpers:
 
 
 def _place(thread: int, cores: set[int]) -> None:
+    """Have a thread, by the system's number, run on some cores alone. Does nothing without permission."""
     with contextlib.suppress(OSError):  # Without permission, threads run anywhere.
         os.sched_setaffinity(thread, cores)
 
@@ -202,15 +203,16 @@ def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
 
 
 def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
-    """Call `loop(start, stop, *args)` on all cores, in ranges that together cover [0, count).
+    """Call `loop(start, stop, *args)` on all cores, in ranges that together cover [0, count); return when all are done.
 
-    The caller's thread alone runs a loop of little `work`. An error in a range ends the loop and is raised.
+    The caller's thread alone runs a loop of little `work`, as one range, and one for which no helper is free. An error
+    in a range ends the loop and is raised.
 
     Args:
         loop: a function of (start, stop, *args) that releases the interpreter lock.
         count: the end of the range.
         *args: passed on.
-        work: rough time of all ranges on one thread, nanoseconds.
+        work: rough time of all ranges on one thread, nanoseconds. The default is just enough for helpers to be asked.
         apart: whether helpers must stay off the caller's core all the time. The loop must then start no threads, which
             would have to stay off as well.
     """

@@ -117,6 +117,7 @@ def _check_camera(camera: Camera) -> Camera:
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
+    """The part at an index of the scene, if its fields pass the checks; else an InputError. Lists become arrays."""
     surface = _check_surface(part.surface, f"the surface of part {index}")
     if min(surface.sample_widths) < 0:
         raise InputError(f"{surface!r} has no sample_widths; expected (I, P), the integers and reals of a sample")
@@ -275,7 +276,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
 
 
 def check_memory(height: int, width: int, layers: int, capacity: int | None, *, gradient: bool) -> None:
-    """Refuse a render that needs more memory than this machine has, by `BYTES_PER_CELL`."""
+    """Refuse a render of height × width cells that needs more memory than this machine has, by `BYTES_PER_CELL`."""
     bytes_ = BYTES_PER_CELL["gradient" if gradient else "forward"]
     if capacity is not None and capacity * bytes_ > MEMORY:
         raise InputError(

@@ -2,7 +2,8 @@
 
 `count` columns of `ids` (N, I), from `column` on, are indices of rows of (V, C). The first columns of weights (N, W)
 belong to these rows. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last).
-Affine sums of three rows have loops of their own. Gradients are added up in the order of the samples.
+Affine sums of three rows have loops of their own. Gradients are added up in the order of the samples. The loops of
+values and tangents write NaN for samples with an id that names no row. The loops of gradients add nothing for them.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
 def forward(
     rows: np.ndarray, weights: np.ndarray, ids: np.ndarray, out: np.ndarray, column: int, count: int, affine: bool
 ) -> None:
-    """Fill `out` (N, C) with the weighted sums."""
+    """Fill `out` (N, C) with the weighted sums. An InputError if an id names no row."""
     check(rows, ids, column, count)
     _combine(rows, weights, ids, out, column, count, affine)
 
@@ -50,7 +51,10 @@ def push(
     count: int,
     affine: bool,
 ) -> None:
-    """Fill `out` (N, C) with the derivative along `t_rows` (V, C) and `t_weights` (N, W), each None if zero."""
+    """Fill `out` (N, C) with the derivative along `t_rows` (V, C) and `t_weights` (N, W), each None if zero.
+
+    Ids are not checked here, unlike in `forward`.
+    """
     if t_rows is None:
         out[...] = 0
     else:
@@ -74,7 +78,10 @@ def pull(
     count: int,
     affine: bool,
 ) -> None:
-    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), fill `g_weights` (N, W), unless None."""
+    """Pull back the gradient `g` (N, C) of the result: add to `g_rows` (V, C), fill `g_weights` (N, W), unless None.
+
+    Entries of `g_weights` in columns that the sum does not use become 0.
+    """
     if g_rows is not None:
         if affine and count == 3:
             _scatter(ids, column, weights, g, g_rows)
@@ -92,6 +99,7 @@ def pull(
 
 @compiled
 def _all_known(ids, n, column, count, rows):
+    """True if the ids of sample n, in the `count` columns from `column` on, are indices below `rows`."""
     known = True
     for i in range(column, column + count):
         known &= 0 <= ids[n, i] < rows
@@ -100,6 +108,7 @@ def _all_known(ids, n, column, count, rows):
 
 @loop
 def _sum(start, stop, rows, ids, column, count, affine, weights, out):
+    """Fill rows [start, stop) of `out` (N, C) with sums; NaN where an id names no row."""
     for n in range(start, stop):
         if not _all_known(ids, n, column, count, len(rows)):
             out[n] = np.nan
@@ -115,6 +124,7 @@ def _sum(start, stop, rows, ids, column, count, affine, weights, out):
 
 @loop
 def _add_sum(start, stop, rows, ids, column, count, affine, weights, out):
+    """Add sums without their constant, `last` of affine ones, to rows [start, stop) of `out` (N, C)."""
     for n in range(start, stop):
         if not _all_known(ids, n, column, count, len(rows)):
             out[n] = np.nan
@@ -128,6 +138,7 @@ def _add_sum(start, stop, rows, ids, column, count, affine, weights, out):
 
 @loop
 def _scatter_sum(ids, column, count, affine, weights, g, g_rows):
+    """Add to `g_rows` (V, C) the gradient of the rows, from `g` (N, C)."""
     one = g.dtype.type(1)
     for n in range(len(ids)):
         if not _all_known(ids, n, column, count, len(g_rows)):
@@ -142,6 +153,7 @@ def _scatter_sum(ids, column, count, affine, weights, g, g_rows):
 
 @loop
 def _weigh_sum(start, stop, rows, ids, column, count, affine, g, g_weights):
+    """Fill rows [start, stop) of `g_weights` (N, W) with the gradient of the weights, from `g` (N, C)."""
     for n in range(start, stop):
         g_weights[n] = 0
         if not _all_known(ids, n, column, count, len(rows)):
@@ -165,6 +177,7 @@ def _known(a, b, c, count):
 
 @loop
 def _interpolate(start, stop, rows, ids, column, weights, out):
+    """`_sum` for affine sums of three rows."""
     for n in range(start, stop):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
         if not _known(a, b, c, len(rows)):
@@ -177,6 +190,7 @@ def _interpolate(start, stop, rows, ids, column, weights, out):
 
 @loop
 def _add_weighted(start, stop, rows, ids, column, weights, out):
+    """`_add_sum` for affine sums of three rows."""
     for n in range(start, stop):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
         if not _known(a, b, c, len(rows)):
@@ -189,6 +203,7 @@ def _add_weighted(start, stop, rows, ids, column, weights, out):
 
 @loop
 def _scatter(ids, column, weights, g, g_rows):
+    """`_scatter_sum` for affine sums of three rows."""
     one = g.dtype.type(1)
     for n in range(len(ids)):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
@@ -206,6 +221,7 @@ def _scatter(ids, column, weights, g, g_rows):
 
 @loop
 def _weigh(start, stop, rows, ids, column, g, g_weights):
+    """`_weigh_sum` for affine sums of three rows."""
     for n in range(start, stop):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
         u = v = g.dtype.type(0)

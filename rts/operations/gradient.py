@@ -47,6 +47,7 @@ def gradient(f: Callable[[Array], Array], points: Array) -> Array:
 
 
 def _differences(f: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
+    """Central differences (N, C) of `f` at points (N, C): two calls of `f` for each of C columns."""
     wide = np.asarray(points, np.float64)
     step = STEP * (float(np.abs(wide).max(initial=0.0)) or 1.0)
     columns = []

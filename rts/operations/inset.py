@@ -78,7 +78,7 @@ def _painted_shape(
 
 
 def _no_colors(like: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Empty arrays in place of color, row and settled."""
+    """Empty arrays in place of color, row and settled; the first in the dtype of `like`."""
     return (
         read_only(np.empty(0, like.dtype)),
         read_only(np.empty((0, 0), np.int32)),
@@ -107,6 +107,7 @@ def _put(
     side: int,
     out: np.ndarray,
 ) -> None:
+    """Fill `out` (H, W, C) by `inset_loops.put`, on all cores."""
     from rts.operations import inset_loops
 
     parallel(inset_loops.put, len(out), image, color, row, settled, fine, pixel, side, out, work=out.size)
@@ -147,6 +148,7 @@ def _pulled(
     sums: np.ndarray,
     fine: np.ndarray,
 ) -> None:
+    """Pull back `g` (H, W, C) to `image`, `sums` and `fine` by `inset_loops.pull`, on all cores."""
     from rts.operations import inset_loops
 
     given = read_only(g), read_only(pixel), row, settled, side

@@ -9,9 +9,19 @@ from rts.compiling.loops import compiled, loop
 
 @loop
 def put(start, stop, image, color, row, settled, fine, pixel, side, out):
-    """Fill rows [start, stop) of out (H, W, C); see `rts.operations.inset`.
+    """Fill rows [start, stop) of `out` with an image, and means of a finer one; see `rts.operations.inset`.
 
-    If `image` is empty, `color`, `row` and `settled` replace it.
+    Args:
+        start: first row.
+        stop: end of the rows.
+        image: (H, W, C); no rows for the image that `color`, `row` and `settled` describe.
+        color: (C,), of covered pixels. Others are 0.
+        row: (H', W') int32, with the same border on opposite sides; a pixel is covered where this is not negative.
+        settled: (H', W') integers; a pixel is covered where this is not negative, too.
+        fine: (h · side, w · side, C).
+        pixel: (H, W) integers, the index of a pixel among the h × w of `fine`, counted row by row; negative for none.
+        side: cells along each side of a pixel.
+        out: (H, W, C).
     """
     _, width, channels = out.shape
     across, share = fine.shape[1] // side, out.dtype.type(1) / out.dtype.type(side)
@@ -33,7 +43,10 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
 
 @compiled
 def _sum(fine, top, left, c, side, share):
-    """The sum, in channel c, of the means of the `side` columns of a pixel's cells; `share` is 1 / `side`."""
+    """The sum, in channel c, of the means of the `side` columns of a pixel's cells in `fine`; `share` is 1 / `side`.
+
+    The pixel's first cell is in row `top` and column `left`.
+    """
     # Rows first, for the same rounding as in the specification.
     total = fine.dtype.type(0)
     for u in range(left, left + side):
@@ -61,9 +74,19 @@ def _paint(out, c, value, there):
 
 @loop
 def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
-    """Fill the gradients `image` and `fine`, given as zeros, from rows [start, stop) of the result's gradient `g`.
+    """Pull back rows [start, stop) of the gradient `g` (H, W, C) of the result of `put`.
 
-    `sums` (H, C), given as zeros, receives the colour's gradient, summed over each row. Empty arrays are skipped.
+    Args:
+        start: first row.
+        stop: end of the rows.
+        g: (H, W, C).
+        pixel: see `put`.
+        row: see `put`.
+        settled: see `put`.
+        side: see `put`.
+        image: (H, W, C), zeros at the start; receives the image's gradient. No rows to leave it out.
+        sums: (H, C), zeros at the start; receives the colour's gradient, summed over each row. No rows to leave it out.
+        fine: (h · side, w · side, C), zeros at the start; receives the finer image's gradient. No rows to leave it out.
     """
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)

@@ -40,6 +40,7 @@ def pull(
 
 @loop
 def _affine(start, stop, rows, points, out):
+    """Fill rows [start, stop) of `out` (N, R) with the mapped points."""
     for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         for r in range(len(rows)):
@@ -48,6 +49,7 @@ def _affine(start, stop, rows, points, out):
 
 @loop
 def _add_moved(start, stop, rows, move, out):
+    """Add to rows [start, stop) of `out` (N, R) the vectors `move` (N, 3) under the linear part of the map."""
     for n in range(start, stop):
         x, y, z = move[n, 0], move[n, 1], move[n, 2]
         for r in range(len(rows)):
@@ -56,6 +58,7 @@ def _add_moved(start, stop, rows, move, out):
 
 @loop
 def _pull_rows(start, stop, points, g, sums):
+    """Add to entries [start, stop) of `sums` (S, R, 4) the gradient of the map by each `CHUNK` of points."""
     for chunk in range(start, stop):
         total = sums[chunk]
         for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):
@@ -68,6 +71,7 @@ def _pull_rows(start, stop, points, g, sums):
 
 @loop
 def _pull_points(start, stop, rows, g, g_points):
+    """Fill rows [start, stop) of `g_points` (N, 3) from `g` (N, R)."""
     for n in range(start, stop):
         for i in range(3):
             total = g.dtype.type(0)

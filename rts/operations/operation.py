@@ -292,6 +292,11 @@ class Operation:
         return kept
 
     def _look_at(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> None:
+        """Raise an InputError if the value `out` lacks numbers that the specification has, or is of another shape.
+
+        No check is made where a value without NaN is large, where one with NaN has operands that are not finite, or
+        where the specification fails.
+        """
         missing = np.isnan(out)
         if missing.any():
             if not all(np.isfinite(x).all() for x in operands if x.dtype == out.dtype):

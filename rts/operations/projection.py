@@ -28,6 +28,8 @@ def projective_map(rows: Array, points: Array) -> Array:
 def projective_map_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
     """`projective_map` for points (N, 3) of several views, which are placed side by side in one picture.
 
+    Unused rows at the end hold anything; NumPy's plain products leave these rows out.
+
     Args:
         rows: (B, 4, 4), the affine maps of each view.
         points: (N, 3), views one after the other.

@@ -42,6 +42,7 @@ def pull(
 
 @loop
 def _project(start, stop, m, points, out):
+    """Fill rows [start, stop) of `out` (N, 3) with the points (N, 3) under the maps `m` (4, 4)."""
     one = out.dtype.type(1)
     for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -54,6 +55,10 @@ def _project(start, stop, m, points, out):
 
 @loop
 def _push(start, stop, m, points, turn, move, out):
+    """Fill rows [start, stop) of `out` (N, 3) with the derivative along `turn` (4, 4) of `m` and `move` of the points.
+
+    `move` is (N, 3), or has no rows if it is zero.
+    """
     zero, one = out.dtype.type(0), out.dtype.type(1)
     value, change = np.empty(4, out.dtype), np.empty(4, out.dtype)
     for n in range(start, stop):
@@ -72,6 +77,10 @@ def _push(start, stop, m, points, turn, move, out):
 
 @loop
 def _pull(start, stop, m, points, g, sums, g_points):
+    """Fill entries [start, stop) of `sums` (S, 4, 4): the gradient of `m` by each `CHUNK` of points, from `g` (N, 3).
+
+    Also fills the rows of these points in `g_points` (N, 3), unless it has no rows.
+    """
     zero, one = points.dtype.type(0), points.dtype.type(1)
     for chunk in range(start, stop):
         # A loop, since for assigned arrays numba also compiles an error about their shapes, which takes a second.

@@ -24,7 +24,11 @@ def take(rows: Array, index: Array) -> Array:
 
 
 def take_shifted(rows: Array, index: Array, shift: Array) -> Array:
-    """Rows (M, C) of an array (V, C), by their indices (M,), plus a shift (M, C) that has no derivative."""
+    """Rows (M, C) of an array (V, C), by their indices (M,), plus a shift (M, C) that has no derivative.
+
+    Raises:
+        InputError: on the host, an index names no row.
+    """
     return SHIFTED(rows, index, shift)
 
 

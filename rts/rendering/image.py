@@ -197,7 +197,7 @@ def render_samples(
 
 
 def _narrowed(sampled: Sampled, count: int) -> Sampled:
-    """Samples with an apron that is narrower by `count` cells."""
+    """Samples with an apron that is narrower by `count` cells; that of fine samples stays."""
     if count == 0:
         return sampled
     rows, columns = (slice(count, n - count) for n in sampled.row.shape[1:])
@@ -243,7 +243,7 @@ def splatted(
 
 
 def seen(image: Array, scene: Scene, name: str = "the image") -> Array:
-    """The image itself; a warning names it if nothing is seen in it."""
+    """The image (H, W, C + 1) itself; a warning names it if alpha is 0 everywhere. A traced image is not looked at."""
     engine, (height, width) = engine_of(image), image.shape[:2]
     if not engine.on_host(image):
         seen = value_of(engine.namespace.any(image[..., -1] > 0))

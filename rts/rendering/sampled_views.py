@@ -91,7 +91,7 @@ class Sampling(NamedTuple):
         return list(zip(first.parts, first.chosen(), first.entries, strict=True))
 
     def hidden(self) -> HiddenRule | None:
-        """The rule for hidden samples of a view."""
+        """The rule for hidden samples of a view; None to keep all. An InputError if a view needs too much memory."""
         first, settings = self.scenes[0], self.settings
         gradient = first.context.engine.differentiates
         check_memory(*self.cells, settings.most_layers, settings.capacity, gradient=gradient)
@@ -100,10 +100,16 @@ class Sampling(NamedTuple):
     def of_part(
         self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, hidden: HiddenRule | None
     ) -> tuple[Samples, Array, Array]:
-        """The needed samples of a part in all views, by one call to the host.
+        """The needed samples of a part in all views, by one call to the host; at most `settings.capacity` in each view.
+
+        Args:
+            part: the part.
+            sampler: draws its triangles.
+            entry: the structure that the sampler has prepared; None to look it up, or to build it.
+            hidden: the rule that tells which samples to keep; None to keep all.
 
         Returns:
-            Samples, and `view` and `scales` of `Views`.
+            Samples on the grid of the picture, and `view` and `scales` of `Views`.
         """
         settings = self.settings
         grids = [Grid.sampled(scene, scene.camera, self.cells, settings.apron) for scene in self.scenes]
@@ -335,7 +341,7 @@ def decided_in_views(hidden: HiddenRule | None, picture: Picture, question: Ques
 
 
 def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:
-    """Factors (height, width) on the depth of each cell."""
+    """Factors (height, width) on the depth of each cell, from those of the views (B,); 1 in places without a view."""
     factors = np.ones(picture.size, dtype)
     for (lines, columns), scale in zip(picture.places(), scales, strict=True):
         factors[lines, columns] = scale
@@ -351,7 +357,7 @@ def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
 
 
 def _scales_of(depth: Array, picture: Picture) -> Array:
-    """The `depth_scales` of the depths (K, height, width) of views."""
+    """The `depth_scales` (B,) of the views, from depths (K, height, width) of the picture."""
 
     def host(depth: np.ndarray) -> tuple[np.ndarray]:
         return (depth_scales(_largest(depth, picture)),)
@@ -362,7 +368,7 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
     """The number (B,) of samples of each view, from `row` (K, height, width), in which each has one cell.
 
-    If there are more than these, `rows` in all, the others count as the first view's.
+    If the table has more rows than these, `rows` in all, the others count as the first view's.
     """
     from rts.sampling import packing_loops
 

@@ -83,7 +83,10 @@ class RenderSettings:
         return self.reader.reach + 1
 
     def bands(self, size: tuple[int, int]) -> list[tuple[int, int]]:
-        """(first row, number of rows) of each band of an image (height, width)."""
+        """(first row, number of rows) of each band of an image (height, width).
+
+        A band is rendered at a time. With one sample a pixel, or `Adaptive`, there is one band.
+        """
         height, width = size
         if self.side is None or self.side == 1:
             return [(0, height)]

@@ -164,7 +164,19 @@ def _colors(
     names: Sequence[str],
     attributes: Mapping[str, Array],
 ) -> Array:
-    """The result of a part's shader for some rows of the attributes that it has read, in local space."""
+    """The colours (n, C + 1) that a part's shader gives for n rows of the attributes that it has read.
+
+    Args:
+        part: the part.
+        theta: the result of `theta_of`.
+        transform: the part's transform, or None.
+        camera: the camera of the whole image, or of each row.
+        names: all attributes that the part has.
+        attributes: those that the shader read in its first call, (n, ·) each, local space.
+
+    Raises:
+        _UnreadError: the shader reads another one of `names` now.
+    """
 
     def unread() -> Array:
         raise _UnreadError

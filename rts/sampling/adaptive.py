@@ -137,7 +137,7 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
     Cells are included where only rounding could make a front end.
 
     Args:
-        row: (K, H, W) int32 of one sample a pixel.
+        row: (K, H, W), the sample of each cell, counted over all parts, or −1; one cell a pixel.
         depth: (K, H, W), 0 in empty cells.
         sizes: the number of rows of each part.
         settled: (H, W) int8, 0 at cells that the only part covers, even where they have no sample, −1 at others;

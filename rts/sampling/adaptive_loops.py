@@ -53,7 +53,10 @@ def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, ma
 
 @compiled
 def _differ(marks, above, level, below):
-    """Fill `marks` (W,): 1 for cells whose part, −1 for none, differs from one of their eight neighbours'."""
+    """Fill `marks` (W,): 1 for cells whose part differs from that of one of their eight neighbours, else 0.
+
+    `above`, `level`, `below` (W + 2,) are the parts seen in three rows, −1 for none, with one more cell at each side.
+    """
     for x in range(len(marks)):
         own = level[x + 1]
         found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
@@ -63,7 +66,10 @@ def _differ(marks, above, level, below):
 
 @compiled
 def _unite(near, above, level, below):
-    """Fill `near` (W,): 1 for cells whose 3 × 3 window has a mark in the three rows. Returns True if there are any."""
+    """Fill `near` (W,): 1 for cells whose 3 × 3 window has a mark, else 0. Returns True if there are any.
+
+    `above`, `level`, `below` (W + 2,) are marks of three rows, with one more cell at each side.
+    """
     some = np.uint8(0)
     for x in range(len(near)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
@@ -75,7 +81,10 @@ def _unite(near, above, level, below):
 
 @compiled
 def _ends(row, depth, y, x, beyond, margin, continued):
-    """True if the front of the cell (y, x) may end towards one of its neighbours; all these cells must be covered."""
+    """True if the front of the cell (y, x) may end towards one of its neighbours. For arguments see `mark`.
+
+    The cell and its neighbours in the image must be covered.
+    """
     _, height, width = row.shape
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1
@@ -88,7 +97,10 @@ def _ends(row, depth, y, x, beyond, margin, continued):
 
 @compiled
 def _parted(row, depth, y, x, v, u, beyond, margin, continued):
-    """True unless the front of a covered target (y, x) surely pairs with the front of the source (y − v, x − u)."""
+    """True unless the front of a covered target (y, x) surely pairs with the front of the source (y − v, x − u).
+
+    For other arguments see `mark`.
+    """
     layers, height, width = row.shape
     py, px = y - v, x - u
     source, target = depth[0, py, px], depth[0, y, x]

@@ -25,6 +25,7 @@ def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:
 
 
 def _cause(part: CheckedPart, camera: Camera) -> str:
+    """The likely cause for one part, a text with {} in place of the part's name."""
     if not isinstance(part.surface, TriangleSurface):
         return "no ray meets {}, or its shader gives an alpha of 0"
     known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))

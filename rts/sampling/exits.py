@@ -43,7 +43,7 @@ def outline_cells(
     one is nearer to the front of the other.
 
     Args:
-        covered: (K, H, W) bool; or (K, L, C) for listed cells, and the result are indices in this list.
+        covered: (K, H, W) bool; or (K, L, C) for listed cells, and then results are flat indices in this list.
         depth: depths of the samples, of the same shape; anything where nothing is covered.
         cells: (L, C), the listed cells, as flat indices in the grid, −1 for none; None for all. Others count as empty.
         size: (height, width) of the grid, for listed cells.
@@ -73,7 +73,9 @@ def with_pairs(
     size: tuple[int, int],
     specs: Mapping[str, ArraySpec],
 ) -> tuple[Samples, tuple[np.ndarray, np.ndarray] | None]:
-    """Samples whose `exit` (2, H, W) names the pairs of a surface's `refine_outlines`, which are not packed yet.
+    """Samples whose `exit` (2, H, W) names the pairs of a surface's `refine_outlines`, which have no rows yet.
+
+    Until `repack` gives them rows, `exit` holds indices of the returned ids and params, −1 in cells without a pair.
 
     Args:
         samples: refined samples on the host, a row for each covered cell.
@@ -85,7 +87,8 @@ def with_pairs(
         specs: the result of the surface's `table_specs`.
 
     Returns:
-        The samples, and ids (2 M, I) and params (2 M, P) of the pairs, as `repack` takes them; None without any.
+        The samples, and ids (2 M, I) and params (2 M, P) of the pairs, as `repack` takes them. None in place of ids and
+        params if no cell is at an outline, the surface has no pairs, or its tables exceed their specs.
     """
     exits = np.full((2, *samples.row.shape[1:]), -1, np.int32)
     cells = outline_cells(samples.row >= 0, samples.depth, listed, size)

@@ -13,7 +13,12 @@ BLOCK = 32
 
 @loop
 def find(kept, cells):
-    """Fill `cells` (H · W,) with the indices that `exits.beside_outlines` returns. Returns their number."""
+    """Write to the start of `cells` the indices that `exits.beside_outlines` returns. Returns their number.
+
+    Args:
+        kept: (K, H, W) bool, the samples that splatters need.
+        cells: (H · W,) int32.
+    """
     layers, height, width = kept.shape
     # With one more cell at each side, the cells of all rows follow on each other: loops over all are quick.
     pitch = width + 2
@@ -36,9 +41,9 @@ def find(kept, cells):
 
 @loop
 def mark_ends(start, stop, cells, covered, depth, ends):
-    """Fill `ends` (M,) for covered cells [start, stop) of a list: True where the front ends towards a neighbour.
+    """Fill `ends` (M,) for cells [start, stop) of a list: True where the front ends towards a neighbour.
 
-    See `exits.outline_cells`.
+    `cells` (M,) are flat indices of covered cells. For `covered` and `depth` (K, H, W) see `exits.outline_cells`.
     """
     layers, height, width = covered.shape
     for i in range(start, stop):

@@ -19,8 +19,8 @@ def facing(
 ) -> np.ndarray:
     """The piece that each fragment shows, and its side: (K, H, W) int16, see `Cells.facing`.
 
-    Splatters compare sides in cells that have hidden layers, and beside such cells; elsewhere they are 0. The last
-    layer of fragments is marked by `MORE_BEHIND`.
+    Splatters compare sides in cells that have hidden layers, and beside such cells; elsewhere they are 0. They are all
+    0 if `kept` has no hidden samples. The last layer of fragments is marked by `MORE_BEHIND`.
 
     Args:
         fragments: the fragments of all layers.
@@ -28,7 +28,8 @@ def facing(
         proxy: the triangles.
         pieces: (T,) int16, the number of each triangle's piece; or (1,), one for all triangles.
         camera: host matrices.
-        listed: True for the cells of a list: neighbours in the list may not be neighbours in the image.
+        listed: True for the cells of a list: neighbours in the list may not be neighbours in the image, so that all
+            cells get sides if any has a hidden layer.
     """
     return facing_of_views(fragments, kept, proxy, pieces, [camera], kept.shape[1:], listed)
 
@@ -42,7 +43,17 @@ def facing_of_views(
     view: tuple[int, ...],
     listed: bool = False,
 ) -> np.ndarray:
-    """The result of `facing` for views (height, width) side by side, line after line, with a camera for each."""
+    """The result of `facing` for a grid of views, side by side, line after line.
+
+    Args:
+        fragments: the fragments of all layers and views.
+        kept: (K, H, W) bool, the fragments that are samples.
+        proxy: the triangles.
+        pieces: see `facing`.
+        cameras: the camera of each view, host matrices.
+        view: (height, width) of one view; H and W are multiples of these.
+        listed: see `facing`.
+    """
     from rts.sampling import facing_loops
 
     behind = np.count_nonzero(kept[1:])

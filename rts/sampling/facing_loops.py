@@ -10,9 +10,22 @@ from rts.sampling.windows_loops import add, spread
 
 @loop
 def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, columns, listed, more, found):
-    """Fill lines [start, stop) of `found` (K, H, W) int16; see `rts.sampling.facing`.
+    """Fill lines [start, stop) of `found` with pieces and sides; see `rts.sampling.facing`.
 
-    Views of `rows` × `columns` cells lie side by side, line after line; `eyes` (B, 4) has the eye of each.
+    Args:
+        start: first line.
+        stop: end of the lines.
+        kept: (K, H, W) bool, the fragments that are samples; others get 0.
+        triangle_ids: (K, H, W) int32.
+        vertices: (V, 3) float32.
+        faces: (T, 3) int32.
+        pieces: (T,) int16; or (1,), one for all triangles.
+        eyes: (B, 4), the point that the rays of each view come from; see `facing.eye`.
+        rows: lines of a view. Views lie side by side, line after line.
+        columns: columns of a view.
+        listed: True to ask for all cells, not only those beside hidden samples.
+        more: `Cells.MORE_BEHIND`.
+        found: (K, H, W) int16.
     """
     layers, height, width = kept.shape
     across = width // columns
@@ -44,7 +57,10 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
 
 @compiled
 def _side(t, vertices, faces, pieces, eye, more):
-    """The number of a triangle's piece plus `more`, or 0 without a piece; negative where its back is seen."""
+    """The number of piece of triangle `t`, plus `more`; negative where its back is seen; 0 without a piece.
+
+    For other arguments see `fill`.
+    """
     piece = pieces[t] if len(pieces) > 1 else pieces[0]
     if piece > 0:
         piece += more
@@ -53,7 +69,7 @@ def _side(t, vertices, faces, pieces, eye, more):
 
 @compiled
 def _front(vertices, faces, t, eye):
-    """True if a triangle is seen from its front, where its corners go round counter-clockwise."""
+    """True if triangle `t` is seen from its front, where its corners go round counter-clockwise. See `facing.eye`."""
     a, b, c = np.uint32(faces[t, 0]), np.uint32(faces[t, 1]), np.uint32(faces[t, 2])
     x, y, z = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
     bx, by, bz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z

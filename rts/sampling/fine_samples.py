@@ -43,7 +43,16 @@ def active(
     apron: int,
     where: Where,
 ) -> np.ndarray:
-    """Active pixels (H, W) bool of the image, from coarse samples (K, ·, ·) with an apron; see `visible_outlines`."""
+    """Active pixels (H, W) bool of the image, from coarse samples (K, ·, ·) with an apron.
+
+    Args:
+        row: see `visible_outlines`.
+        depth: see `visible_outlines`.
+        settled: see `visible_outlines`.
+        sizes: the number of rows of each part.
+        apron: cells around the image.
+        where: the rule.
+    """
     pixels = visible_outlines(row, depth, sizes, settled, where.opaque)
     if where.colors is not None and where.adaptive.contrast is not None:
         pixels |= contrasts(row[0], where.colors, where.adaptive.contrast)
@@ -67,7 +76,7 @@ def fine_samples(
         coarse: one sample a pixel.
         grid: the sizes of the image and of its fine cells.
         where: the rule by which pixels are active.
-        take: samples the fine grid: a number of layers, a rule for hidden samples, cells and capacity → `Sampled`.
+        take: samples the fine grid: `take(layers, hidden, listed=cells, capacity=rows)` → `Sampled`.
         hidden: the rule for hidden samples of an image; None to keep all.
         layers: K, or "auto".
         capacity: rows to allot; None for as many as there are, or could be if coarse samples are traced.

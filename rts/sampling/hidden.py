@@ -97,7 +97,10 @@ class HiddenBySplatter:
         return replace(self, size=0.0)
 
     def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
-        """Decide which samples to keep: those that can reach the image, or its `wanted` cells (H, W); None for all."""
+        """Decide which samples to keep: those that can reach the image, or its `wanted` cells (H, W); None for all.
+
+        All are kept where numbers are so large that rounding may reorder depths.
+        """
         covered, depth, size, _ = question
         too_rough = (self.settles or len(covered) > 1) and too_far(max(size, self.size), depth)
         needed = covered if too_rough or len(covered) == 1 else self._needed(covered, depth)
@@ -183,7 +186,8 @@ def with_layers_that_count(
 ) -> Sampled:
     """A scene sampled with as many layers as its image needs, up to `LAYER_LIMIT`; a LayersWarning if that is too few.
 
-    If parts are translucent, an empty layer is added: it says that nothing lies behind the others.
+    If parts are translucent, an empty layer is added: it says that nothing lies behind the others. Samples beyond the
+    limit are counted in `overflow`.
 
     Args:
         taken: samples the scene with a number of layers, without the samples that a rule drops.
@@ -226,7 +230,11 @@ def _ran_out(sampled: Sampled) -> bool:
 def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> Sampled:
     """The scene without the samples that a decision does not need, and without single exits away from outlines.
 
-    One host call.
+    One host call. Every part keeps at least one row, which no cell may name.
+
+    Args:
+        sampled: the scene; its `depth` is not None.
+        decide: the decision, on the host; its `needed` is used.
 
     Raises:
         InputError: `row` or `exit` names a sample that does not exist.
@@ -276,7 +284,7 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:
-    """The samples of a part with the rows of `index` only, and the cells' new `row`."""
+    """The samples of a part with the rows of `index` (N,) only, and the cells' new `row` (K, H, W); without exits."""
     xp = namespace(index)
     gbuffer = samples.gbuffer
     tables = samples.tables.items()

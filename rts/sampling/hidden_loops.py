@@ -26,7 +26,10 @@ class Numbering:
         parallel(_mark, len(row), row, kept, self._used, work=row.size)
 
     def indices(self) -> list[np.ndarray]:
-        """The rows of each part that are used, int32, in their order, so that neighbours stay neighbours in memory."""
+        """For each part, its used rows (n,) int32, counted within the part.
+
+        They stay in order, so that neighbours are neighbours in memory. Numbers them for `renumbered`.
+        """
         counts = np.zeros(len(self._firsts) - 1, np.int64)
         parallel(
             _number, len(counts), self._used, self._firsts, self._numbers, self._index, counts, work=len(self._used)
@@ -48,6 +51,7 @@ class Numbering:
 
 @loop
 def _mark(start, stop, row, kept, used):
+    """Set `used` (N,) bool for rows that kept cells of lines [start, stop) name; other entries stay."""
     for y in range(start, stop):
         for x in range(row.shape[1]):
             if kept[y, x] and 0 <= row[y, x] < len(used):
@@ -56,7 +60,17 @@ def _mark(start, stop, row, kept, used):
 
 @loop
 def _number(start, stop, used, firsts, numbers, index, counts):
-    """Fill, for parts [start, stop), the new `numbers` of rows (N,), −1 if unused; used rows `index`; and `counts`."""
+    """Number the used rows of parts [start, stop) anew, each part from 0 on.
+
+    Args:
+        start: first part.
+        stop: end of the parts.
+        used: (N,) bool, rows of all parts.
+        firsts: (P + 1,), where the rows of each part begin, and N.
+        numbers: (N,) int32, to be filled: the new number of each row, or −1.
+        index: (N,) int32. From where a part begins, its used rows are written, counted within the part.
+        counts: (P,), to be filled: the number of used rows.
+    """
     for part in range(start, stop):
         first, count = firsts[part], 0
         for i in range(first, firsts[part + 1]):
@@ -69,6 +83,7 @@ def _number(start, stop, used, firsts, numbers, index, counts):
 
 @loop
 def _renumber(start, stop, row, numbers, found):
+    """Fill lines [start, stop) of `found` with the `numbers` (N,) of the rows in `row`; −1 for rows that are none."""
     for y in range(start, stop):
         for x in range(row.shape[1]):
             i = row[y, x]

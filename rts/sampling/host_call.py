@@ -106,10 +106,18 @@ class HostCall:
         """Samples and further arrays that `find` computes, by one call to the host.
 
         Args:
-            find: computes samples and further results on the host; see `Find`.
+            find: computes samples and further results on the host; see `Find`. Its results have all names of `beside`,
+                and its samples all `tables`.
             beside: specs of the further results, by name.
             tables: specs of `Samples.tables`.
-            arrays: further operands of `find`, after cameras and inputs.
+            arrays: further operands of `find`, after cameras and inputs. A surface that is not centred takes the first
+                as the list of cells (L, C), if there is one.
+
+        Returns:
+            Samples, and the further results by name, in arrays of the part's engine.
+
+        Raises:
+            InputError: a camera makes no image (see `check_camera`).
         """
         tables = dict(tables or {})
         if not self._surface.centered:
@@ -156,7 +164,10 @@ class HostCall:
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:
-    """The table `ON_RAYS` of samples in a view, or in listed cells of it; rows without a cell repeat the first."""
+    """The table `ON_RAYS` (N, 3) of samples in a view, or in listed cells (L, C) of it.
+
+    Rows that no cell names repeat row 0.
+    """
     rays, covered = rays_of(samples, camera, view, cells), samples.row >= 0
     depth, used = np.ones(len(samples.ids)), np.zeros(len(samples.ids), bool)
     depth[samples.row[covered]], used[samples.row[covered]] = samples.depth[covered], True
@@ -177,7 +188,15 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
 def _attribute_specs(
     surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
 ) -> dict[str, ArraySpec]:
-    """Specs of the attributes that the host evaluates, those that the shader reads; none unless θ is constant."""
+    """Specs of the attributes that the host evaluates: "position", and others that the shader reads.
+
+    Args:
+        surface: the surface.
+        asked: names of the attributes that the shader reads; None for all.
+        host_theta: the θ that the surface reads, if it is constant; None gives no specs.
+        shape: bounds on the number of samples.
+        like: an array whose precision the attributes take; None for float32.
+    """
     if host_theta is None:
         return {}
     real = np.float64 if like is not None and floating_bits(like) == 64 else np.float32

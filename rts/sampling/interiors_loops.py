@@ -20,7 +20,7 @@ def settle(
     reach: int,
     wanted: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Find cells amid fronts, and drop from `kept` the samples that only these cells need.
+    """Find cells amid fronts: their 3 × 3 window is covered, without kept hidden samples. Drop samples only they need.
 
     Samples within reach of any other wanted cell stay. So do the nearest and the farthest front, since splatters
     measure differences of depth relative to these two.
@@ -33,7 +33,7 @@ def settle(
         wanted: (H, W) bool, the cells that are shown; None for all, those beyond the grid included.
 
     Returns:
-        (H, W) bool, True for cells whose 3 × 3 window is all fronts, without kept hidden samples.
+        (H, W) bool, True for cells amid fronts; False in the outermost lines and columns.
     """
     layers, height, width = covered.shape
     wanted = np.empty((0, width), np.bool_) if wanted is None else np.ascontiguousarray(wanted)
@@ -50,7 +50,18 @@ def settle(
 
 @loop
 def _settle(start, stop, covered, kept, wanted, reach, found, near):
-    """Fill rows [start, stop) of `found`, cells amid fronts, and of `near`, cells within reach of other wanted ones."""
+    """Fill lines [start, stop) of `found` and `near`. For other arguments see `settle`.
+
+    Args:
+        start: first line.
+        stop: end of the lines.
+        covered: (K, H, W) bool.
+        kept: (K, H, W) bool.
+        wanted: (H, W) bool; no rows for all cells, those beyond the grid included.
+        reach: in cells.
+        found: (H, W) bool: the cell is amid fronts.
+        near: (H, W) bool: the cell is within reach of a wanted cell that is not amid fronts.
+    """
     layers, height, width = covered.shape
     around = reach + 1
     rows = stop - start + 2 * around
@@ -90,7 +101,7 @@ def _settle(start, stop, covered, kept, wanted, reach, found, near):
 
 @loop
 def _drop(start, stop, near, kept):
-    """Clear `kept` in cells that are not near."""
+    """Clear lines [start, stop) of `kept` (K, H, W) bool, in all layers, in cells that `near` (H, W) does not mark."""
     for k in range(len(kept)):
         for y in range(start, stop):
             _mask(kept[k, y], near[y])

@@ -36,7 +36,8 @@ def on_surface(
     """Samples on a surface where rays meet its nearest triangles: refined, and in order.
 
     Rays that meet triangles may miss the surface. Cells that are left with fewer than `layers` layers get more from
-    the fragments behind these.
+    the fragments behind these. Dropped samples keep rows in `ids` and `params` that no cell names; `repack` removes
+    them.
 
     Args:
         surface: the surface.

@@ -16,8 +16,8 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
         depth: (K, H, W) float32.
         limits: (4,) depths of the near and far plane; and the least difference of the depths of two roots: a constant,
             and a factor of the depth.
-        out_row: (K, H, W), to be filled.
-        out_depth: (K, H, W), to be filled.
+        out_row: (K, H, W), to be filled; −1 in empty layers.
+        out_depth: (K, H, W), to be filled; 0 in empty layers.
     """
     layers, _, width = row.shape
     near, far, apart, apart_by_depth = limits
@@ -46,7 +46,10 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
 
 @compiled
 def _ray(x, y, p, inverse, origin, direction):
-    """Fill `origin` and `direction` (3,) with the ray through the point (x, y) of NDC. See `rts.Camera.rays`."""
+    """Fill `origin` and `direction` (3,) with the ray through the point (x, y) of NDC. See `rts.Camera.rays`.
+
+    `p` (4, 4) is the camera's projection, `inverse` (4, 4) the inverse of its view.
+    """
     a, b, across, lean = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1], x * p[3, 3] - p[0, 3], p[0, 2] - x * p[3, 2]
     c, d, down, fall = p[1, 0] - y * p[3, 0], p[1, 1] - y * p[3, 1], y * p[3, 3] - p[1, 3], p[1, 2] - y * p[3, 2]
     determinant = a * d - b * c
@@ -82,7 +85,18 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
 
 @loop
 def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
-    """Fill `origins` and `directions` (N, 3) of the samples `row` (K, M) of M cells at `lines` and `columns` (M,)."""
+    """Fill the rays of samples in listed cells, as `rts.Camera.rays` gives them; other rows of rays stay.
+
+    Args:
+        row: (K, M) int32, the sample in each of M cells, or −1.
+        lines: (M,), the line of each cell in the grid.
+        columns: (M,), its column.
+        size: (H, W) of the grid.
+        projection: (4, 4) float64.
+        inverse: (4, 4) float64, of the view.
+        origins: (N, 3) float64.
+        directions: (N, 3) float64.
+    """
     height, width = size
     for k in range(len(row)):
         for m in range(len(lines)):

@@ -16,7 +16,11 @@ from rts.errors import InputError
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     """Interleave the layers of several parts by depth and keep the nearest `layers`; the earlier part is first at ties.
 
-    A single part keeps its cells as they are.
+    A single part keeps its cells as they are. The result has fewer layers if all parts together have fewer, and no
+    settled cells if there are several parts.
+
+    Raises:
+        InputError: known cells of one of several parts name a sample that does not exist.
     """
     overflow = samples[0].overflow
     for s in samples[1:]:
@@ -52,14 +56,18 @@ def _as_many(one: Array, other: Array) -> tuple[Array, Array]:
 
 
 def _nothing_told(row: Array) -> Array:
+    """`Cells.facing` (K, H, W) int16 of a part that records no sides: 0 everywhere."""
     xp = namespace(row)
     return xp.zeros_like(row, dtype=xp.int16)
 
 
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
-    """Part, row within the part, depth and facing (K, H, W), merged from those of all parts.
+    """Part, row within the part, depth and facing (K, H, W), merged from those of all parts; −1 in empty layers.
 
-    `tables` are the rows of all parts, then their depths, then their facings. Without facings, none is returned.
+    Args:
+        layers: K; fewer layers are returned if all parts together have fewer.
+        sizes: the number of rows of each part.
+        *tables: the rows of all parts, then their depths, then their facings. Without facings, none is returned.
     """
     xp, count = namespace(tables[0]), len(sizes)
     rows, facing = tables[:count], tables[2 * count :]

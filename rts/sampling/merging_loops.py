@@ -15,15 +15,15 @@ def interleave(
     layers: int,
     more: int,
 ) -> tuple[np.ndarray, ...]:
-    """The nearest layers of several parts: part, row within it (−1 in empty layers), and depth, (K, H, W) each.
+    """The nearest layers of several parts: part, row within it, and depth, (K, H, W) each; −1, −1 and 0 where empty.
 
-    If parts have `facing`, that of the merged layers is a fourth result.
+    If parts have `facing`, that of the merged layers is a fourth result, its pieces numbered among those of all parts.
 
     Args:
         rows: `row` of each part, (L, H, W) int32, front to back.
         depths: depths of each part, (L, H, W).
         facing: `facing` of each part, (L, H, W) int16; or empty.
-        layers: K.
+        layers: K; fewer layers are returned if all parts together have fewer.
         more: `Cells.MORE_BEHIND`.
     """
     (_, height, width), kind = rows[0].shape, np.result_type(*depths)
@@ -65,7 +65,23 @@ def _merge(
 ):
     """Fill lines [start, stop) of `merged_*` (K, H, W) with a part and the parts before it, which are merged already.
 
-    If `part` is empty, only one part came before. `own_*` are of part `number` of `count`.
+    Args:
+        start: first line.
+        stop: end of the lines.
+        part: (L, H, W) int32, of the parts before; no layers if part 0 alone came before.
+        row: (L, H, W) int32, within its part, or −1.
+        depth: (L, H, W) float.
+        facing: (L, H, W) int16; no layers if sides are not recorded, and then all facings have none.
+        own_row: (M, H, W), of the part to merge.
+        own_depth: (M, H, W).
+        own_facing: (M, H, W), its pieces as the part numbers them.
+        number: the part to merge, counted from 0.
+        count: number of parts. With the last one, `more` is added where layer K − 1 has a piece.
+        more: `Cells.MORE_BEHIND`.
+        merged_part: to be filled; −1 in empty layers.
+        merged_row: to be filled; −1 in empty layers.
+        merged_depth: to be filled; 0 in empty layers.
+        merged_facing: to be filled; 0 in empty layers.
     """
     before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(facing) > 0
     for y in range(start, stop):

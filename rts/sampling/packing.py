@@ -48,9 +48,16 @@ def lift(
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
     Samples are numbered layer by layer, and line by line in each. There is always at least one row, so that later
-    steps stay connected to θ; a row that no cell refers to has no effect. `capacity` is the number of rows to allot.
-    `kept` (K, H, W) bool marks the `covered_cells` to take, None for all. `exits` get the last rows, as many as there
-    is room for: rows number at most cells times layers. `views` counts the views in the grid, down and across.
+    steps stay connected to θ; a row that no cell refers to has no effect.
+
+    Args:
+        fragments: (K, H, W), on the host.
+        proxy: the triangles.
+        capacity: rows to allot; samples beyond are dropped, and counted in `overflow`. None for as many as are taken.
+        kept: (K, H, W) bool, the `covered_cells` to take; None for all.
+        exits: further fragments, for the last rows, as many as find room: in `capacity`, or in K · H · W rows. None
+            for none.
+        views: number of views in the grid, down and across; each is numbered by itself, one after the other.
     """
     from rts.sampling import packing_loops
 

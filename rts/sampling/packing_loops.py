@@ -22,6 +22,8 @@ def pack(
 ) -> tuple[Any, ...]:
     """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of these cells.
 
+    Cells without a row have −1 and 0. They are those that are not taken, and those beyond the capacity.
+
     Args:
         fragments: the fragments of all layers.
         kept: (K, H, W) bool, the fragments to take; all of them name triangles.
@@ -53,7 +55,17 @@ def pack(
 
 
 class _Lines(NamedTuple):
-    """Fragments as lines of cells of a view, with the fragments to take and their number in each line."""
+    """Fragments as lines of cells of a view, with the fragments to take and their number in each line.
+
+    Attributes:
+        kept: (L, W) bool, the fragments to take. L counts lines layer by layer, each line of the grid cut into views.
+        triangle_ids: (L, W) int32.
+        barycentrics: (L, W, 2) float32.
+        depths: (L, W) float32.
+        counts: (L,) int64, the number of fragments to take.
+        shape: (K, height, width) of the whole grid.
+        views: the number of views in the grid, down and across.
+    """
 
     kept: np.ndarray
     triangle_ids: np.ndarray
@@ -65,6 +77,7 @@ class _Lines(NamedTuple):
 
     @classmethod
     def of(cls, fragments: Fragments, kept: np.ndarray, views: tuple[int, int] = (1, 1)) -> _Lines:
+        """The lines of fragments (K, H, W), of which `kept` (K, H, W) bool are to be taken."""
         shape, across = kept.shape, views[1]
         lines, width = shape[0] * shape[1] * across, shape[2] // across
         triangle_ids = np.ascontiguousarray(fragments.triangle_ids, np.int32).reshape(lines, width)
@@ -83,7 +96,7 @@ class _Lines(NamedTuple):
 
 
 def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
-    """The number of kept cells, of (K, H, W) bool, in each view of a grid of `views` (down, across): (B,)."""
+    """The number of kept cells, of (K, H, W) bool, in each view of a grid of `views` (down, across): (B,), by rows."""
     layers, height, width = kept.shape
     lines, counts = kept.reshape(-1, width // views[1]), np.zeros(layers * height * views[1], np.int64)
     parallel(_count, len(lines), np.ascontiguousarray(lines), counts, work=kept.size // 8)
@@ -92,6 +105,7 @@ def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
 
 @loop
 def _count(start, stop, kept, counts):
+    """Write to `counts` (L,) the number of True entries in each of the lines [start, stop) of `kept` (L, W)."""
     for y in range(start, stop):
         count = 0
         for x in range(kept.shape[1]):
@@ -101,6 +115,23 @@ def _count(start, stop, kept, counts):
 
 @loop
 def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners, offsets, ids, params, row, depth):
+    """Pack the kept fragments of lines [start, stop); see `_Lines` for the first four arrays.
+
+    Args:
+        start: first line.
+        stop: end of the lines.
+        kept: (L, W) bool.
+        triangle_ids: (L, W).
+        barycentrics: (L, W, 2).
+        depths: (L, W).
+        table: (T, I) int32, ids of each triangle.
+        corners: (T, 3, P) float32; no rows for the barycentrics themselves.
+        offsets: (L,), the first row of each line.
+        ids: (N, I) int32. Rows from a line's offset on are written; fragments that find none are left out.
+        params: (N, P) float32, likewise.
+        row: (L, W) int32, to be filled; −1 for cells without a row.
+        depth: (L, W) float32, to be filled; 0 for cells without a row.
+    """
     for y in range(start, stop):
         n = offsets[y]
         for x in range(kept.shape[1]):

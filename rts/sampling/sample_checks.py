@@ -74,7 +74,11 @@ def check_faces(proxy: Proxy, surface: Any = None) -> None:
 
 
 def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
-    """A table of a proxy, contiguous, of this dtype; refused unless of its kind and (rows, *widths), −1 for any."""
+    """A table of a proxy, contiguous, as float32 or int32, whichever `dtype` is.
+
+    Refused unless it holds floats for float32, or integers for int32, and its shape is (rows, *widths). A width of −1
+    stands for any.
+    """
     try:
         array = np.asarray(table)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -133,7 +137,14 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
 
 
 def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> np.ndarray:
-    """The covered cells (K, H, W) bool of a sampler's fragments, which are refused if they break the contract."""
+    """The covered cells (K, H, W) bool of a sampler's fragments; refused if shapes or triangle numbers do not fit.
+
+    Args:
+        fragments: the result of `rasterize`.
+        shape: (K, H, W).
+        faces: number of triangles.
+        sampler: the sampler, for the error.
+    """
     if isinstance(fragments, Fragments):
         ids, barycentrics, depth = fragments
         fits = shape_of(ids) == shape_of(depth) == shape and shape_of(barycentrics) == (*shape, 2)
@@ -244,7 +255,13 @@ def check_proxy(proxy: Proxy, surface: Any) -> None:
 
 
 def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> Samples:
-    """The result of a surface's `refine` in arrays of the right dtypes, refused where it breaks its contract."""
+    """The result of a surface's `refine` in arrays of the right dtypes, refused where it breaks its contract.
+
+    Args:
+        refined: the result.
+        lifted: the samples that `refine` was given. Fields that `refine` may not change are taken from these.
+        surface: the surface.
+    """
     who = f"refine of {surface!r}"
     if not isinstance(refined, Samples):
         raise InputError(f"{who} gave a {type(refined).__name__}; expected Samples")
@@ -270,7 +287,10 @@ def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> 
 
 
 def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any) -> np.ndarray:
-    """A value as an array of a dtype, refused where its shape or its kind is another."""
+    """A value as an array of `dtype`, refused unless its shape is `shape` and its own dtype a subtype of `kind`.
+
+    `what` begins the error: "refine of … gave ids".
+    """
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:

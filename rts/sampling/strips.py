@@ -73,7 +73,7 @@ class FineGrid(NamedTuple):
         return self.high + self.gap
 
     def room(self, capacity: int | None, layers: int) -> Room:
-        """Room for the worst case, or for `capacity` rows in so many layers."""
+        """Room for `capacity` rows in `layers` layers, if strips are `FILLED`; None for the worst case."""
         cells, columns = self.fine[0] * self.fine[1], self.strips * (self.size[1] + self.gap)
         if capacity is None:
             return Room(columns, cells)
@@ -94,7 +94,7 @@ class Room(NamedTuple):
 
 
 def rounded(count: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few shapes, so that compiled programs are reused."""
+    """The least 2ⁿ or 3·2ⁿ that is at least `count` and 16: few shapes, so that compiled programs are reused."""
     size = 16
     while size < count:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
@@ -107,7 +107,7 @@ class Layout(NamedTuple):
     Attributes:
         cells: (L, LINE) int32, the cells to sample, as flat indices in the grid with its apron; −1 for none.
         place: (h, w) int32, the index in `cells` that each place of the layout shows, or −1.
-        kinds: (h, w) uint8, bits of `strips_loops`.
+        kinds: (h, w) uint8, bits of `strips_loops`: `WANTED` in an active pixel, `NEAR` within two cells of one.
         wanted: (h, w) bool, the cells of active pixels.
         pixel: (H, W) int32, flat index of an active pixel in the layout, in pixels without the apron; −1 for others.
         coarse: (H', W') bool, the coarse cells, apron included, whose pixels are not active.
@@ -134,14 +134,17 @@ class Layout(NamedTuple):
 
 
 def _lines(grid: FineGrid, columns: int) -> tuple[int, int]:
-    """Lines and columns of a roughly square layout for runs of `columns` columns in total; a line may cut a run."""
+    """Lines of runs, and pixels across, of a roughly square layout. A line may cut a run.
+
+    `columns` is the width of all runs together, in pixels, aprons included.
+    """
     # At the end of a line up to `gap` columns stay empty, and a run that is cut needs its aprons twice.
     across = max(math.isqrt(columns * grid.pitch), 3 * grid.gap + 1)
     return -(-columns // (across - 2 * grid.gap)), across
 
 
 def _shape(grid: FineGrid, lines: int, across: int) -> tuple[int, int]:
-    """Height and width of a layout, in fine cells."""
+    """Height and width, in fine cells, of a layout of `lines` lines of runs, `across` pixels wide."""
     pixels = (lines - 1) * grid.pitch + grid.high, across - grid.gap
     return pixels[0] * grid.side + 2 * grid.apron, pixels[1] * grid.side + 2 * grid.apron
 
@@ -155,8 +158,11 @@ def lay_out(
         active: (H, W) bool, the active pixels.
         grid: the sizes.
         room: the room; None for as much as needed.
-        sizes_of: needed number of columns, or of lines of cells → the number to allot. None for the numbers of `room`,
-            or without room for as many as needed.
+        sizes_of: function from the needed number of lines of `cells` to the number to allot; without `room`, of
+            columns too. None for the numbers of `room`, or without room for as many as needed.
+
+    Returns:
+        The layout, NumPy arrays. Active pixels that find no room stay −1 in `pixel`; `dropped` counts them.
     """
     from rts.sampling import strips_loops
 
@@ -188,7 +194,14 @@ def lay_out(
 
 
 def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """The first pieces, with at most `most` cells (None for all); and the number of their cells in each grid line."""
+    """The first pieces that need at most `most` cells together, and how many of these each line of the grid has (H',).
+
+    Args:
+        marks: (H, W) uint8, the active pixels.
+        pieces: (P, 5), see `strips_loops`.
+        grid: the sizes.
+        most: the bound; None for all pieces.
+    """
     from rts.sampling import strips_loops
 
     def counted(n: int) -> np.ndarray:
@@ -235,7 +248,7 @@ class HiddenInStrips:
         return self.rule.size
 
     def decide(self, question: Question) -> Decision:
-        """See `Hidden`; cells are (K, L, LINE)."""
+        """See `Hidden`; cells of the question and the decision are those of the list, (K, L, LINE)."""
         from rts.sampling import strips_loops
 
         covered, depth, size, part = question
@@ -273,7 +286,15 @@ class HiddenInStrips:
 
 
 def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
-    """Samples of listed cells (K, L, LINE), put into the layout wherever it shows these cells."""
+    """Samples of listed cells, put into the layout wherever it shows these cells; the result is not `flat`.
+
+    Exits that find no room behind the samples are left out.
+
+    Args:
+        sampled: the samples; `row` is (K, L, LINE), as `layout.cells`.
+        layout: the layout, in arrays of any engine.
+        grid: the sizes.
+    """
     sizes = [s.ids.shape[-2] for s in sampled.samples]
     engine, layers = engine_of(sampled), sampled.row.shape[0]
     laid = layers, *layout.place.shape
@@ -332,7 +353,18 @@ def _arranged(
     width: int,
     settled: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
-    """Index, shift, laid, part and shown, as `strips_loops.arrange` fills them; there is always at least one splat."""
+    """Index (M,), shift (M, 3), laid and part (K, h, w), and shown (h, w), as `strips_loops.arrange` fills them.
+
+    M is at least 1: without samples, the only splat is sample 0, which no place shows.
+
+    Args:
+        row: (K, L, LINE), the sample of each listed cell, counted over all parts; −1 for none.
+        place: see `Layout`.
+        cells: see `Layout`.
+        sizes: the number of rows of each part.
+        width: cells in a line of the grid, apron included.
+        settled: (L, LINE), 0 or −1, see `Cells.settled`; None for none, and `shown` has no rows.
+    """
     from rts.sampling import strips_loops
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
@@ -353,7 +385,7 @@ def _arranged(
 def _with_exits(
     index: np.ndarray, shift: np.ndarray, fronts: np.ndarray, place: np.ndarray, exits: np.ndarray, most: int
 ) -> tuple[np.ndarray, ...]:
-    """Index and shift of splats with those of exits behind them, at most `most` in all; and `Cells.exit` (E, h, w).
+    """Index and shift of splats, those of exits appended, at most `most` in all; and `Cells.exit` (E, h, w) of splats.
 
     Args:
         index: (M,), see `Fine`.
@@ -377,12 +409,12 @@ def _with_exits(
 def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     """The samples of listed cells, selected from those of all cells, for samplers that do not follow lists.
 
-    They are without exits and settled cells.
+    Their cells are (K, L, LINE), without exits and settled cells.
 
     Args:
         whole: samples of the whole grid.
         cells: (L, LINE) int32, flat indices in the grid, or −1.
-        capacity: rows to allot, or None for as many as there are.
+        capacity: rows to allot; samples beyond are dropped, and counted in `overflow`. None for as many as there are.
     """
     layers, count = whole.row.shape[0], whole.ids.shape[0]
     rows = count if capacity is None else capacity

@@ -50,7 +50,14 @@ def _unite(some, active):
 
 @loop
 def split(runs, gap, lines, across):
-    """Pieces (P, 5) int32 of runs, cut to fit `lines` lines of `across` columns; runs without room are left out."""
+    """Pieces (P, 5) int32 of runs, cut to fit the layout; what finds no room after the last line is left out.
+
+    Args:
+        runs: (R, 3), the result of `find`.
+        gap: pixels that aprons on two opposite sides take.
+        lines: number of lines of pieces.
+        across: pixels of width in a line, aprons included.
+    """
     pieces = np.empty((len(runs) + lines, 5), np.int32)
     found, line, at = 0, 0, 0
     for r in range(len(runs)):
@@ -70,7 +77,16 @@ def split(runs, gap, lines, across):
 
 @loop
 def number(active, pieces, high, pitch, across, pixel):
-    """Fill `pixel` with indices of active pixels in the layout: `across` a line, lines of pieces `pitch` apart."""
+    """Write to `pixel`, for the active pixels of pieces, their flat index in the layout; leave other entries alone.
+
+    Args:
+        active: (H, W) uint8.
+        pieces: (P, 5).
+        high: pixels from top to bottom of a strip.
+        pitch: pixels from a line of pieces to the next.
+        across: pixels of width in the layout, without its apron.
+        pixel: (H, W) int32, −1 at the start.
+    """
     height, _ = active.shape
     for strip, first, columns, line, at in pieces:
         for y in range(strip * high, min(height, (strip + 1) * high)):
@@ -82,7 +98,22 @@ def number(active, pieces, high, pitch, across, pixel):
 
 @compiled
 def _needs(needs, active, line, strip, first, columns, side, apron, high):
-    """Fill `needs`: 1 for the columns of a piece whose active pixels need a line of cells. Returns True if any do."""
+    """Fill `needs[:columns]`: 1 for the columns of a piece whose active pixels need a line of cells, else 0.
+
+    Args:
+        needs: (W,) uint8.
+        active: (H, W) uint8.
+        line: line of cells of the grid, apron included.
+        strip: strip of the piece.
+        first: first column of the piece.
+        columns: number of its columns.
+        side: s, cells along each side of a pixel.
+        apron: cells around active pixels that are needed.
+        high: pixels from top to bottom of a strip.
+
+    Returns:
+        True if any column needs the line.
+    """
     needs[:columns] = 0
     top, bottom = strip * high, min(len(active), (strip + 1) * high)
     begin, end = _pixels(line, side, apron)
@@ -96,7 +127,10 @@ def _needs(needs, active, line, strip, first, columns, side, apron, high):
 
 @compiled
 def _pixels(line, side, apron):
-    """First and end of the lines of pixels that hold a line of cells of the grid in themselves or their aprons."""
+    """First and end of the lines of pixels that hold a line of cells in themselves or their aprons.
+
+    Line 0 of cells is the first of the image's apron. The lines of pixels may lie outside of the image.
+    """
     return (line - 2 * apron) // side, line // side + 1
 
 
@@ -119,7 +153,7 @@ def _end(marks, first):
 
 @loop
 def count(start, stop, active, pieces, firsts, side, apron, high, width, counts):
-    """Count the cells of lines [start, stop) of the grid that active pixels need: counts (H',).
+    """Write to `counts` how many cells active pixels need in each of the lines [start, stop) of the grid.
 
     Args:
         start: first line.
@@ -130,8 +164,8 @@ def count(start, stop, active, pieces, firsts, side, apron, high, width, counts)
         side: s, cells along each side of a pixel.
         apron: cells around active pixels that are needed.
         high: pixels from top to bottom of a strip.
-        width: cells in a line of the grid.
-        counts: to be filled.
+        width: cells in a line of the grid, apron included.
+        counts: (H',) int64, for every line of the grid; entries [start, stop) are written.
     """
     needs, seen = np.empty(active.shape[1], np.uint8), np.zeros(width, np.uint8)
     for line in range(start, stop):
@@ -159,7 +193,7 @@ def _strips(line, side, apron, high, strips):
 
 @loop
 def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, cells, place, kinds):
-    """Lay out the cells of lines [start, stop) of the grid that active pixels need.
+    """Lay out the cells of lines [start, stop) of the grid, apron included, that active pixels need.
 
     Args:
         start: first line.
@@ -172,9 +206,9 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
         high: pixels from top to bottom of a strip.
         gap: pixels that aprons on two opposite sides take.
         offsets: (H',), the number of cells in the lines before each.
-        cells: (M,) int32, to be filled with the flat index of each cell in the grid, apron included.
-        place: (h, w) int32 of −1, to be filled with the index in `cells` that each place of the layout shows.
-        kinds: (h, w) uint8 zeros, to be filled with bits.
+        cells: (M,) int32. The flat indices in the grid of a line's cells are written from its offset on.
+        place: (h, w) int32, −1 at the start. Where the layout shows a cell, its index in `cells` is written.
+        kinds: (h, w) uint8, 0 at the start, to which the bits `WANTED` and `NEAR` are added.
     """
     width = active.shape[1] * side + 2 * apron
     needs, numbers = np.empty(active.shape[1], np.uint8), np.full(width, -1, np.int32)
@@ -221,7 +255,11 @@ def _repeat(to, given, more):
 def _number(numbers, cells, first, n):
     """Number the cells of a run that have no number yet, from n on, and list them in `cells`. Returns the next number.
 
-    `first` is the flat index of the run's first cell in the grid.
+    Args:
+        numbers: (R,) int32, the number of each cell of the run, or −1 for none; changed in place.
+        cells: (M,) int32; entries from n on are written.
+        first: flat index of the run's first cell in the grid.
+        n: the first free number.
     """
     known = False
     for u in range(len(numbers)):
@@ -246,7 +284,10 @@ def _copy(to, given):
 
 @compiled
 def _near(line, side, apron):
-    """First and end of the lines of pixels within two cells, or the apron, of a line of cells; and its own line."""
+    """First and end of the lines of pixels near a line of cells, and the line of pixels that it lies in.
+
+    Near is within two cells, and within the apron. All three may lie outside of the image.
+    """
     begin, end = _pixels(line, side, apron)
     own = line - apron
     return max(begin, (own - side - 2) // side + 1), min(end, (own + 2) // side + 1), own // side
@@ -254,7 +295,19 @@ def _near(line, side, apron):
 
 @compiled
 def _tell(kinds, active, near, strip, first, columns, side, apron, high):
-    """Set bits in `kinds`, a line of cells of a piece, from the active pixels on the lines of pixels of `_near`."""
+    """Add the bits `WANTED` and `NEAR` to `kinds`, one line of cells of a piece, apron included.
+
+    Args:
+        kinds: (columns · side + 2 · apron,) uint8.
+        active: (H, W) uint8.
+        near: the result of `_near` for the line of cells.
+        strip: strip of the piece.
+        first: first column of the piece.
+        columns: number of its columns.
+        side: s, cells along each side of a pixel.
+        apron: cells around active pixels.
+        high: pixels from top to bottom of a strip.
+    """
     around = min(apron, 2)
     begin, end, own = near
     for y in range(max(strip * high, begin), min(len(active), (strip + 1) * high, end)):
@@ -273,7 +326,11 @@ def _tell(kinds, active, near, strip, first, columns, side, apron, high):
 
 @loop
 def count_samples(start, stop, row, place, counts):
-    """Count the samples of lines [start, stop) of a layout, of K · h lines in all layers: counts (K · h,)."""
+    """Write to `counts` (K · h,) the number of samples that each of the lines [start, stop) of a layout shows.
+
+    Line k · h + y is line y in layer k. `row` (K, M) has the sample of each listed cell, `place` (h, w) the cell that
+    each place shows; −1 for none.
+    """
     height = len(place)
     for line in range(start, stop):
         k, found = line // height, 0
@@ -284,22 +341,22 @@ def count_samples(start, stop, row, place, counts):
 
 @loop
 def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, index, shift, laid, part, shown):
-    """Put samples into lines [start, stop) of a layout, of K · h lines in all layers.
+    """Put samples into lines [start, stop) of a layout; line k · h + y is line y in layer k.
 
     Args:
         start: first line.
         stop: end of the lines.
-        row: (K, M) int32, the sample of each cell.
-        place: (h, w).
-        cells: (M,), the flat index of each cell in the grid.
+        row: (K, M) int32, the sample of each listed cell, counted over all parts; −1 for none.
+        place: (h, w) int32, the cell that each place of the layout shows; −1 for none.
+        cells: (M,) int32, the flat index of each cell in the grid.
         settled: (M,) int8, 0 or −1, see `Cells.settled`; empty if there is none.
         firsts: (P − 1,) the first row of each part but the first.
-        width: cells in a line of the grid.
+        width: cells in a line of the grid, apron included.
         offsets: (K · h,), the number of the first splat of each line.
         index: (N,) int32, to be filled: the sample of each splat.
-        shift: (N, 3) float32, to be filled: from the grid to the layout.
-        laid: (K, h, w) int32, to be filled: the splat of each place.
-        part: (K, h, w) int32, to be filled: the part of that splat.
+        shift: (N, 3) float32, to be filled: cells right and down from the grid to the layout, then 0.
+        laid: (K, h, w) int32, to be filled: the splat of each place, or −1.
+        part: (K, h, w) int32, to be filled: the part of that splat, or −1.
         shown: (h, w) int8, to be filled: `settled` of each place; no rows if there is none.
     """
     height, across = len(place), np.uint32(width)
@@ -325,7 +382,10 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
 
 @loop
 def gather(start, stop, covered, depth, place, laid, deep):
-    """Fill lines [start, stop), of K · h, of `laid` and `deep` (K, h, w) with cover and depth of cells (K, M)."""
+    """Fill lines [start, stop) of `laid` and `deep` (K, h, w) with cover and depth of the listed cells (K, M).
+
+    Line k · h + y is line y in layer k. `place` (h, w) names the cell that each place shows; −1 gives False and 0.
+    """
     height = len(place)
     for line in range(start, stop):
         k, y = line // height, line % height
@@ -337,9 +397,15 @@ def gather(start, stop, covered, depth, place, laid, deep):
 
 @loop
 def scatter(start, stop, kept, kinds, place, found):
-    """Mark in `found` (K, M) the cells kept in lines [start, stop) of a layout, of K · h lines in all layers.
+    """Mark in `found` the listed cells that are kept in lines [start, stop) of a layout.
 
-    With `kinds`, `kept` is first cleared where it is not near wanted cells.
+    Args:
+        start: first line; line k · h + y is line y in layer k.
+        stop: end of the lines.
+        kept: (K, h, w) bool, False where the layout shows no cell. With `kinds`, cleared in place where not `NEAR`.
+        kinds: (h, w) uint8, bits; no rows to keep all.
+        place: (h, w) int32, the cell that each place shows, or −1.
+        found: (K, M) bool, False at the start.
     """
     height = len(place)
     for line in range(start, stop):

@@ -66,7 +66,10 @@ class TriangleSampler(Sampler):
         return {name: value for name, value in self.__dict__.items() if name != "_keeper"}
 
     def prepare(self, proxy: Proxy) -> Any:
-        """Build the input of `rasterize`: an acceleration structure, device buffers. The default gives the proxy."""
+        """Build the input of `rasterize`: an acceleration structure, device buffers.
+
+        The default returns the proxy, once its `faces` are found to name vertices; else it raises an InputError.
+        """
         check_faces(proxy)
         return proxy
 
@@ -114,7 +117,7 @@ class TriangleSampler(Sampler):
             cells: (L, C) int32, flat indices of cells in the grid, none of them twice; −1 for an unused place.
 
         Returns:
-            Fragments, (K, L, C).
+            Fragments, (K, L, C), with `triangle_ids` of −1 in unused places.
         """
         whole, listed = self.rasterize(prepared, camera, size, layers, cull), cells >= 0
         check_fragments(whole, (layers, *size), np.iinfo(np.int32).max, self)
@@ -143,7 +146,7 @@ class TriangleSampler(Sampler):
                 change afterwards.
 
         Returns:
-            Fragments (K, H, W), the cells, and the fragments (1, 1, M) of cull="front" in these.
+            Fragments (K, H, W), the cells (1, M), and the fragments (1, 1, M) of cull="front" in these; M may be 0.
         """
         fragments = self.rasterize(prepared, camera, size, layers, "back")
         cells = beside(fragments)
@@ -153,7 +156,12 @@ class TriangleSampler(Sampler):
         return fragments, cells, backs
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
-        """The proxy of a part, and the result of `prepare` for it; see `Sampler`."""
+        """The proxy of a part, and the result of `prepare` for it; see `Sampler`.
+
+        Raises:
+            InputError: the surface has no triangles, θ or the camera is traced, or the triangles depend on the view
+                and the camera or the size is None.
+        """
         surface = _of_triangles(part.surface)
         if surface.depends_on_view and (camera is None or size is None):
             raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
@@ -200,14 +208,15 @@ class TriangleSampler(Sampler):
     def sample(
         self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request = NOTHING_ELSE
     ) -> Samples:
-        """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
+        """The `layers` nearest samples of every cell asked for, by one call to the host; see `rts.Sampler`.
 
-        Sides are recorded for parts that are not culled, of surfaces with `pieces` that do not move their samples.
-        Exits are recorded for parts with cull="back", of centred surfaces without `refine`, but not for lists of cells.
-        Pairs at outlines are recorded for surfaces with `refine_outlines` that do not move their samples.
+        If requested, `facing` is recorded for K > 1 layers of parts that are not culled, of surfaces with `pieces` that
+        do not move their samples. Requested exits are of two kinds. Single ones are recorded for parts with
+        cull="back", of centred surfaces without `refine`, but not for lists of cells. Pairs at outlines are recorded
+        for surfaces with `refine_outlines` that do not move their samples.
 
         Raises:
-            InputError: the surface has no triangles, or a plugin broke its contract.
+            InputError: the surface has no triangles, the camera makes no image, or a plugin broke its contract.
         """
         surface, camera = _of_triangles(part.surface), camera.for_size(size)
         listed, hidden, entry = request.cells, request.hidden, request.entry
@@ -253,7 +262,7 @@ class TriangleSampler(Sampler):
             inputs: the result of its `proxy_inputs`, on the host.
             camera: the camera.
             view: (height, width) of the grid of cells.
-            entry: the prepared entry, if known.
+            entry: the prepared entry; None to look it up, or to build it.
             work: a function of the entry. Several threads may call it at once if `draws_at_once`.
         """
         with self._keeper.lock:
@@ -286,7 +295,7 @@ class _Search:
         shape: bounds on the number of samples.
         tables: the result of the surface's `table_specs`.
         hidden: the rule for hidden samples; None to keep all.
-        entry: the surface's prepared entry, if known.
+        entry: the surface's prepared entry; None to look it up, or to build it.
         cells: (L, C), the cells to sample; None for all.
     """
 
@@ -302,7 +311,13 @@ class _Search:
     cells: np.ndarray | None
 
     def in_place(self, sides: bool, exits: bool, pairs: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them; `pairs` also at outlines."""
+        """Samples on the triangles, or refined by a surface that does not move them.
+
+        Args:
+            sides: True to record `Cells.facing`.
+            exits: True to record, at outlines, the sample where the ray leaves the part.
+            pairs: True to record, at outlines, the surface's pairs of samples.
+        """
         known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
         # All refined samples stay, also those amid one colour.
@@ -325,7 +340,7 @@ class _Search:
         return repack(samples, samples.row >= 0, self.shape.capacity, further).replace(facing=facing)
 
     def moved(self) -> Samples:
-        """Samples that the surface moves off its triangles."""
+        """Samples that the surface moves off its triangles, with `ran_out`."""
         layers = self.shape.layers
         # There is only one set of tables, so that no samples can be added later.
         known, fragments, covered, *_ = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
@@ -347,10 +362,9 @@ class _Search:
         return repack(samples, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
 
     def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
-        """The prepared entry, the fragments (K, ·, ·), and their covered cells.
+        """The prepared entry, fragments (K, ·, ·), their covered cells (bool), a decision on them, and exits.
 
-        With `exits` also the exits of rays from the part and, if it has triangles, the decision on the fragments; else
-        None for these.
+        Decision and exits are None unless `exits` is True. The decision is None, too, if the part has no triangles.
         """
         sampler, (camera, view) = self.sampler, (self.camera, self.shape.view)
         grid = layers, *self.shape.size
@@ -390,7 +404,7 @@ class _Search:
         return self.hidden.decide(Question(covered, fragments.depth, self._size(known)))
 
     def _size(self, known: Entry) -> float:
-        """The triangles' largest absolute coordinate; 0 if the rule for hidden samples has it already."""
+        """The triangles' largest absolute coordinate; 0 if no rule needs it, or the rule has it in its own `size`."""
         if known.size is not None or self.hidden is None:
             return known.size or 0.0
         # The rule knows the size of vertices that are themselves in θ.

@@ -710,7 +710,7 @@ class Camera:
 
 
 def toward_rows(view: Array, projection: Array) -> Array:
-    """The affine maps (…, 3, 4) from points to `Camera.toward`, for matrices (…, 4, 4)."""
+    """The affine maps (…, 3, 4) from world points to `Camera.toward` there, for matrices (…, 4, 4)."""
     xp, rotation = namespace(view), view[..., :3, :3]
     at = xp.sum(rotation[..., :, :, None] * view[..., :3, None, :], axis=-3) * projection[..., 3:, 2:3]
     axis = projection[..., 3, 3:] * rotation[..., 2, :]
@@ -729,12 +729,14 @@ def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
 
 
 def _known_ratio(aspect: Any) -> float | Literal["open"] | None:
+    """`Camera.aspect` for a constructor's `aspect`: "open" if None was given, None for an array of an engine."""
     if aspect is None:
         return "open"
     return float(aspect) if is_constant(aspect) else None
 
 
 def _equal(a: Array, b: Array) -> bool:
+    """True if two arrays, perhaps of two engines, have equal values; False if one is traced."""
     a, b = value_of(a), value_of(b)
     return a is not None and b is not None and np.array_equal(a, b)
 

@@ -13,7 +13,10 @@ SMALL = 1e-2
 
 
 def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix (4, 4) of a pose (6,) about a centre (3,), and the entries' Jacobian (16, 9) by both; float64."""
+    """The matrix (4, 4) of a pose (6,) about a centre (3,), and the entries' Jacobian (16, 9) by both; float64.
+
+    The pose is a rotation vector and a translation. Entries are counted row by row; pose comes before centre.
+    """
     matrix, jacobian = np.empty((4, 4)), np.empty((16, 9))
     _rigid(pose.astype(np.float64), center.astype(np.float64), matrix, jacobian)
     return matrix, jacobian
@@ -21,6 +24,7 @@ def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @loop
 def _rigid(pose, center, matrix, jacobian):
+    """Fill `matrix` (4, 4) and `jacobian` (16, 9), float64; see `rigid`."""
     r = pose[:3]
     s = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     if s < SMALL:

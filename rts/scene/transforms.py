@@ -26,7 +26,7 @@ def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:
 
 
 def scaled_rows(matrix: Array, row_signs: tuple[float, ...]) -> Array:
-    """The matrix with each row multiplied by its sign."""
+    """The matrix (R, ·), its row i multiplied by the number `row_signs[i]`."""
     xp = namespace(matrix)
     return xp.stack([matrix[i, :] * s for i, s in enumerate(row_signs)])
 

@@ -282,9 +282,11 @@ def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
 
 
 def _positive(x: Array) -> Array:
+    """The array with zeros in place of negative numbers, which have no derivative there."""
     return namespace(x).where(x > 0, x, 0 * x)  # NaN stays NaN.
 
 
 def _opaque(color: Array) -> Array:
+    """(N, 4): colours (N, 3) with an alpha of 1."""
     xp = namespace(color)
     return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)

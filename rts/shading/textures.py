@@ -22,7 +22,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
         texture: (h, w, C), C = 1, 3 or 4, row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w,
             v = 1 − (i + 0.5) / h.
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
-        wrap: "repeat", "mirror" or "clamp" outside [0, 1].
+        wrap: "repeat" or "mirror" outside [0, 1]; any other text is "clamp".
         footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for a step to the next cell, constant. The texture is averaged
             over roughly this area, by `mip_levels` and `level_of`. None for no average.
 

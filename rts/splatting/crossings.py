@@ -248,7 +248,10 @@ def _step(z0: Array, z1: Array, two: Array, m: Steps) -> _Step:
 
 
 def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> Array:
-    """R / (h(q) + h(p)) for all cells q and p = q + m; infinity where they are no pair."""
+    """R / (h(q) + h(p)) (H, W) for all cells q and p = q + m; infinity where these cannot be a pair.
+
+    `z0`, `z1` and `two` are as in `pairs`. Sums of gaps up to `least` are rounding.
+    """
     xp, step = namespace(two, z0), _step(z0, z1, two, m)
     before, after = step.before, step.after
 
@@ -262,9 +265,10 @@ def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> 
 
 
 def _candidates(z0: np.ndarray, z1: np.ndarray, two: np.ndarray, least: float, m: Steps) -> np.ndarray:
-    """Cells q (H, W) that may form a pair with q + m, whether or not the cells beyond these two have two layers.
+    """Cells q (H, W) bool that may form a pair with q + m, whether or not the cells beyond these two have two layers.
 
-    `SLACK` allows for rounding, since pairs are computed from depths of another precision.
+    Arguments are as in `_ratio`. `SLACK` allows for rounding, since pairs are computed from depths of another
+    precision.
     """
     step, slack = _step(z0, z1, two, m), SLACK * least
     (change0, change1), (direct0, direct1) = step.changes, step.directs
@@ -282,9 +286,17 @@ def _candidates(z0: np.ndarray, z1: np.ndarray, two: np.ndarray, least: float, m
 def _slope(
     first: Array, second: Array, m: Steps, two: Array, same: dict[Steps, Array], swapped: dict[Steps, Array]
 ) -> tuple[Array, Array]:
-    """Slope along a step, of a sheet that is `first` at the target and `second` beyond the line; and its mask.
+    """Slope along a step, of the sheet that is `first` at the target and `second` beyond the line; and where it exists.
 
     The slope is the mean of the differences on both sides, or the one that exists.
+
+    Args:
+        first: (H, W), depths of the layer that is the sheet's at the target.
+        second: (H, W), depths of the other layer.
+        m: the step, along x or y.
+        two: (H, W) bool, true for cells with both layers.
+        same: for each step from the target, (H, W) bool: the cell there has the sheets in the target's order.
+        swapped: for each step, (H, W) bool: the cell there has them in the opposite order.
     """
     xp, changes, exists = namespace(two, first), [], []
     for sign in (1, -1):

@@ -258,7 +258,13 @@ def fronts(covered: np.ndarray) -> np.ndarray:
 
 
 def opposite_sides(hidden: Array, front: Array, behind: Array) -> Array:
-    """True where a hidden layer is the other side of a front's piece, so that the two do not pair."""
+    """True where a hidden layer is the other side of a front's piece, so that the two do not pair.
+
+    Args:
+        hidden: (H, W), `Splats.facing` of the hidden layer.
+        front: (H, W), `Splats.facing` of the front, in a neighbouring cell.
+        behind: (H, W) bool, true where that front is deeper than the hidden layer.
+    """
     xp, bit = namespace(front), Cells.MORE_BEHIND
     other = (front != 0) & (hidden == -front)
     return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, bit, -bit)))

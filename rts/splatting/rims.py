@@ -186,7 +186,14 @@ def _off(layers: Layers, shift: dict[Steps, Array]) -> dict[Steps, Array]:
 
 
 def _ratio(layers: Layers, z: Array, n: Steps, off: dict[Steps, Array]) -> Array:
-    """The ratio r along a direction; 0 where p₂ does not continue the surface, or its depth does not fall off."""
+    """The ratio r (H, W) along a direction; 0 where p₂ does not continue the surface, or its depth does not fall off.
+
+    Args:
+        layers: the samples.
+        z: (H, W), depths of the fronts, without derivative.
+        n: the direction, from p₁ to p.
+        off: the result of `_off`.
+    """
     xp, back = layers.xp, opposite(n)
     (z1, _), (z2, there) = layers.front(*n), layers.front(2 * n[0], 2 * n[1])
     z1, z2 = stopped(z1), stopped(z2)
@@ -221,7 +228,11 @@ def _backs(layers: Layers, part: Array | None) -> list[Back]:
 
 
 def _closes(layers: Layers, directions: dict[Steps, Array], back: Back) -> Array:
-    """True where fronts and their far ends meet along a direction, (H, W); for deepest points, where there is one."""
+    """True (H, W) where fronts and the far ends `back` meet along one of the directions that hold.
+
+    `directions` has a mask (H, W) for each direction: usable ones; for deepest points those that are off, and then any
+    of them will do.
+    """
     if back.gap is None:
         return functools.reduce(operator.or_, directions.values()) & back.own
     gap, closing = layers.at(back.gap, 0, 0), False

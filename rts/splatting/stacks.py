@@ -58,7 +58,10 @@ class Source:
         )
 
     def composited(self, first: Array, last: Array, xp: Any) -> Array:
-        """Layers first ≤ k < last over one another, with the weight of the first one, (H, W, 5)."""
+        """Layers first ≤ k < last over one another, with the weight of the first one, (H, W, 5); 0 if there is none.
+
+        `first` and `last` are (H, W) integers.
+        """
         total = xp.zeros_like(self.splats[0])
         for k in reversed(range(len(self.splats))):
             inside = ((first <= k) & (k < last))[..., None]
@@ -82,7 +85,7 @@ class Left:
 
 
 def picked(values: list[Array], index: Array, xp: Any) -> Array:
-    """For each target the value with an index (H, W) out of K; 0 where there is no such value."""
+    """For each target the value with an index (H, W) out of K, (H, W) or (H, W, ·); 0 where there is no such value."""
     total = xp.zeros_like(values[0])
     for k, value in enumerate(values):
         chosen = index == k
@@ -109,7 +112,8 @@ def image(layers: Layers, shift: dict[Steps, Array], sigma: float, gains: Any, s
         layers: the samples.
         shift: for each offset the number s of `Visible` at the first level.
         sigma: of the kernel, cells.
-        gains: from the sums (H, W, 5) of F and S at the first level, the change (H, W, 5) of each with its coverage.
+        gains: function of the two sums (H, W, 5) of F and S at the first level. It returns the changes (H, W, 5) of
+            these buffers, once normalised, as outlines move; or 0.0 for no change.
         still: (H, W) bool, targets whose image has no derivative in positions; None for none.
     """
     xp, count = layers.xp, len(layers.target)
@@ -148,6 +152,13 @@ def pairing(source: Source, target: Source, left: Left, level: int, xp: Any) -> 
     """The number s (H, W) of a source at a level; 0 where the target lacks this level.
 
     s ≥ 0: the source's layer start + s is at the level. s < 0: its layer start pairs with the target's layer level − s.
+
+    Args:
+        source: the source.
+        target: the source at (0, 0).
+        left: the layers that the source has left.
+        level: the level, counted from 0.
+        xp: the array namespace.
     """
     count, start, own = len(source.depth), left.start, target.depth[level]
     z = picked(source.depth, start, xp)
@@ -176,7 +187,16 @@ def buffers(
     level: int,
     xp: Any,
 ) -> list[Array]:
-    """The sums (H, W, 5) of F, S and gap at a level, over the sources that are `present` there."""
+    """The sums (H, W, 5) of F, S and gap at a level, over the sources that take part.
+
+    Args:
+        sources: the source at each offset.
+        left: the layers that each has left.
+        shift: the number s (H, W) of each, see `pairing`.
+        present: (H, W) bool for each, true where it takes part.
+        level: the level, counted from 0.
+        xp: the array namespace.
+    """
     own, count = sources[0, 0], len(sources[0, 0].depth)
     least = xp.full_like(shift[0, 0], count)
     for n, s in shift.items():
