@@ -192,7 +192,7 @@ class _Differentiable:
     def _host_push(
         self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
     ) -> None:
-        """Fill `results`: the value's tangents (T, ·), from those at the end of `given`, of operands marked `wanted`."""
+        """Fill `results`: the value's tangents (T, ·), from those of operands marked `wanted`, last in `given`."""
         operands, used, kept = self._in_use(given)
         tangents: list[Any] = _spread(given[self.count :], wanted)
         for i in self.operation.packed:
