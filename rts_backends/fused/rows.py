@@ -202,7 +202,10 @@ def composite(total, layers, count):
 
 @compiled
 def fill(s, rgba, cells, states, left, count):
-    """Fill planes `s` of a row without busy targets: the colours of FLAT targets, and zeros at others."""
+    """Fill four planes `s` of a row without BUSY targets: the colours of FLAT targets, and zeros at others.
+
+    `cells` and `states` are rows of the grid: the front's sample, and the state, of `count` targets from `left` on.
+    """
     for j in range(count):
         for c in range(4):
             s[c * PITCH + j] = rgba[cells[left + j], c] if states[left + j] == FLAT else s.dtype.type(0)

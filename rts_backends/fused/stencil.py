@@ -223,7 +223,10 @@ def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
 
 @compiled
 def scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
-    """Write the sums that a row of cells has gathered to the gradients of the cells' samples."""
+    """Write the sums `gathered` by a row of cells (see `gather`) to the gradients of their samples, in their place.
+
+    `row` (W,) names the samples, or −1; `s` is the slot of the cells from column `left` on.
+    """
     for j in range(count):
         i = row[left + j]
         if i >= 0:

@@ -244,7 +244,10 @@ def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
 
 @compiled
 def _scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
-    """Add the sums that a row of cells has gathered to the gradients of their samples."""
+    """Add the sums `gathered` by a row of cells (see `gather`) to the gradients of their samples.
+
+    `row` (W,) names the samples, or −1; `s` is the slot of the cells from column `left` on.
+    """
     for j in range(count):
         i = row[left + j]
         if i >= 0:
