@@ -98,8 +98,8 @@ def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
     """Insert a hit, triangle t at depth z, among the nearest in `depths`, `ids` and `sure`, by depth, then by triangle.
 
     These three (K,) change in place, as does their number of hits, `state[COUNT]`. Hits at nearly the same depth are
-    tested in float64 first, unless they are `exact` or `sure` already; earlier ones that fail are removed. Returns False
-    if the hit fails, is there already, or is not among the nearest.
+    tested in float64 first, unless they are `exact` or `sure` already; earlier ones that fail are removed. Returns
+    False if the hit fails, is there already, or is not among the nearest.
     """
     slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
     while i < count:
