@@ -69,7 +69,8 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Test triangle `t` at a pixel position: True if it covers it; least barycentric, depth, first two barycentrics.
 
     If the triangle is culled or has no area, or lies behind the eye or is clipped there, the least barycentric is −∞
-    and the rest is 0. `corners` (3, 4) is working memory.
+    and the rest is 0. `matrix` is that of `pixel_matrix`, `row` that of `depth_of`, `keep` the sign of `facing`;
+    `corners` (3, 4) is working memory.
     """
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -101,7 +102,8 @@ def _walk(t, x, y, hits, count, scene, around, offsets, members):
     """Go from triangle `t` to its neighbours, towards one that covers a pixel and is not among the first `count` hits.
 
     Neighbours share a corner. If `t` itself covers the pixel, it is the last triangle, even if it is among the hits.
-    Returns True if the last triangle covers the pixel, this triangle, its depth and its first two barycentrics.
+    Returns True if the last triangle covers the pixel, this triangle, its depth and its first two barycentrics. `scene`
+    are the arguments of `look` from `matrix` on; for the arrays after it see `correct`.
     """
     inside, least, z, a, b = look(t, x, y, *scene)
     for _ in range(WALK):
@@ -133,7 +135,8 @@ def correct(
     """Correct the hits of pixel rows [first, last): fill barycentrics and depths, correct ids, drop those that miss.
 
     `triangle_ids` (K, H, W) are changed in place; each pixel's hits are sorted by depth, then by index, and empty
-    layers follow. `around` is the result of `places`, `offsets` and `members` are its `corner_lists`.
+    layers follow. Hits behind an empty layer are dropped. `around` is the result of `places`, `offsets` and `members`
+    are its `corner_lists`; for `matrix`, `row` and `keep` see `look`.
     """
     layers, _, width = triangle_ids.shape
     scene = matrix, row, keep, vertices, faces, np.empty((3, 4))

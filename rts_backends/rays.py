@@ -107,7 +107,8 @@ def _with_deepest(
         surface: the surface.
         theta: its θ, constant.
         begins: (H, W) or (L, C) bool, cells whose ray enters a solid at the front.
-        rays: points of the surface, directions, and reach, for all cells, as `RaySurface.deepest` takes them.
+        rays: points of the surface (M, 3), directions (M, 3), and reach (M,), of all M cells, as `RaySurface.deepest`
+            takes them for some.
         capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none. None
             for as much room as there are cells.
         listed: (L, C), `Request.cells`; None for all cells of the grid.

@@ -54,9 +54,10 @@ def _chunks(counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First and last pixel (T, 2) that each triangle may cover, and marks (T,) of triangles that may cover any.
+    """First and last pixel (T, 2), each (x, y), that a triangle may cover (none if first > last), and marks (T,).
 
-    `corners` (T, 3, 4) are in clip space. A triangle with a corner whose w is not positive gets the whole image.
+    Marked are triangles that reach between the near and far planes, ahead of the eye. `corners` (T, 3, 4) are in clip
+    space. A triangle with a corner whose w is not positive gets the whole image.
     """
     height, width = size
     w = corners[..., 3]
@@ -83,8 +84,8 @@ def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
 def _hits(triangle, x, y, corners, depth, size):
     """Triangles, flat pixel indices, first two barycentrics and depths of those candidates that hit.
 
-    Candidate n is triangle `triangle[n]` at pixel (x[n], y[n]); `corners` (T, 3, 4) are in clip space, `depth` is (T,
-    3).
+    Candidate n is triangle `triangle[n]` at pixel (x[n], y[n]); `corners` (T, 3, 4) are in clip space, `depth` (T, 3)
+    are linear depths of corners.
     """
     height, width = size
     ndc_x, ndc_y = (x + 0.5) * 2 / width - 1, 1 - (y + 0.5) * 2 / height

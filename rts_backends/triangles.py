@@ -36,7 +36,10 @@ def facing(camera: Camera, cull: str) -> float:
 
 @loop
 def bounding_sphere(vertices, faces):
-    """(4,) centre and radius, at least 1e-30, of the sphere around the bounding box of vertices that triangles use."""
+    """(4,) centre and radius, at least 1e-30, of the sphere around the bounding box of vertices that triangles use.
+
+    Without triangles the centre is NaN.
+    """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for t in range(len(faces)):
         for c in range(3):

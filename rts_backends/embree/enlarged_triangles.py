@@ -159,7 +159,11 @@ def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners
 
 @compiled
 def _perpendicular(points, p, s, along, height, side):
-    """Fill `side` with a unit vector perpendicular to `along`, in the plane of the triangle if it has one."""
+    """Fill `side` (3,) with a unit vector perpendicular to `along` (3,), in the triangle's plane if it has one.
+
+    `along` is the unit direction of an edge that begins at corner p of `points` (3, 3). Corner s lies opposite, at the
+    distance `height` from the edge.
+    """
     if height > 1e-12:
         dot = 0.0
         for r in range(3):
@@ -179,9 +183,10 @@ def _perpendicular(points, p, s, along, height, side):
 
 @compiled
 def _ribbon(corners, start, along, side, length, height):
-    """Fill `corners` (3, 3) with a long triangle around a segment, in the plane of `along` and `side`.
+    """Fill `corners` (3, 3) with a long triangle around a segment, in the plane of `along` and `side`, unit vectors.
 
-    At the segment's end it is about half as wide as at its start.
+    The segment leads from `start` along `along`, `length` far. The triangle reaches more than `height` to either side
+    of it; at the segment's end it is about half as wide as at its start.
     """
     wide = 2 * (height + 2 * LEAST)
     for r in range(3):

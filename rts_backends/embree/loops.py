@@ -97,8 +97,9 @@ def _decide(t, state, work, vertices, faces):
 def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
     """Insert a hit, triangle t at depth z, among the nearest in `depths`, `ids` and `sure`, by depth, then by triangle.
 
-    Hits at nearly the same depth are tested in float64 first, unless they are `exact` or `sure` already; earlier ones
-    that fail are removed. Returns False if the hit fails, is there already, or is not among the nearest.
+    These three (K,) change in place, as does their number of hits, `state[COUNT]`. Hits at nearly the same depth are
+    tested in float64 first, unless they are `exact` or `sure` already; earlier ones that fail are removed. Returns
+    False if the hit fails, is there already, or is not among the nearest.
     """
     slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
     while i < count:
@@ -325,8 +326,9 @@ def _pixels(tile, across, width, height, cells, at, columns, lines):
 def _aim(space, sphere, planes, x, y, ray, state):
     """Write the ray through an NDC position to `ray`, its depth at the start to `state`; False if there is none.
 
-    The ray is the part within the object's sphere and between `planes`. From such a start, and in units of the object,
-    float32 is fine enough however far off the camera or the origin.
+    `space`, `sphere` and `planes` are `ray_space`, `object_sphere` and `planes` of `cast`. The ray is the part within
+    the object's sphere and between `planes`. From such a start, and in units of the object, float32 is fine enough
+    however far off the camera or the origin.
     """
     # See Camera.rays: the camera-space point at depth z is (start + z step, −z). Rows 0–3 are the projection, 4–6
     # those of the inverse view. (No slices here: each would cost an atomic count of references.)

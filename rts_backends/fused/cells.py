@@ -98,19 +98,19 @@ class Cells:
         settings: the splatter, as numbers.
         positions: (N, 3) float32 or float64, pixel position and linear depth.
         rgba: (N, 4), of the same dtype, premultiplied colours.
-        row: (K, H, W) signed integers, the sample of each cell, or −1.
-        choices: choices made earlier for the same samples, if any.
+        row: (K, H, W) signed integers, the sample of each cell, or −1; kind "single" reads layer 0 alone.
+        choices: choices made earlier for the same samples; None to make them on first use.
         part: (K, H, W) integers, the part of each sample; None, or no layers, if unknown, or if all belong to one.
-        facing: (K, H, W) integers, the number of each sample's piece, its sign the side it shows; None, or no layers,
-            if unknown.
+        facing: (K, H, W) integers, `Cells.facing` of the records: which piece of surface a sample is on, and by its
+            sign, which side it shows; None, or no layers, if unknown.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
         settled: (H, W) integers, the sample whose colour a target shows, whatever moves, or −1; None, or no rows, for
             no such targets.
         exits: (E, H, W) integers, `Cells.exit` of the records; None, or no entries, if unknown.
 
     Raises:
-        InputError: positions and rgba do not fit; or, unless `choices` are given, other shapes do not fit, or `row`,
-            `settled` or `exits` refer to a sample that is not there.
+        InputError: positions and rgba do not fit; or, unless `choices` are given, other shapes do not fit, `settled`
+            holds no signed integers, or `row`, `settled` or `exits` refer to a sample that is not there.
     """
 
     def __init__(
@@ -382,7 +382,7 @@ class Cells:
             g_rgba[shown] += sums.sum(axis=0)
 
     def _pull(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
-        """`vjp` of the targets that are not settled: adds to the gradients."""
+        """`vjp` of the targets that are not settled; gradients hold zeros before, and plain targets overwrite them."""
         height = self.row.shape[1]
         if self.choices.repeated:
             self._vjp_of_repeated(g, g_positions, g_rgba)
@@ -466,7 +466,10 @@ class Cells:
             self._paint(tangents[1], out)
 
     def _push_lines(self, tangents: tuple[np.ndarray, ...], out: np.ndarray) -> None:
-        """Replace, in `out`, the tangents of targets beside lines of crossing."""
+        """Replace, in `out` (T, H, W, 4), the tangents of targets beside lines of crossing.
+
+        `tangents` are those of positions (T, N, 3) and rgba (T, N, 4), without samples (N = 0) for zeros.
+        """
         t_positions, t_rgba = tangents
         tints, choices, height = None, self.choices, out.shape[1]
         if choices.stacks is not None:
@@ -483,7 +486,10 @@ class Cells:
             out[:, rows[inside], columns[inside]] += tints[:, rows[inside], columns[inside]]
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
-        """`_pull` with a copy of the sample for each cell, whose gradients are then added to `results` in order."""
+        """`_pull` where cells share samples: with a copy of the sample for each cell, whose gradients are then summed.
+
+        `results` are the gradients of positions (N, 3) and rgba (N, 4), added to in order of cells; None if not wanted.
+        """
         covered, leaves = self.row >= 0, self.exits >= 0
         index = np.concatenate([self.row[covered], self.exits[leaves]])
         own, exits = np.full(self.row.shape, -1, np.int32), np.full(self.exits.shape, -1, np.int32)
@@ -519,7 +525,10 @@ def _scale_and_peak(settings: Settings) -> tuple[float, float]:
 
 @lru_cache
 def _reach(settings: Settings) -> float:
-    """The largest offset of samples, pixels along x and y, at which weights are sure to sum up to one; −1 if never."""
+    """The largest offset of samples, pixels along x and y, at which a target's nine weights are sure to sum up to one.
+
+    −1 if ε is too small for that.
+    """
     if settings.epsilon < Visible.LEAST_EPSILON:
         return -1.0
     scale, low, high = 1 / (2 * settings.sigma**2), 0.0, 1.0

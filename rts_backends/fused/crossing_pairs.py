@@ -27,7 +27,15 @@ ROWS = 32
 
 
 class Rules(NamedTuple):
-    """Limits of `rts.splatting.crossings`, in the dtype of the depths."""
+    """Limits of `rts.splatting.crossings`, in the dtype of the depths.
+
+    Attributes:
+        least: the least sum of the gaps of a pair.
+        largest: its LARGEST.
+        direct: its DIRECT.
+        fit: its FIT.
+        slack: allowance for rounding, a depth.
+    """
 
     least: float
     largest: float
@@ -44,9 +52,10 @@ class Rules(NamedTuple):
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
-    """Mark in `kept` (K, H, W) the samples that `rts.splatting.crossings.sheets` keeps; other marks stay.
+    """Mark in `kept` (K, H, W) bool the samples that `rts.splatting.crossings.sheets` keeps; other marks stay.
 
-    `extent` is the largest less the least depth of the fronts, the camera's 0 included.
+    `covered` (K, H, W) bool and `depth` (K, H, W) have two layers at least. `extent` is the largest less the least
+    depth of the fronts, the camera's 0 included.
     """
     _, height, width = covered.shape
     bits, some = _no_pairs(height, width)
@@ -61,10 +70,10 @@ def _no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> tuple[np.ndarray, np.ndarray]:
-    """Bits (H, W) uint8 of the steps from each cell to the other of a pair, and marks (H,) of rows that have some.
+    """Bits (H, W) uint8 of pairs, each at its first cell, and marks (H,) of rows that have some.
 
-    A pair is two neighbouring cells between which a line of crossing runs. Both arrays have no rows if there are no
-    pairs.
+    A pair is two neighbouring cells between which a line of crossing runs. Bit i at a cell: it forms one with the cell
+    `STEPS[i]` farther on. Both arrays have no rows if there are no pairs.
 
     Args:
         positions: (N, 3).
@@ -156,7 +165,10 @@ def _window(width, kind):
 
 @compiled
 def _load_cells(z, gap, positions, row, y):
-    """Fill depths z (2, W) and gaps of row y at its cells of two layers; return True if there are any. Others stay."""
+    """Fill depths z (2, W) and gaps (W + 2 BORDER) of row y at its cells of two layers; return True if there are any.
+
+    Other entries stay as they are; the gap of column x is at x + BORDER.
+    """
     width, some = row.shape[2], False
     for left in range(0, width, CHUNK):
         right = min(left + CHUNK, width)
@@ -254,7 +266,9 @@ def _largest(most, before, here, after):
 
 @compiled
 def _suspect(marks, gap, above, level, below):
-    """Mark cells of two layers that have a much larger gap beside them.
+    """Fill `marks` (W,): 1 at cells of two layers that have a much larger gap beside them, 0 at others.
+
+    `gap` has the cells' own gaps; `above`, `level` and `below` (W,) are rows of `_largest`.
 
     At least one of the two cells of each pair is marked, whatever rounding does: with gaps h and t, and b and a beyond
     them, R is at least |b − 2 h − t| + |a − 2 t − h|, or twice one of these, and less than half of h + t.
@@ -300,7 +314,10 @@ def has_two(gap, y, x):
 
 @compiled
 def _ratio(z, gap, rules, y, x, v, u):
-    """R / (h(q) + h(p)) of a cell q and the cell p a step (u, v) farther on; infinity where they are no pair."""
+    """R / (h(q) + h(p)) of cell q = (y, x) and the cell p a step (u, v) farther on, see `rts.splatting.crossings`.
+
+    Infinity where R is unknown, the gaps are too small, or R is not below its share of D.
+    """
     two = gap.dtype.type(2)
     total, before, after, change0, change1, direct0, direct1 = _step(z, gap, y, x, v, u)
     change = change0 + change1 if before and after else two * min(change0, change1)
@@ -311,7 +328,10 @@ def _ratio(z, gap, rules, y, x, v, u):
 
 @compiled
 def _may_cross(z, gap, rules, y, x, v, u):
-    """True if two cells may form a pair, whichever of the cells beyond them have two layers."""
+    """True if cell (y, x) and the one a step (u, v) farther on may form a pair.
+
+    So it may be whichever of the cells beyond the two have two layers in the end.
+    """
     two = gap.dtype.type(2)
     total, before, after, change0, change1, direct0, direct1 = _step(z, gap, y, x, v, u)
     if not total > rules.least - rules.slack:

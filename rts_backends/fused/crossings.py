@@ -69,6 +69,7 @@ def nothing(height: int, kind: np.dtype) -> Crossings:
 
 
 def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
+    """Lists for `offsets[-1]` targets, not yet filled; floats have the dtype `kind`."""
     count = offsets[-1]
     shapes = (count, 9, 3), (count, 2, 4), (count, 5)
     arrays = (np.empty(shape, kind) for shape in shapes)
@@ -116,8 +117,9 @@ def _still(start, stop, firsts, crossed, offsets, columns, changes):
 def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, z, gap, rules, around, counts):
     """Find targets beside lines in rows [start, stop).
 
-    Fills `around`, bits 3 (v + 1) + (u + 1) of the steps (u, v) from a target to its partners, and `counts`, the number
-    of targets in each row. A target amid one colour is left out: its derivative is already that of a line.
+    Fills `around` (H, W), zeros before, with bits 3 (v + 1) + (u + 1) of the steps (u, v) from a target to its
+    partners. Adds to `counts` (H,), zeros before, the number of targets in each row. Left out are targets whose sources
+    cannot all be sorted into two sheets, and those amid one colour, whose derivative is already that of a line.
     """
     height, width = bits.shape
     sheets, slopes = np.empty(9, np.uint8), np.empty(4, z.dtype)
@@ -137,7 +139,7 @@ def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, 
 
 @compiled
 def _place(columns, m, mixed, y, x):
-    """The index of a mixed target in the list of mixed targets, searched from m on; m itself if it is not mixed."""
+    """The index of target (y, x) in the list of mixed targets, searched from m on, in its row; m if it is not mixed."""
     while mixed[y, x] and columns[m] < x:
         m += 1
     return m
@@ -158,7 +160,7 @@ def _fill(
     around,
     result,
 ):
-    """Fill the lists of `result` for targets of rows [start, stop)."""
+    """Fill the lists of `result`, whose `offsets` are known, for the targets of rows [start, stop) found by `_list`."""
     row = grid.row
     slopes = np.empty(4, grid.positions.dtype)
     for y in range(start, stop):
@@ -174,7 +176,10 @@ def _fill(
 
 @compiled
 def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
-    """Sort the sources of a target into `sheets` (9,), and fill the sheets' `slopes` (4,); True if both succeed."""
+    """Sort the sources of target (y, x) into `sheets` (9,), and fill the sheets' `slopes` (4,); True if both succeed.
+
+    `around` are the bits of its partners, see `_list`; `m` is its index in the list of mixed targets, if it is mixed.
+    """
     _sort(sheets, row, mixed[y, x], ranges, m, around, y, x)
     at = y + BORDER, x
     return _incline(slopes, sheets, z, gap, *at) and _complete(sheets, slopes, z, gap, rules.fit, *at)
@@ -223,7 +228,7 @@ def _incline(slopes, sheets, z, gap, y, x):
 def _complete(sheets, slopes, z, gap, fit, y, x):
     """Sort sources left in neither sheet, if they have two layers, by the sheets' planes through the target.
 
-    Returns True if all get sorted.
+    Returns True if all get sorted; False also if the planes are parallel.
     """
     kind = slopes.dtype.type
     gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
@@ -286,7 +291,10 @@ def _weigh(d, result, slopes, grid, y, x):
 
 @compiled
 def rate(slopes, t_positions, i, j):
-    """ġ, the rate of sheet a's depth less sheet b's at a target, along a tangent of its samples i and j."""
+    """ġ, the rate of sheet a's depth less sheet b's at a target, along a tangent (N, 3) of positions.
+
+    `slopes` (5,) are `Crossings.slopes` of the target; i and j are the samples of its first two layers.
+    """
     a = t_positions[i, 2] - slopes[1] * t_positions[i, 0] - slopes[2] * t_positions[i, 1]
     return a - (t_positions[j, 2] - slopes[3] * t_positions[j, 0] - slopes[4] * t_positions[j, 1])
 
@@ -325,9 +333,9 @@ def push(start, stop, grid, ranges, sums, lines, t_positions, t_rgba, border, ou
 
 @loop
 def pull(rgba, row, lines, border, g, g_positions, g_rgba):
-    """Add listed targets' shares to the gradients of positions (N, 3) and rgba (N, 4), from the image's `g` (H, W, 4).
+    """Add to the gradients of positions (N, 3) and rgba (N, 4), from the image's `g` (H, W, 4) at listed targets.
 
-    A gradient of no rows is not wanted. Mixed targets add nothing to the gradient of rgba here.
+    `lines` are the `Crossings`. A gradient of no rows is not wanted. Mixed targets add nothing to that of rgba here.
     """
     zero = g.dtype.type(0)
     for y in range(border, len(g) + border):

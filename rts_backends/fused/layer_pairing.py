@@ -97,9 +97,21 @@ def choose(
 ):
     """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`.
 
-    `choices` are the ranges. Marks go by depths alone; with `facing` (K, H, W), which may have no layers, more fronts
-    may pair. States of listed targets become EMPTY. The directions in which fronts end before others are added to
-    `ends` (H, W) of `survey`, which may have no rows.
+    Args:
+        start: first row.
+        stop: end of the rows.
+        grid: the samples.
+        facing: (K, H, W), `Cells.facing`, or no layers. Marks go by depths alone; with it more fronts may pair.
+        visible: True for the splatter `Visible`, False for `Multi`.
+        continued: `Visible.CONTINUED`.
+        beyond: see `find`.
+        mixed: (H, W), the marks of mixed targets.
+        offsets: (H + 1,), where the targets of each row begin in the lists.
+        columns: (M,), to be filled.
+        choices: (M, 9, 3, 2), the ranges, to be filled.
+        sums: (M, 3, 5), to be filled.
+        states: (H, W); those of listed targets become EMPTY.
+        ends: (H, W) of `survey`, or no rows: directions in which fronts end before other surfaces are added.
     """
     positions, row = grid.positions, grid.row
     layers, height, width = row.shape
@@ -159,8 +171,9 @@ def _sides(sides, facing, y, x):
 
 @compiled
 def _pairing(z, n, target, sides):
-    """The number s of `rts.splatting.Visible` before `continues`, and the distance of the depths that it pairs.
+    """The number s of source n by depths and sides alone, and the distance of the depths that it pairs.
 
+    For s ≥ 0, layer s of the source pairs with the target's front; for s < 0, its front with the target's layer −s.
     `z` (K, 9) are depths of all sources, `target` (K,) of the target; `sides` (K, 9) those of all sources' layers, 0 if
     unknown, and everywhere in `Multi`.
     """
@@ -208,7 +221,8 @@ def _continues(positions, row, y, x, n, fronts, limit):
 def _choose_visible(choice, shift, z, row, y, x, target):
     """Fill the ranges `choice` (9, 3, 2), zeros before, that `rts.splatting.Visible` gives a target.
 
-    `shift` (9,) are the numbers s of its sources, 0 for an empty target.
+    `shift` (9,) are the numbers s of its sources, see `_pairing`; 0 for an empty target. `z` (K, 9) are depths of the
+    sources, `target` (K,) those of the target (y, x).
     """
     layers, height, width = row.shape
     m = layers

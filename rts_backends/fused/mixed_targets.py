@@ -171,7 +171,10 @@ def composited(total, change, c):
 
 @compiled
 def tint_of(pixel, total, grid, y, x, choice, t_rgba):
-    """Add to a pixel (4,) the change of target (y, x) along a tangent (N, 4) of colours."""
+    """Add to a pixel (4,) the change of target (y, x) along a tangent (N, 4) of colours.
+
+    `total` (3, 5) are its sums, `choice` (9, 3, 2) its ranges, see `sums_of`.
+    """
     # Weights do not change with colours: tangents are summed as colours are.
     change = np.empty((3, 5), total.dtype)
     tinted = Grid(grid.positions, t_rgba, grid.row, grid.scale, grid.peak, grid.gamma)

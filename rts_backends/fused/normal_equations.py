@@ -136,8 +136,24 @@ def _accumulate(
 ):
     """Add to `sums` (B, T + 1, T + 1), zeros, for bands [start, stop): products of T tangents and, last, the residuals.
 
-    Only lower triangles are filled; their last number is the sum of losses. Each pixel is the mean of `fine` rows and
-    columns of cells.
+    Only lower triangles are filled; their last number is the sum of losses.
+
+    Args:
+        start: first band, of BAND rows of pixels.
+        stop: end of the bands.
+        planes: COLORS, or ALPHA for a target of alpha alone.
+        plain: `Cells.plain_grid`.
+        grid: `Cells.grid`; the next four are attributes of `Cells`, too.
+        choices: the mixed targets.
+        outlines: the motions of outlines.
+        crossings: the targets beside lines of crossing.
+        settled: (H, W), or no rows.
+        tangents: of positions (T, N, 3), and of rgba (T, N, 4) or, for zeros, (T, 0, 4).
+        fields: target, weights and background of `normal_equations`; an absent one has no rows.
+        loss: see `in_numbers`.
+        border: the border of the cells.
+        fine: cells a pixel along each axis; a pixel is their mean.
+        sums: to be added to.
     """
     positions, rgba, row = grid.positions, grid.rgba, grid.row
     t_positions, t_rgba = tangents
@@ -197,7 +213,10 @@ def _accumulate(
 
 @compiled
 def _change(change, value, sources, moving, layers, y, count, planes):
-    """Fill `value` and `change`, a row of a tile of the image and its tangents (T, ·), by the stencil."""
+    """Fill `value` and `change`, a row of a tile of the image and its tangents (T, ·), by the stencil.
+
+    `sources` and `moving` (T, ·) are slots that `load_tangents` has filled around row y of the cells.
+    """
     normalised_sums(value, sources, layers, y, count)
     for n in range(len(change)):
         change_row(change[n], moving[n], sources, value, layers, y, count, planes)
@@ -218,7 +237,10 @@ def _add_means(to, row, fine, count):
 
 @compiled
 def _mix(change, value, grid, choices, tangents, border, y, left, count, changes):
-    """Replace the stencil's `value` and `change` at the mixed targets of a row of a tile."""
+    """Replace the stencil's `value` and `change` at the mixed targets of a row of a tile.
+
+    `y` and `left`, the row and its first column, do not count the border. `changes` (T, 3, 5) is working memory.
+    """
     offsets, columns = choices.offsets, choices.columns
     one = value.dtype.type(1)
     for d in range(offsets[y + border], offsets[y + border + 1]):
@@ -298,7 +320,10 @@ def _settle(change, value, rgba, t_rgba, settled, moving):
 
 @compiled
 def _multiply(sums, products, change, value, fields, loss, y, left, count, changing):
-    """Add the products of a row of a tile to `sums`; unless `changing`, those of the residuals alone."""
+    """Add the products of a row of a tile, `count` pixels, to `sums` (T + 1, T + 1).
+
+    Unless `changing`, `change` counts as zeros. `products` (T + 2, ·) is working memory.
+    """
     target, weights, background = fields
     channels, many = target.shape[2], len(change)
     first, one = 3 if channels == 1 else 0, value.dtype.type(1)

@@ -34,7 +34,7 @@ NEAR = 1e-3
 
 
 class Rules(NamedTuple):
-    """Limits of `rts.splatting.rims`, in the dtype of the positions."""
+    """Limits of `rts.splatting.rims`, in the dtype of the positions: its LEAST, LARGEST, FLAT, CONVERGING and HALF."""
 
     least: float
     largest: float
@@ -47,7 +47,8 @@ class Outlines(NamedTuple):
     """Motions of outlines, and the targets that they cover in part.
 
     Attributes:
-        beta: (H, W), β at the targets below that are covered: v̂ = v + β (v − the motion of the partner's sample).
+        beta: (H, W), β at covered targets of the lists below, and at those marked `BESIDE`; not filled elsewhere. The
+            outline moves by v̂ = v + β (v − the motion of the partner's sample).
         partner: (H, W) int32, the partner's sample, an index of positions, where β is not 0.
         second: (1, H, W) int32, where β is −1 a second partner: the mean of both motions counts; or no entries.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
@@ -135,7 +136,10 @@ def _beside(ends, wanted, y, x):
 
 @compiled
 def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
-    """β and the partner's sample (see `Outlines`) of a cell whose front ends in some direction; (0, −1) for no rule."""
+    """β and the partner's sample (see `Outlines`) of a covered cell (y, x) whose front ends in some direction.
+
+    (0, −1) if no rule holds; β is −1 if `exits` name two samples. For the arguments see `fill`.
+    """
     layers, height, width = row.shape
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
     bits, front = ends[y, x] & DIRECTIONS, positions[row[0, y, x], 2]
@@ -270,7 +274,10 @@ def _any(ends):
 
 @compiled
 def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
-    """Fill `slopes`, of the weights of the fronts around target d, and `gives` as if the target were not mixed.
+    """Fill `gives` of target d, as if it were not mixed, and `slopes` of the weights of the fronts around it.
+
+    `slopes` of sources without a front stay as they are. `around` (9, 3) are u, v and the weight of sources whose
+    samples lie on their cells' centres; `which` and `samples` (9,) are working memory.
 
     Returns the sums of the fronts' weighted colours (four numbers), and of their weights.
     """
@@ -304,9 +311,9 @@ def _weigh(gives, slopes, d, grid, y, x, around, which, samples):
 
 @compiled
 def _change(gives, changes, d, total):
-    """Fill the derivative of target d's colour with its coverage, to which all fronts around it add.
+    """Fill `changes` (2, 4) of target d, which is not mixed: all fronts around it add to one coverage, at the surface.
 
-    A target that is not covered in part has zeros, and `gives` becomes NOTHING.
+    `total` are the sums of `_weigh`. A target that is not covered in part gets zeros, and its `gives` become NOTHING.
     """
     zero, one = changes.dtype.type(0), changes.dtype.type(1)
     partial = zero < total[4] < one
@@ -325,9 +332,10 @@ def _clear(gives, d):
 
 @compiled
 def _change_mixed(changes, d, sums, m):
-    """Fill the derivatives of a mixed target's colour with its buffers' coverage.
+    """Fill `changes` (2, 4) of target d, the m-th mixed one: derivatives of its colour with its buffers' coverage.
 
-    Returns two marks: True if the buffer in front, and the one at the surface, cover the target in part.
+    They are zeros for a buffer that does not cover it in part. Returns two marks: True if the buffer in front, and the
+    one at the surface, cover the target in part.
     """
     zero, one = sums.dtype.type(0), sums.dtype.type(1)
     front, surface = zero < sums[m, 0, 4] < one, zero < sums[m, 1, 4] < one
@@ -342,9 +350,10 @@ def _change_mixed(changes, d, sums, m):
 
 @compiled(inline="always")
 def _list(gives, d, ranges, m, front, surface):
-    """Fill `gives` of a mixed target, whose buffers cover it in part as `front` and `surface` say.
+    """Correct `gives` of target d, the m-th mixed one, whose buffers cover it in part as `front` and `surface` say.
 
-    Before, `gives` is NOTHING for sources without a front, and only for these.
+    Before, `gives` is as `_weigh` fills it: NOTHING only for sources without a front. Sources whose front is in the
+    buffer in front become FRONT, if that covers in part. Those whose front changes no such coverage become NOTHING.
     """
     for n in range(9):
         if gives[d, n] != NOTHING:
@@ -356,9 +365,9 @@ def _list(gives, d, ranges, m, front, surface):
 
 @compiled
 def _part(gives, d, part, ends, y, x):
-    """Have sources of other parts than the target's move as their own outlines: a gap may lie between.
+    """Have JOINED sources of other parts than the target's move as their own outlines: a gap may lie between.
 
-    Sources without an outline give NOTHING.
+    In `gives` they become SURFACE, or NOTHING without an outline of their own.
     """
     n = 0
     for v in range(-1, 2):

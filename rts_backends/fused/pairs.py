@@ -71,9 +71,10 @@ def _load(z, positions, row, y, first, last, beyond):
 
 @compiled
 def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front, target_hidden):
-    """Mark targets of which a hidden layer, or one of a source, pairs nearer than the two fronts.
+    """Add marks to targets where a hidden layer fits better than the fronts, for some source.
 
-    Rows of sources begin one cell left of the targets'.
+    That is: the hidden layer of target or source is nearer to the other's front than the two fronts are to each other.
+    Fronts and hidden layers are depths of sources in three rows, which begin one cell left of the targets'.
     """
     for x in range(len(marks)):
         t, q = target_front[x], target_hidden[x]

@@ -73,6 +73,18 @@ def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued,
     """Fill `kept` in rows [start, stop): True for fronts, and for hidden layers around marks.
 
     Around marks MIXED all hidden layers are kept, around RING alone the second layer.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        covered: (K, H, W) bool.
+        depth: (K, H, W), read where covered.
+        visible: True for the splatter `Visible`, False for `Multi`.
+        rims: True to set marks RING, too.
+        beyond: a depth that stands for layers that are not covered.
+        margin: difference of depths that rounding may cause.
+        continued: `Visible.CONTINUED`.
+        kept: (K, H, W) bool, to be filled.
     """
     layers, height, width = covered.shape
     # From row start − HALO on: depths with a border, NaN where there is nothing; least and largest front, least hidden.
@@ -130,7 +142,10 @@ def _bound(least, largest, hidden, front, second):
 
 @compiled
 def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
-    """Mark the targets of row r whose colour may depend on hidden layers, with MIXED; others get 0."""
+    """Fill `marks`: 1, that is MIXED, at targets of row r whose colour may depend on hidden layers; 0 at others.
+
+    `z` (K, ·, W + 2) are depths and `bounds` (·, 3, W) the arrays of `_bound`, in a window of rows.
+    """
     width = z.shape[2] - 2
     above, level, below = bounds[r - 1], bounds[r], bounds[r + 1]
     least, largest = (above[0], level[0], below[0]), (above[1], level[1], below[1])
@@ -154,9 +169,9 @@ def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
 
 @compiled
 def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2, hidden0, hidden1, hidden2, margin):
-    """Mark covered targets, unless all hidden layers around lie farther behind the fronts than the fronts lie apart.
+    """Fill `marks`: 0 at empty targets, and where hidden layers lie farther behind fronts than these lie apart; else 1.
 
-    Few targets are marked.
+    Few targets are marked. The depths of `_bound` are those of the rows above (0), at (1) and below (2) the targets'.
     """
     for x in range(len(least0)):
         a, b, c = least0[x], least1[x], least2[x]

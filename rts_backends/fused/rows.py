@@ -97,7 +97,7 @@ class Grid(NamedTuple):
 
 @compiled
 def slot(s, k, y, size):
-    """The slot, a view of `size` numbers of s, of layer k in row y ≥ −2."""
+    """A view of the `size` numbers of `s` that hold row y ≥ −2 of layer k; rows y and y + 3 share a slot."""
     start = (3 * k + (y + 3) % 3) * size
     return s[start : start + size]
 
@@ -123,7 +123,11 @@ def busy(states, y, first, count, least):
 
 @compiled
 def load(s, grid, k, y, first, count):
-    """Fill a source's slot `s` with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
+    """Fill a source's slot `s` with cells first, …, first + count − 1 of row y of layer k.
+
+    Cells outside of the grid are empty. Empty cells get zeros for colour and ONE, but weights like any other, unless
+    the whole row is empty.
+    """
     positions, rgba, row, scale, peak, gamma = grid
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     _, height, width = row.shape
@@ -165,7 +169,10 @@ def add_row(to, s, v, count):
 
 @compiled
 def normalised_sums(total, sources, layers, y, count):
-    """Fill `total` with both buffers of target row y: colours over the weight, taken as at least one; the weight."""
+    """Fill `total` with the sums of target row y: colours over the weight, taken as at least one; and the weight.
+
+    There is one buffer for one layer, else two. `sources` hold rows y − 1 to y + 1 of all layers.
+    """
     one = total.dtype.type(1)
     total[: min(layers, 2) * SUM] = total.dtype.type(0)
     for k in range(layers):
@@ -181,7 +188,10 @@ def normalised_sums(total, sources, layers, y, count):
 
 @compiled
 def composite(total, layers, count):
-    """Composite the surface over the buffer behind, in `total`, in place of the surface's colours."""
+    """Composite the surface over the buffer behind, in `total`, in place of the surface's colours.
+
+    With a single layer `total` stays as it is.
+    """
     one = total.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -192,7 +202,10 @@ def composite(total, layers, count):
 
 @compiled
 def fill(s, rgba, cells, states, left, count):
-    """Fill planes `s` of a row without busy targets: the colours of FLAT targets, and zeros at others."""
+    """Fill four planes `s` of a row without BUSY targets: the colours of FLAT targets, and zeros at others.
+
+    `cells` and `states` are rows of the grid: the front's sample, and the state, of `count` targets from `left` on.
+    """
     for j in range(count):
         for c in range(4):
             s[c * PITCH + j] = rgba[cells[left + j], c] if states[left + j] == FLAT else s.dtype.type(0)

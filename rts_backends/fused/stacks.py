@@ -18,7 +18,7 @@ from rts_backends.fused.mixed_targets import splat
 
 
 class Stacks(NamedTuple):
-    """Plans and sums of M targets with up to K levels.
+    """Plans and sums of M targets with up to K levels; entries behind a target's last level are not filled.
 
     Attributes:
         levels: (M,) int32, the number of levels of each target.
@@ -26,7 +26,7 @@ class Stacks(NamedTuple):
         ends: (M, K, 9) int16, for each source the layer behind those that it gives to the buffer in front.
         least: (M, K), the least weight that fills a buffer.
         sums: (M, K, 3, 5), of each buffer the colours over the weight, taken as at least `least`, and the weight.
-        images: (M, K + 1, 4), the image from each level on; zero behind the last.
+        images: (M, K + 1, 4), the image from each level on; zeros at the place behind the last level.
         straight: (H, W) uint8, the number of layers of further targets, which need no plan (`straight_stacks.py`); 0 at
             others.
     """
@@ -41,7 +41,7 @@ class Stacks(NamedTuple):
 
     @classmethod
     def of(cls, count: int, layers: int, kind: np.dtype, straight: np.ndarray) -> Stacks:
-        """Memory, not yet filled, for `count` targets with plans."""
+        """Memory, not yet filled, for `count` targets with plans of up to `layers` levels, floats of dtype `kind`."""
         return cls(
             np.zeros(count, np.int32),
             np.empty((count, layers, 9, 3), np.int16),
@@ -60,7 +60,11 @@ y), its depth. SOURCE is how many there are."""
 
 @compiled
 def _load(sources, n, grid, y, x, u, v, beyond):
-    """Fill the layers (K, 8) of source n, from which (u, v) leads to target (y, x); return how many are covered."""
+    """Fill entry n of `sources` (·, K, 8), the layers of the source from which (u, v) leads to target (y, x).
+
+    Layers that are not covered get zeros and the depth `beyond`, as do all outside of the grid. Returns one more than
+    the last covered layer; 0 if there is none.
+    """
     positions, rgba, row = grid.positions, grid.rgba, grid.row
     layers, height, width = row.shape
     py, px, count = y - v, x - u, 0
@@ -101,7 +105,7 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
         offsets: (H + 1,), where the targets of each row begin.
         columns: (M,), their columns.
         ranges: (M, 9, 3, 2) of `layer_pairing.choose`, for the first level.
-        stacks: to be filled.
+        stacks: to be filled, but for `straight`.
     """
     row, kind = grid.row, grid.positions.dtype.type
     layers = len(row)
@@ -140,7 +144,12 @@ def fill(start, stop, grid, facing, beyond, offsets, columns, ranges, stacks):
 def _share(t, counts, first, joins, nominal):
     """The share of the weights of sources that take part in level t; −1 if none of these has a layer left.
 
-    `nominal` (9,) are the shares of sources whose samples lie on their cells' centres.
+    Args:
+        t: the level.
+        counts: (9,), the number of layers of each source.
+        first: (9,), the first layer that each source has not yet given.
+        joins: (9,), the least level that each source takes part in from now on.
+        nominal: (9,), the shares of sources whose samples lie on their cells' centres.
     """
     share, some = nominal.dtype.type(0), False
     for n in range(9):
@@ -152,7 +161,11 @@ def _share(t, counts, first, joins, nominal):
 
 @compiled
 def _shift(shift, t, d, ranges, sources, sides, told, counts, first, joins):
-    """Fill `shift` (9,) with the number s of each source that takes part in level t; see `_pair`. Others stay."""
+    """Fill `shift` (9,) with the number s of `_pair`, for each source that takes part in level t and has layers left.
+
+    Other entries stay as they are. `ranges` (M, 9, 3, 2) decide for target d at level 0, where they pair; for the rest
+    see `_share` and `_pair`.
+    """
     for n in range(9):
         if joins[n] > t or first[n] >= counts[n]:
             continue
@@ -164,7 +177,7 @@ def _shift(shift, t, d, ranges, sources, sides, told, counts, first, joins):
 
 @compiled
 def _load_sides(sides, facing, counts, y, x):
-    """Fill `sides` (9, K) with the sides that the layers of the nine sources of a target show."""
+    """Fill `sides` (9, K) with the entries of `facing` (K, H, W) of a target's nine sources, up to `counts` (9,)."""
     for n in range(9):
         for k in range(counts[n]):
             sides[n, k] = facing[k, y - n // 3 + 1, x - n % 3 + 1]
@@ -174,7 +187,17 @@ def _load_sides(sides, facing, counts, y, x):
 def _pair(sources, sides, told, counts, n, t, first, behind_only):
     """The number s of source n at level t: s ≥ 0 if its layer `first` + s pairs with the target's layer t.
 
-    For s < 0 its layer `first` pairs with the target's layer t − s. It is at most 0 if `behind_only`.
+    For s < 0 its layer `first` pairs with the target's layer t − s. s is 0 if the target has no layer t.
+
+    Args:
+        sources: (9, K, 8), see `WEIGHT`; source 4 is the target itself.
+        sides: (9, K), `Cells.facing` of these layers.
+        told: True if `sides` are known; then opposite sides of a piece of surface do not pair.
+        counts: (9,), the number of layers of each source.
+        n: the source.
+        t: the level.
+        first: the first layer that the source has not yet given.
+        behind_only: True to have no s above 0.
     """
     layers = sources.shape[1]
     if t >= counts[4]:
@@ -195,7 +218,11 @@ def _pair(sources, sides, told, counts, n, t, first, behind_only):
 
 @compiled
 def _plan(stacks, d, t, sources, counts, first, joins, shift):
-    """Fill the plan of level t of target d: `plans` and `ends` of all nine sources."""
+    """Fill the plan of level t of target d: `plans` and `ends` of all nine sources.
+
+    Sources that take no part, or have no layer left, give nothing. `shift` (9,) are the numbers of `_shift`; for the
+    rest see `_share`.
+    """
     plans, ends, layers = stacks.plans, stacks.ends, sources.shape[1]
     least = layers
     for n in range(9):
@@ -226,7 +253,10 @@ def _plan(stacks, d, t, sources, counts, first, joins, shift):
 
 @compiled
 def _advance(t, layers, counts, first, joins, shift):
-    """Update, behind level t, the `first` layer that each source has left, and the level at which it `joins` again."""
+    """Update, behind level t, the `first` layer (9,) that each source has left, and the level (9,) at which it `joins`.
+
+    A source with no layer left, or with no partner at level t, `joins` at `layers`, that is, never again.
+    """
     for n in range(9):
         if joins[n] > t:
             continue
@@ -252,7 +282,10 @@ def _last(plans, ends, d, t, n, b, whole):
 
 @compiled
 def _sum(stacks, d, t, sources, counts, whole):
-    """Fill the sums (3, 5) of level t of target d. If `whole`, at level K − 1, chains go on behind the level."""
+    """Fill `stacks.sums` (3, 5) of level t of target d, from its plan and from `sources` (9, K, 8) with `counts` (9,).
+
+    If `whole`, at level K − 1, chains at the level itself go on with all layers behind it.
+    """
     plans, ends, total = stacks.plans, stacks.ends, stacks.sums
     zero, one = total.dtype.type(0), total.dtype.type(1)
     for b in range(3):
@@ -273,7 +306,7 @@ def _sum(stacks, d, t, sources, counts, whole):
 
 @compiled
 def _composite(stacks, d, levels):
-    """Fill the images of target d from each of its levels on, the last first."""
+    """Fill `stacks.images` of target d, the images from each of its `levels` levels on, the last first."""
     sums, images = stacks.sums, stacks.images
     one = sums.dtype.type(1)
     for c in range(4):
@@ -286,7 +319,10 @@ def _composite(stacks, d, levels):
 
 @compiled
 def _under(sums, images, coverage, d, t, c):
-    """A channel of the image of level t without the buffer in front."""
+    """Channel c of the image of level t of target d, without the buffer in front.
+
+    `coverage` is the weight at the level over `Stacks.least`, at most 1.
+    """
     one = sums.dtype.type(1)
     through = (coverage - sums[d, t, 1, 3]) * images[d, t + 1, c]
     return sums[d, t, 1, c] + through + (one - coverage) * sums[d, t, 2, c]
@@ -324,7 +360,10 @@ def recolor(start, stop, own, listed, offsets, columns, stacks, changes):
 
 @loop
 def forward(start, stop, offsets, columns, images, border, image):
-    """Fill targets with plans in rows [start, stop) of the image (H, W, 4)."""
+    """Fill targets with plans in rows [start, stop) of the image (H, W, 4), which lacks the border of the cells.
+
+    `offsets` and `columns` list these targets by row of cells; `images` are those of `Stacks`.
+    """
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d] - border
@@ -335,7 +374,10 @@ def forward(start, stop, offsets, columns, images, border, image):
 
 @loop
 def adjoint(start, stop, offsets, columns, stacks, border, g, adjoints):
-    """Fill `adjoints` (M, K, 3, 5), gradients of the sums before normalisation, from the image's `g` (H, W, 4)."""
+    """Fill `adjoints` (M, K, 3, 5), gradients of the sums before normalisation, from the image's `g` (H, W, 4).
+
+    They are zero for targets in the border, and not filled behind a target's last level.
+    """
     levels, sums, images, least = stacks.levels, stacks.sums, stacks.images, stacks.least
     zero, own, below = g.dtype.type(0), np.empty(4, g.dtype), np.empty(4, g.dtype)
     for y in range(start, stop):
@@ -379,9 +421,9 @@ def _adjoint_level(a, d, t, sums, images, least, own, below):
 
 @loop
 def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_rgba):
-    """Add targets' shares to the gradients of the samples of source rows [start, stop), from `adjoints`.
+    """Add to the gradients of the samples of source rows [start, stop), from `adjoints` of targets with plans.
 
-    A gradient of no rows is not wanted.
+    `g_positions` (N, 3) gets x and y, `g_rgba` (N, 4) colours; one of no rows is not wanted.
     """
     layers, height, _ = grid.row.shape
     kind = grid.positions.dtype
@@ -401,7 +443,10 @@ def pull(start, stop, grid, offsets, columns, stacks, adjoints, g_positions, g_r
 
 @compiled
 def _pull_source(gradients, products, source, count, levels, plans, ends, adjoints, d, n):
-    """Add the gradients (K, 5) of the colours and weights of one source (1, K, 8), the n-th of target d."""
+    """Add to `gradients` (K, 5), of colours (4) and weight of each layer of a source (1, K, 8), the n-th of target d.
+
+    `count` is the number of its layers, `levels` that of levels of the target; `products` (K, 2) is working memory.
+    """
     for t in range(levels if count > 0 else 0):
         for b in range(3):
             first, last = max(plans[d, t, n, b], 0), 0
@@ -412,7 +457,7 @@ def _pull_source(gradients, products, source, count, levels, plans, ends, adjoin
 
 @compiled
 def _pull_chain(gradients, products, source, first, last, adjoints, d, t, b):
-    """Add the gradients (K, 5) of the colours and weights of layers first ≤ k < last of a source (1, K, 8).
+    """Add to `gradients` (K, 5) those of layers first ≤ k < last of a source (1, K, 8), given to buffer b at level t.
 
     `products` (K, 2) is working memory: the gradient's products with the colours of each layer, and of those behind.
     """
@@ -434,7 +479,10 @@ def _pull_chain(gradients, products, source, first, last, adjoints, d, t, b):
 
 @compiled
 def _scatter(g_positions, g_rgba, gradients, source, count, row, y, x, slope):
-    """Add the gradients (K, 5) of a source's layers to those of their samples."""
+    """Add the gradients (K, 5) of the layers of a source, cell (y, x), to those of their samples.
+
+    `g_positions` (N, 3) gets x and y, `g_rgba` (N, 4) colours; one of no rows gets nothing.
+    """
     for k in range(count):
         i = row[k, y, x]
         if i >= 0:
@@ -475,7 +523,10 @@ def push(start, stop, grid, offsets, columns, stacks, tangents, border, out):
 
 @compiled
 def _load_tangents(moves, sources, counts, grid, y, x, t_positions, t_rgba):
-    """Fill `moves` (9, K, 5), the tangents of the colours and weights of a target's sources."""
+    """Fill `moves` (9, K, 5), the tangents of the colours and weights of a target's sources.
+
+    Tangents of positions (N, 3) and rgba (N, 4) may have no samples: then they are zeros.
+    """
     slope = moves.dtype.type(2) * grid.scale * grid.gamma
     moves[:] = 0
     for n in range(9):

@@ -43,7 +43,10 @@ w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
 
 @compiled
 def load_around(sources, loaded, grid, y, first, count):
-    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; return the first of them, or y + 2."""
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; return the first of them, or y + 2.
+
+    `loaded` (3,), updated, names the row in each slot. Slots hold `count` cells from column `first` on.
+    """
     start = y + 2
     for v in range(y + 1, y - 2, -1):
         if loaded[(v + 3) % 3] != v:
@@ -55,7 +58,10 @@ def load_around(sources, loaded, grid, y, first, count):
 
 @loop
 def forward(start, stop, grid, states, border, image):
-    """Fill rows [start, stop) of the image (H, W, 4), the cells less a border `border` wide."""
+    """Fill rows [start, stop) of the image (H, W, 4), the cells less a border `border` wide.
+
+    Mixed targets get anything: other loops fill them afterwards.
+    """
     rgba, row = grid.rgba, grid.row
     layers, (_, width, _) = len(row), image.shape
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
@@ -108,7 +114,10 @@ def add_adjoint(to, total, g, count):
 
 @compiled
 def adjoint_row(to, total, g, layers, count):
-    """Fill `to` with the gradients of both buffers' sums in a row, from the image's in `g`, which is overwritten."""
+    """Fill `to` with the gradients of the buffers' sums in a row, from the image's in `g`, which is overwritten.
+
+    There is one buffer for one layer, else two; `g` has room for as many.
+    """
     one = to.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -149,9 +158,10 @@ def _any(planes, count):
 
 @compiled
 def gather(to, s, above, level, below, count):
-    """Fill `to` with sums over the adjoints a of nine targets: w a; then w, w u and w v times a · (colour, 1).
+    """Fill eight planes `to` with sums over the adjoints a (five planes) of nine targets around each source.
 
-    Source j lies under target j + 1; `s` is its slot from the cell of j = 0.
+    Five planes get w a; then three get w, w u and w v times a · (colour, 1). Source j lies under target j + 1; `s` is
+    its slot from the cell of j = 0.
     """
     zero = to.dtype.type(0)
     for j in range(count):
@@ -176,7 +186,8 @@ def gather(to, s, above, level, below, count):
 def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
     """Write the gradients of the samples of source rows [start, stop) by plain targets, from the image's `g` (H, W, 4).
 
-    Each cell collects its own. A gradient of no rows is not wanted.
+    Each cell collects its own. Gradients hold zeros before: cells far from all that counts are skipped. `g_positions`
+    (N, 3) gets x and y, `g_rgba` (N, 4) colours; one of no rows is not wanted.
     """
     row = grid.row
     layers, _, width = row.shape
@@ -212,7 +223,10 @@ def pull(start, stop, grid, states, border, g, g_positions, g_rgba):
 
 @compiled
 def scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
-    """Write the sums that a row of cells has gathered to the gradients of the cells' samples."""
+    """Write the sums `gathered` by a row of cells (see `gather`) to the gradients of their samples, in their place.
+
+    `row` (W,) names the samples, or −1; `s` is the slot of the cells from column `left` on.
+    """
     for j in range(count):
         i = row[left + j]
         if i >= 0:
@@ -247,7 +261,11 @@ def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope, pla
 
 @compiled
 def load_tangents(tangents, sources, loaded, grid, t_positions, t_rgba, y, first, count, planes=COLORS):
-    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet, and the tangents' slots beside them."""
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet, as `load_around` does.
+
+    Also fills their slots in `tangents` (T, ·), from tangents of positions (T, N, 3) and rgba (T, N, 4), either of
+    which may have no samples, for zeros.
+    """
     slope = sources.dtype.type(2) * grid.scale * grid.gamma
     for v in range(load_around(sources, loaded, grid, y, first, count), y + 2):
         for k in range(len(grid.row)):

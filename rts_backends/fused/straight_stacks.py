@@ -66,7 +66,10 @@ def find(start, stop, positions, row, ends, crossed, marks, straight, counts):
 
 @compiled
 def _load(depths, levels, positions, row, y):
-    """Fill the depths (K + 1, W) of a row's layers, infinity where there is none, and the number of layers (W,)."""
+    """Fill the first K lines of `depths` (K + 1, W), of row y: infinity where there is no layer.
+
+    Also fills `levels` (W,), the number of layers.
+    """
     levels[:] = 0
     for k in range(len(row)):
         for x in range(len(levels)):
@@ -134,9 +137,9 @@ def _depth(straight, y, first, count):
 
 @compiled
 def _sums(total, images, sources, layers, y, count):
-    """Fill `total`, the sums of each layer in row y (colours over the weight, and the weight), and `images`.
+    """Fill `total`, the sums of each of `layers` layers in row y: colours over the weight, and the weight.
 
-    These are the images from each layer on.
+    Also fills `images`, those from each layer on, and zeros behind the last. `sources` hold rows y − 1 to y + 1.
     """
     one = total.dtype.type(1)
     images[layers * IMAGE : (layers + 1) * IMAGE] = total.dtype.type(0)
@@ -183,7 +186,10 @@ def forward(start, stop, grid, straight, border, image):
 
 @compiled
 def _adjoints(to, total, images, own, layers, y, count):
-    """Fill `to` with the gradients of the sums before normalisation, from the image's in planes `own`, which change."""
+    """Fill the slots of row y in `to` with the gradients of the sums before normalisation, for `layers` layers.
+
+    `own` are planes of the image's gradient, which are overwritten; `total` and `images` are those of `_sums`.
+    """
     zero, one = own.dtype.type(0), own.dtype.type(1)
     for k in range(layers):
         a, s, behind = slot(to, k, y, SUM), total[k * SUM : (k + 1) * SUM], images[(k + 1) * IMAGE :]
@@ -202,9 +208,10 @@ def _adjoints(to, total, images, own, layers, y, count):
 
 @loop
 def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
-    """Add straight targets' shares to the gradients of the samples of source rows [start, stop), from `g` (H, W, 4).
+    """Add to the gradients of the samples of source rows [start, stop), from `g` (H, W, 4), the image's gradient.
 
-    A gradient of no rows is not wanted.
+    Straight targets alone count. `g_positions` (N, 3) gets x and y, `g_rgba` (N, 4) colours; one of no rows is not
+    wanted.
     """
     layers, _, width = grid.row.shape
     sources, loaded = np.empty(3 * layers * SOURCE, g.dtype), np.empty(3, np.int64)
@@ -237,7 +244,10 @@ def pull(start, stop, grid, straight, border, g, g_positions, g_rgba):
 
 @compiled
 def _scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
-    """Add the sums that a row of cells has gathered to the gradients of their samples."""
+    """Add the sums `gathered` by a row of cells (see `gather`) to the gradients of their samples.
+
+    `row` (W,) names the samples, or −1; `s` is the slot of the cells from column `left` on.
+    """
     for j in range(count):
         i = row[left + j]
         if i >= 0:
@@ -252,7 +262,10 @@ def _scatter(g_positions, g_rgba, row, left, gathered, s, slope, count):
 
 @compiled
 def _change(grown, change, tangent, sources, total, images, layers, y, count):
-    """Fill `grown`, planes of the tangent of row y of the image, from the slots of sources and of their tangents."""
+    """Fill `grown`, planes of the tangent of row y of the image, from the slots of sources and of their tangents.
+
+    `total` and `images` are those of `_sums`; `change` is working memory.
+    """
     zero, one = grown.dtype.type(0), grown.dtype.type(1)
     grown[:] = zero
     for k in range(layers - 1, -1, -1):
@@ -273,7 +286,10 @@ def _change(grown, change, tangent, sources, total, images, layers, y, count):
 
 @loop
 def push(start, stop, grid, t_positions, t_rgba, straight, border, out):
-    """Fill the straight targets of rows [start, stop) of the tangents `out` (T, H, W, 4)."""
+    """Fill the straight targets of rows [start, stop) of the tangents `out` (T, H, W, 4), which lack the border.
+
+    Tangents of positions (T, N, 3) and rgba (T, N, 4) may have no samples: then they are zeros.
+    """
     layers, (many, _, width, _) = len(grid.row), out.shape
     sources, loaded = np.empty(3 * layers * SOURCE, out.dtype), np.empty(3, np.int64)
     total, images = np.empty(layers * SUM, out.dtype), np.empty((layers + 1) * IMAGE, out.dtype)

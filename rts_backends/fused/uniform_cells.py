@@ -57,7 +57,8 @@ def survey(
         row: (K, H, W).
         exits: (E, H, W), see `rts.plugin_api.records.Cells`.
         fronts: True if front layers alone make a target FLAT; otherwise they must be opaque, to hide those behind.
-        reach: the largest offset of a sample from its cell's centre, pixels, at which weights are sure to sum to one.
+        reach: the largest offset of a sample from its cell's centre, pixels, at which the nine weights of a target are
+            sure to sum to one or more; negative if never.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2, 2) zeros, for the least and the largest depth, and zero, of each row's fronts and hidden layers.
@@ -167,9 +168,10 @@ def _cover(covered, cells):
 
 @compiled
 def _note(cells, positions, behind, hidden, depths, seen):
-    """Note a row of a layer: mark its samples in `seen`, extend `depths` (2,), and mark blocks in `hidden` if `behind`.
+    """Note a row of a layer, samples `cells` (W,) or −1; return the number of covered cells.
 
-    Returns the number of covered cells.
+    Marks the samples in `seen` (N,), and extends `depths` (2,), the least and the largest depth. If the layer is
+    `behind` the front, also marks in `hidden` (B,) the blocks of columns in or beside which a cell is covered.
     """
     count, last = 0, len(cells) - 1
     least, largest = depths[0], depths[1]
@@ -217,6 +219,10 @@ def _keep_covered(mixed, cells):
 
 @compiled
 def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, joins2):
+    """Fill a row of `states` with EMPTY, FLAT or BUSY, but for SETTLED ones, which stay.
+
+    The others (W + 2,) are marks of `_inspect`, of the rows above (0), at (1) and below (2) the targets'.
+    """
     for x in range(len(states)):
         some = covered0[x] | covered0[x + 1] | covered0[x + 2] | covered1[x] | covered1[x + 1] | covered1[x + 2]
         some |= covered2[x] | covered2[x + 1] | covered2[x + 2]
@@ -233,7 +239,11 @@ def _fill_settled(kinds, states):
 
 @compiled
 def _mark_partial(partial, above, level, below, fronts):
-    """Fill `partial` (W,), 1 at the targets of a row that may be covered in part, 0 at others."""
+    """Fill `partial` (W,), 1 at the targets of a row that may be covered in part, 0 at others.
+
+    `above`, `level` and `below` (W + 2,) are bits of cells, such as LOOSE, of three rows, one cell more at each side.
+    `fronts` (W,) are the samples of the targets' own cells, or −1.
+    """
     for x in range(len(partial)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         around |= below[x] | below[x + 1] | below[x + 2]
@@ -243,7 +253,10 @@ def _mark_partial(partial, above, level, below, fronts):
 
 @compiled
 def _unite(partial, mixed, y):
-    """Add the mixed targets of row y to the marks `partial`; return the number of marks."""
+    """Add the mixed targets (H, W) of row y to the marks `partial` (W,); return the number of marks.
+
+    `mixed` without rows adds none.
+    """
     count = 0
     for x in range(len(partial) if len(mixed) > 0 else 0):
         partial[x] |= mixed[y, x]
@@ -254,7 +267,10 @@ def _unite(partial, mixed, y):
 
 @compiled
 def _fill_ends(ends, partial, above, level, below):
-    """Fill a row of `ends`, see `survey`."""
+    """Fill a row of `ends` (W,), see `survey`: LISTED where `partial`, and if covered, directions of empty neighbours.
+
+    `above`, `level` and `below` are as in `_mark_partial`.
+    """
     for x in range(len(ends)):
         bits = _empty(above, x, 0) | _empty(above, x + 1, 1) | _empty(above, x + 2, 2)
         bits |= _empty(level, x, 3) | _empty(level, x + 2, 5)

@@ -67,7 +67,8 @@ class JaxEngine(Engine):
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[jax.Array, ...]:
         """Call `fn` without derivative. Packed results are padded with zeros.
 
-        They are padded to a `bucket` if values are known, to the shape in `specs` under a trace.
+        They are padded to a `bucket` if values are known, to the shape in `specs` under a trace. There, `take_error`
+        hands out an `RtsError` of `fn`.
         """
         # Under grad and jvp this yields the plain value; only jit and vmap leave a tracer.
         args = tuple(jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a for a in args)
@@ -241,7 +242,7 @@ class JaxEngine(Engine):
         return jax.jvp(f, (primal,), (tangent,))
 
     def jacobian(self, f: Callable) -> Callable:
-        """The Jacobian by forward-mode autodiff, all unknowns in one vectorised pass."""
+        """See `Engine.jacobian`: by forward-mode autodiff, all unknowns in one vectorised pass."""
 
         def call(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
             along = jnp.eye(vector.size, dtype=vector.dtype)
@@ -254,7 +255,7 @@ class JaxEngine(Engine):
         return jax.jit(f)
 
     def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
-        """Optax's `adam` or `sgd`, or an `optax.GradientTransformation`."""
+        """See `Engine.optimizer`: optax's `adam` or `sgd`, or an `optax.GradientTransformation`."""
         from rts_backends.jax_engine.optimizer import Optimizer
 
         if not isinstance(method, str) and not (callable(getattr(method, "init", None)) and hasattr(method, "update")):

@@ -179,6 +179,7 @@ class _Differentiable:
         return operands, used, kept
 
     def _host_value(self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], **params: Any) -> None:
+        """Fill `results`: the value, zeros in rows not in use; and a note, if the operation `keeps`, −1 for none."""
         operands, used, _ = self._in_use(given)
         out = results[0]
         if self.operation.packed_result:
@@ -191,6 +192,7 @@ class _Differentiable:
     def _host_push(
         self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
     ) -> None:
+        """Fill `results`: the value's tangents (T, ·), from those of operands marked `wanted`, last in `given`."""
         operands, used, kept = self._in_use(given)
         tangents: list[Any] = _spread(given[self.count :], wanted)
         for i in self.operation.packed:
@@ -206,6 +208,10 @@ class _Differentiable:
     def _host_pull(
         self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
     ) -> None:
+        """Fill `results`, gradients (T, ·) of the operands that `wanted` marks; zeros in rows not in use.
+
+        The last of `given` are the value's gradients (T, ·). A result may share the memory of its operand.
+        """
         operands, used, kept = self._in_use(given)
         places = _spread(results, wanted)
         for t, g in enumerate(given[-1]):
@@ -338,7 +344,7 @@ def _zeros(like: Sequence[jax.Array]) -> list:
 def _present(tangents: Sequence, wanted: Wanted | None = None) -> tuple[list, Wanted]:
     """Tangents that are not zero, and a mark for each operand: True if its tangent is among them.
 
-    `tangents` are of all operands, or of those that `wanted` marks.
+    `tangents` are of all operands, or of those that `wanted` marks; jax's `ad.Zero`, or None, is one of zeros.
     """
     places = tangents if wanted is None else _spread(tangents, wanted)
     given = tuple(t is not None and not _is_zero(t) for t in places)

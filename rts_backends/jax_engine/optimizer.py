@@ -49,7 +49,7 @@ class Optimizer:
         return file.getvalue()
 
     def restore(self, state: bytes, parameters: Tree) -> None:
-        """Go on from a `state`; the parameters are given to each step."""
+        """Go on from a `state`; `parameters` are not read, since each step is given them."""
         with np.load(io.BytesIO(state)) as known:
             arrays = [jax.numpy.asarray(known[f"arr_{i}"]) for i in range(len(known.files))]
         self._state = jax.tree.unflatten(jax.tree.structure(self._state), arrays)

@@ -96,7 +96,7 @@ class HostPrimitive:
         return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
 
     def _on_host(self, operands: Sequence[np.ndarray], results: Sequence[np.ndarray], params: dict) -> None:
-        """Fill the results in place, item by item if operands have the axis B."""
+        """Fill the results in place, item by item if operands have the axis B; then all results have it, too."""
         by_item = self._by_item(operands, params)
         if not any(by_item):
             self._host(operands, results, **params)

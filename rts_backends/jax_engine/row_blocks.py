@@ -137,7 +137,10 @@ class _Pieces:
         return start + jnp.arange(self._size)
 
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
-        """The value of a piece as a function of the wanted operands alone; and these operands, rows cut to it."""
+        """The value of a piece as a function of the wanted operands alone; and these operands, rows cut to it.
+
+        The function replaces rows that are not in use by the first row of all, or by ones if none is in use.
+        """
         operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
         in_use = self.index(start) < self._used
 
@@ -155,6 +158,7 @@ class _Pieces:
 
 
 def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr, fixed: int) -> list[jax.Array]:
+    """The value (N, ·), computed piece by piece, see `_Pieces`; rows that are not in use get anything."""
     pieces = _Pieces(jaxpr, operands, fixed, most, used)
 
     def step(start: Any, first: Any, out: jax.Array) -> jax.Array:

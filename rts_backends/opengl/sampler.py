@@ -271,7 +271,7 @@ def _peel(
 ) -> np.ndarray:
     """(K, H, W) triangle ids, −1 for none, of vertices as hardware rounds them; `exact_hits` corrects them later.
 
-    `clip` (4, 4) leads from the unit sphere to clip space; `keep` is the sign of `facing`.
+    `clip` (4, 4) leads from the unit sphere to clip space; `keep` is the sign of `facing`, 0 for both orientations.
     """
     parts, array = _programs(context), _upload(context, prepared)
     program, query = parts["peel"], parts["query"]

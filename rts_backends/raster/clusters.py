@@ -303,11 +303,10 @@ def _test(boxes, cones, planes, towards, rows, sides):
 
 @loop
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
-    """Mark in `near` which of the clusters `kept` may touch blocks of requested cells.
+    """Fill `near` (N,) bool: True for clusters `kept[start:stop]` that may touch blocks of requested cells.
 
-    `there` (Y + 1, X + 1) holds counts of these blocks, cumulative along both axes.
-
-    A cluster whose box reaches behind the eye is always marked.
+    `there` (Y + 1, X + 1) holds counts of these blocks, cumulative along both axes. `rows` (3, 4) lead to homogeneous
+    pixels (x, y, w). A cluster whose box reaches behind the eye is always marked.
     """
     corner, side = np.empty(3), np.empty((3, 3))
     for n in range(start, stop):
@@ -338,7 +337,10 @@ def _touch(start, stop, kept, boxes, rows, height, width, there, near):
 
 @loop
 def _use(kept, offsets, blocks, used):
-    """Fill `used` with the blocks of vertices that the clusters `kept` use. Returns the number of these blocks."""
+    """Fill the head of `used` with the blocks of vertices that the clusters `kept` use. Returns the number of these.
+
+    `offsets` and `blocks` are those of `Clusters`; `used` has room for all blocks.
+    """
     every = len(kept) == len(offsets) - 1
     marks = np.full(len(used), every)
     if not every:

@@ -49,8 +49,8 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
     """`draw` for a list of M cells: fills ids, barycentrics and depths `nearest` (K, M), which `clear` has emptied.
 
-    `asked` are the arrays of the cells' `Blocks`. If `narrows` is set, triangles whose boxes hold no requested cell are
-    skipped.
+    The depths among `fragments` are left to `clear`. `asked` are the arrays of the cells' `Blocks`. If `narrows` is
+    set, triangles whose boxes hold no requested cell are skipped.
     """
     triangle_ids, barycentrics, _ = fragments
     table, numbers, bits = asked
@@ -91,8 +91,16 @@ def _depths(depths, nearest):
 def _draw(items, given, top, end, width, asked, layered):
     """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
-    `items` are the triangles' indices in `rows`. `layered` are the index of the band's first cell among M; `nearest`,
-    depths (K, ·); ids (K, M); and barycentrics (K, M, 2).
+    Args:
+        items: indices of the triangles in `rows`.
+        given: `_List.rows`, vertices (V, 3), the matrix (4, 4) to homogeneous pixels, coefficients (4,) of depth, and
+            `_List.keep`.
+        top: first row.
+        end: end of the rows.
+        width: columns of the image, or of all its blocks.
+        asked: the arrays of `Blocks`, `table` cut to this band; or of `EVERYTHING`.
+        layered: the index of the band's first cell among M; `nearest`, depths (K, ·); ids (K, M); and barycentrics (K,
+            M, 2). They hold the layers found so far, or empty ones.
     """
     rows, vertices, matrix, view_depth, keep = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
@@ -137,7 +145,8 @@ def _draw(items, given, top, end, width, asked, layered):
 def _asked(hits, count, top, asked, cells):
     """Move the hits in requested cells to the front of `hits[:count]`, and fill `cells` with these cells' numbers.
 
-    Returns the number of hits left. If all cells are requested, nothing is changed.
+    Returns the number of hits left. If all cells are requested, nothing is changed. `hits` are as in `_insert`, `asked`
+    as in `_draw`.
     """
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
@@ -228,7 +237,12 @@ def _cover(count, entries, numbers, covers):
 def _insert(hits, met, drawn, layered):
     """Insert the hits that stand the exact test into the layers of cells.
 
-    `hits` (n, 2): triangle in the block · BAND_ROWS + row in band, column.
+    Args:
+        hits: (n, 2): triangle in the block · BAND_ROWS + row in band, column.
+        met: the cells of the hits, which `_asked` fills; and working memory for `_meet`.
+        drawn: the band's first row; the image's width, or 0 to go by the cells in `met`; and the block's `entries`,
+            `numbers` and `clips`, see `_set_up`.
+        layered: see `_draw`; changed in place.
     """
     top, width, entries, numbers, clips = drawn
     cells, sure, depths, within = met

@@ -428,7 +428,7 @@ def _centres(x0, x1, y0, y1, height, width, step):
 
 @compiled
 def _clipped_box(corners, width, height):
-    """The box (x0, x1, y0, y1), pixels, of the part of a triangle beyond the near plane; empty if there is none.
+    """The box (x0, x1, y0, y1), pixels, of the part of a triangle farther than the near plane; x0 > x1 for no part.
 
     `corners` (3, 4) are homogeneous pixels. If a corner of that part has a w that is not positive, the box is the whole
     image.

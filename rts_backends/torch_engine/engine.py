@@ -286,7 +286,7 @@ class TorchEngine(Engine):
         return call
 
     def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
-        """`torch.optim.Adam` or `torch.optim.SGD`, or a `torch.optim.Optimizer`, on private copies of parameters."""
+        """See `Engine.optimizer`: torch's `Adam` or `SGD`, or a `torch.optim.Optimizer`, on copies of parameters."""
         from rts_backends.torch_engine.optimizer import Optimizer
 
         if not isinstance(method, (str, torch.optim.Optimizer)):

@@ -60,7 +60,7 @@ class Optimizer:
         return own
 
     def __call__(self, _: Tree, gradient: Tree) -> Tree:
-        """The parameters after a step from the last ones."""
+        """The parameters after a step from those returned last; the first argument is not read."""
         for variable, g in zip(self._variables, leaves(gradient), strict=True):
             variable.grad = g
         with torch.no_grad():
