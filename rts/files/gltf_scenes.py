@@ -52,7 +52,7 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
 
 
 def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
-    """The parents of nodes, refused if nodes form no forest: a walk among them might never end."""
+    """Child → parent, indices of nodes; refused if nodes form no forest, since a walk among them might never end."""
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for child in map(count_of, node.get("children", [])):

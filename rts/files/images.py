@@ -180,7 +180,7 @@ def _host(image: Any, name: str) -> np.ndarray:
 
 
 def _bytes(image: np.ndarray) -> np.ndarray:
-    """8-bit sRGB with straight alpha of a premultiplied linear image."""
+    """uint8 sRGB of a linear image, clipped to [0, 1]: (H, W, 4) premultiplied, made straight; (H, W, 3); or (H, W)."""
     array = image.astype(np.float64)
     if array.ndim == 3 and array.shape[2] == 4:
         alpha = np.clip(array[..., 3:], 0, 1)

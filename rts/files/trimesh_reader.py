@@ -116,7 +116,10 @@ def _pieces(scene: Any, mesh_type: type, linear: bool) -> list[Piece]:
 
 
 def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray | None, np.ndarray | None]:
-    """Attributes "uv" and "colors", the texture and the material's colour."""
+    """Attributes "uv" and "colors", the texture and the material's colour, as in `Piece`.
+
+    Of GLB and glTF, `gltf`, alpha counts as the material's alphaMode says.
+    """
     visual, attributes, texture, color = mesh.visual, {}, None, None
     if visual.kind == "texture":
         if visual.uv is not None and len(visual.uv) == len(mesh.vertices):

@@ -111,7 +111,16 @@ def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.n
 def _scene(
     subject: Subject, number: Number, vertices: np.ndarray, faces: np.ndarray, motion: np.ndarray, parameters: Tree
 ) -> tuple[Part, Camera]:
-    """The fitted shape and the scene's camera, both moved as the number moves them."""
+    """The fitted shape and the scene's camera, both moved as the number moves them.
+
+    Args:
+        subject: the scene.
+        number: the number that moves.
+        vertices: (V, 3) of the shape, world space.
+        faces: (T, 3) of the shape.
+        motion: (4, 3), from a point (x, y, z, 1) to its velocity for a unit of the number.
+        parameters: {"by": (), the change of the number}.
+    """
     by, engine = parameters["by"], subject.engine
     steps = iter(leaves(number.direction))
     camera = subject.shown(map_leaves(lambda p: p + by * next(steps), subject.parameters))[1]

@@ -50,7 +50,7 @@ class _Error(NamedTuple):
 
     @classmethod
     def of(cls, pushed: np.ndarray, true: np.ndarray) -> _Error:
-        """The error of a derivative image."""
+        """The error of a derivative image (H, W, 4) against the true one."""
         image = low_pass(pushed - true)
         return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
 
@@ -97,26 +97,33 @@ class _Case:
         return self.error.norm > max(NOISY * self.noise, LEFT * self.whole.norm)
 
     def strong(self, error: _Error) -> np.ndarray:
-        """Mask (H, W) bool of the pixels that disagree most."""
+        """Mask (H, W) bool of the pixels that disagree most, both in `error` and before any experiment."""
         size = np.abs(self.number.pushed - self.number.true).max(axis=-1)
         energy = error.energy
         return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
 
     def push(self, change: Change | None = None, **options: Any) -> np.ndarray:
-        """The derivative image with the options that helped, a change of the scene and further options."""
+        """The derivative image (H, W, 4), for a step of the slope's length, as `Number.pushed` is.
+
+        The scene is drawn with the options that helped so far, a change, and further options, none of which are kept.
+        """
         options = {**self.options, **options}
         derivative = self.subject.push(self.number.direction, change, connect=self.connected, **options)
         return derivative * self.number.slope.step
 
     def try_connected(self) -> _Error | None:
-        """The result of `try_out` with derivatives for the arrays that no derivative reaches."""
+        """The result of `try_out` if arrays that no derivative reaches are differentiated; kept only if this helps."""
         self.connected = True
         before = self.try_out()
         self.connected = before is not None
         return before
 
     def try_out(self, **options: Any) -> _Error | None:
-        """Try options; if they make the error much smaller, keep them and return the error before, otherwise None."""
+        """Try options; if they make the error in the pixels `left` much smaller, keep them.
+
+        Returns:
+            The error before; None if the options are not kept.
+        """
         changed = {**self.options, **options}
         pushed = self.push(**options)
         error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
@@ -275,7 +282,16 @@ def _each(count: int) -> str:
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
-    """Name the reason `kind` if pixels at most `widen` from the mask hold much of the remaining error."""
+    """Name the reason `kind` if pixels near the mask hold much of the remaining error; those then count as explained.
+
+    Args:
+        case: gains a finding, and loses these pixels from `left` and `error`; else it stays as it is.
+        mask: (H, W) bool; nothing is named if it is empty.
+        kind: a key of `KINDS`.
+        because: see `Finding`.
+        advice: see `Finding`.
+        widen: pixels count up to this many steps from the mask, along rows and columns.
+    """
     from scipy.ndimage import binary_dilation
 
     if not mask.any():
@@ -345,6 +361,9 @@ def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[
         number: the number.
         touched: the arrays of the scene that the number changes.
         going: a function that is true while there is time for another experiment.
+
+    Returns:
+        Findings; none only if time ran out.
     """
     case = _Case(subject, number)
     for experiment in EXPERIMENTS:

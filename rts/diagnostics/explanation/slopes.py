@@ -118,7 +118,7 @@ def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
 
 
 def chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Sorted indices of `count` entries, or all: half are the largest or NaN, the others random, by a fixed seed."""
+    """Sorted indices of `count` entries of (n,), or all: half the largest or NaN, others random, by a fixed seed."""
     if gradient.size <= count:
         return list(range(gradient.size))
     largest = np.argsort(-np.nan_to_num(np.abs(gradient), nan=np.inf), kind="stable")[: (count + 1) // 2]
