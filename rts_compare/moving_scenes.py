@@ -216,7 +216,7 @@ def _translation(along: np.ndarray) -> np.ndarray:
 
 
 def _rotation(about: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """The derivative (4, 4), by the angle, of a rotation about an axis through a point."""
+    """The derivative (4, 4), by the angle in radians, of a rotation about a unit axis (3,) through a point (3,)."""
     x, y, z = about
     generator = np.zeros((4, 4))
     generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]

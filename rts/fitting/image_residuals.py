@@ -173,7 +173,7 @@ class ImageResiduals(Residuals):
         )
 
     def _difference(self, image: Array, parameters: Tree) -> Array:
-        """What `__call__` gives of one view, whose image is (H, W, C + 1)."""
+        """The residuals of one view, as of `__call__`, from its image (H, W, C + 1)."""
         image = self._beside_target(image, parameters)
         target, weights, _ = self._constants(image)
         self._refuse_other(image.shape[-1] - 1)
@@ -206,7 +206,7 @@ class ImageResiduals(Residuals):
             stage: the resolution, as a share of this one's.
 
         Returns:
-            New residuals; these stay as they are.
+            New residuals; the present ones stay as they are.
         """
         other = copy(self)
         other._views = [view.at_stage(stage) for view in self._views]
