@@ -422,7 +422,7 @@ class Measurements:
         return rebuilt(live)
 
     def _live(self, group: str, engine: Engine) -> tuple[list[Array], Callable[[list[Array]], Tree]]:
-        """The parameters that a group's modes change, and a function: values for these → all parameters."""
+        """The parameters that a group's modes change, arrays of `engine`; and a function: values for these → all."""
         scene = self.scene
         changing = [
             not scene.separate or any(np.any(np.asarray(d)) for d in of_modes)

@@ -258,7 +258,7 @@ def _check_function(name: str, given: Any, expected: str) -> None:
 
 
 def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
-    """The direction as arrays of the engine, of the parameters' names and shapes."""
+    """The direction as arrays of the engine and of the parameters' dtypes; other names or shapes are refused."""
     given, wanted = ([(name, tuple(np.shape(x))) for name, x in named_leaves(t)] for t in (direction, parameters))
     if given != wanted:
         raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")

@@ -134,7 +134,15 @@ def check_attributes(
 
 
 def _check_components(name: str, kind: str, accessor: dict[str, Any], quantized: bool, fail: Any) -> None:
-    """Refuse a type of numbers that the format does not allow for an attribute."""
+    """Refuse a type of numbers that the format does not allow for an attribute.
+
+    Args:
+        name: of the attribute and its primitive, for errors.
+        kind: of the attribute, such as "POSITION", or "indices"; kinds not in `COMPONENTS` may have any type.
+        accessor: its JSON.
+        quantized: True if the file uses KHR_mesh_quantization, which allows more.
+        fail: text → error.
+    """
     component = TYPES[accessor["componentType"]]
     if accessor.get("normalized", False) not in (True, False):
         raise fail(f"{name} has normalized = {accessor['normalized']!r}; expected true or false")
@@ -194,7 +202,10 @@ def _check_corners(
     views: list[bytes],
     fail: Any,
 ) -> None:
-    """Refuse corners that make no triangles, or refer to vertices that are not there."""
+    """Refuse corners that make no triangles, or refer to vertices that are not there.
+
+    `indices` is the accessor of a primitive's table of corners; None where its `count` vertices are the corners.
+    """
     corners, owner = count, f"POSITION of {name}"
     if indices is not None:
         accessor = tree["accessors"][indices]

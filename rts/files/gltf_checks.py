@@ -85,7 +85,11 @@ def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[s
 
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
-    """Refuse a damaged file. Return it as a GLB if it holds numbers that trimesh would misread, else None."""
+    """Refuse a damaged file, of JSON `text` and, in a GLB, the `binary` part for its first buffer.
+
+    Returns:
+        The file as a GLB that trimesh reads rightly, if it holds numbers that trimesh would misread; else None.
+    """
     place = "its tree"
     try:
         tree = json.loads(text, parse_constant=_no_number, object_pairs_hook=_unique)

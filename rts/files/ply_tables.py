@@ -223,7 +223,10 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
 
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
-    """The header's elements, layout and name of a texture; and the byte where the data begin."""
+    """The header's elements, layout and name of a texture, or ""; and the byte where the data begin.
+
+    The layout is "ascii", "binary_little_endian" or "binary_big_endian".
+    """
     # Lines of a Macintosh end in CR alone.
     newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", data) else b"\n"
     end = data.find(newline + b"end_header") + 1
@@ -295,7 +298,10 @@ def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) 
 
 
 def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray | list[list[float]]:
-    """The numbers in each of `rows` (line number, line): an array (R, C) if lines have equally many, else lists."""
+    """The numbers in each of `rows` (line number, line), at least one: (R, C) float64, or lists of unequal lengths.
+
+    A line of other than numbers is refused.
+    """
     try:
         lines = [line for _, line in rows]
         if is_plain("".join(lines)):

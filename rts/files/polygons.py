@@ -73,7 +73,7 @@ def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes:
 
 
 def _ears(ring: np.ndarray) -> np.ndarray | None:
-    """Triangles (n − 2, 3) int of one polygon of corners (n, 3), or None if no triangles fit."""
+    """Triangles (n − 2, 3) int64, corners from 0 on, of one polygon of corners (n, 3); None if no triangles fit."""
     import mapbox_earcut
 
     size = np.abs(ring).max()

@@ -259,7 +259,7 @@ def _colors(index: int, part: Part, rate: int, count: int) -> np.ndarray:
 
 
 def _of_vertices(index: int, part: Part, rate: int) -> np.ndarray:
-    """Colours (V, C) of vertices, as in θ."""
+    """Colours (V, C) of vertices, as in θ; of control points, blended to the cut patches. Others are `Unsuited`."""
     colors = part.theta.get("colors")
     if isinstance(colors, np.ndarray):
         if _is_mesh(part) and part.surface.sample_widths[0] == 3:

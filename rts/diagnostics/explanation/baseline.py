@@ -89,7 +89,7 @@ def nearest(
 
 
 def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A sphere and a box about points (N, 3) that are seen from a camera: vertices and faces, world space."""
+    """A sphere and a box about points (N, 3) that a camera sees: (vertices (V, 3), world, faces (T, 3)) of each."""
     view = np.asarray(engine_of(camera.view).to_numpy(camera.view), np.float64)
     local = position @ view[:3, :3].T + view[:3, 3]
     low, high = np.percentile(local, 1, axis=0), np.percentile(local, 99, axis=0)

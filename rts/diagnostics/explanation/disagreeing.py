@@ -139,7 +139,10 @@ class _Case:
 
 
 def _constants(case: _Case, touched: Touched) -> None:
-    """Name arrays that no derivative reaches, if the number's derivatives would agree with these differentiated."""
+    """Add findings on arrays that no derivative reaches, if derivatives would agree with these differentiated.
+
+    Also if all that the number changes is such arrays, and the derivative image is zero.
+    """
     constants = why_constant(case.subject, touched)
     if not constants:
         return
@@ -154,7 +157,7 @@ def _constants(case: _Case, touched: Touched) -> None:
 
 
 def _outlines(case: _Case, touched: Touched) -> None:
-    """Name the splatter if the splatter "visible", in its place, makes the error much smaller."""
+    """Add a finding on the splatter if the splatter "visible", in its place, makes the error much smaller."""
     splatter = case.subject.options.get("splatter", "auto")
     if case.subject.splats_as("visible"):
         return
@@ -167,7 +170,7 @@ def _outlines(case: _Case, touched: Touched) -> None:
 
 
 def _transparent(case: _Case, touched: Touched) -> None:
-    """Name shaders that are not opaque, if the splatter "visible" in place of another makes the error much smaller."""
+    """Add a finding on shaders that are not opaque, if the splatter "visible" makes the error much smaller."""
     if case.subject.opaque or case.subject.splats_as("visible"):
         return
     before, advice = case.try_out(splatter="visible"), "Say splatter='visible'."
@@ -196,7 +199,7 @@ def _layers(case: _Case, touched: Touched) -> None:
 
 
 def _bounded(case: _Case, touched: Touched) -> None:
-    """Name surfaces that bound near-singular derivatives, if much of the error is where the bounds matter."""
+    """Add a finding on surfaces that bound near-singular derivatives, if much of the error is where bounds matter."""
     if all(part.surface.unbounded() is None for part in case.subject.parts):
         return
     change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
@@ -212,7 +215,7 @@ def _bounded(case: _Case, touched: Touched) -> None:
 
 
 def _crossing(case: _Case, touched: Touched) -> None:
-    """Name lines where parts pass through one another, if much of the error is beside them."""
+    """Add a finding on lines where parts pass through one another, if much of the error is beside these lines."""
     subject = case.subject
     if len(subject.parts) < 2:
         return
@@ -235,7 +238,7 @@ def _crossing(case: _Case, touched: Touched) -> None:
 
 
 def _colors(case: _Case, touched: Touched) -> None:
-    """Name colours finer than pixels: the error lies inside of surfaces, and more samples remove it."""
+    """Add a finding on colours finer than pixels, if the error lies inside of surfaces, and more samples halve it."""
     subject, number = case.subject, case.number
     taken = subject.supersample
     inside = ~subject.fineness.outlines
@@ -254,7 +257,7 @@ def _colors(case: _Case, touched: Touched) -> None:
 
 
 def _samples(case: _Case, touched: Touched) -> None:
-    """Name too few samples, for thin shapes or for outlines."""
+    """Add findings on too few samples, for thin shapes or for outlines, if more make the error much smaller."""
     taken = case.subject.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
@@ -282,7 +285,7 @@ def _each(count: int) -> str:
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
-    """Name the reason `kind` if pixels near the mask hold much of the remaining error; those then count as explained.
+    """Add a finding of a `kind` if pixels near the mask hold much of the remaining error; these are then explained.
 
     Args:
         case: gains a finding, and loses these pixels from `left` and `error`; else it stays as it is.
@@ -308,7 +311,7 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
 
 
 def _bias(case: _Case, touched: Touched) -> None:
-    """Name a bias of the library that a sphere or a box shows, too; otherwise the cause is unknown.
+    """Add a finding on a bias of the library that a sphere or a box shows, too; else one of the kind "unknown".
 
     Does nothing if other findings leave less than half of the error.
     """

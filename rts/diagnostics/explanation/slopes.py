@@ -81,7 +81,10 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
 
 
 def differenced(subject: Subject, number: Number, samples: int) -> Number:
-    """`number` with finite differences by `samples`² and (`samples` + 1)² samples a pixel filled in."""
+    """A copy of `number` with new finite differences, by `samples`² and (`samples` + 1)² samples a pixel.
+
+    These are `true`, `noise`, and `difference` and `error` of its slope.
+    """
     step, direction = number.slope.step, number.direction
     to_numpy = subject.engine.to_numpy
 

@@ -276,7 +276,10 @@ class Subject:
         return gradients
 
     def touched(self, direction: Tree, step: float) -> Touched:
-        """The arrays of the scene that change with a step along a direction, those held by shaders and surfaces too."""
+        """The arrays of the scene that differ half a step behind and ahead along a direction.
+
+        Arrays that shaders and surfaces hold count, too, by the names "shader" and "surface".
+        """
         scenes = [self.shown(self.moved(direction, by)) for by in (-step / 2, step / 2)]
         before, after = map(self._placed, scenes)
         changed, constant, cut = [], [], []

@@ -151,7 +151,7 @@ class _Trial:
         return self._changed(change, **options) & ~self._anyway
 
     def seen_outside(self, change: Change | None = None) -> bool:
-        """True if a larger window, or a camera moved back, sees the number's effect."""
+        """True if a larger window, or a camera moved back or ahead, sees the number's effect, after `change` if any."""
         height, width = self.subject.size
         apron = max(height, width)
         larger = height + 2 * apron, width + 2 * apron

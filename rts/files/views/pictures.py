@@ -130,7 +130,7 @@ def read_picture(pose: Pose, *, linear: bool, behind: np.ndarray | None) -> np.n
 
 
 def read_mask(pose: Pose) -> np.ndarray:
-    """(h, w) float32 in [0, 1]: the mask's picture, as it is encoded, where the undistorted picture is defined."""
+    """(h, w) float32 in [0, 1]: the mask's picture, as encoded, or ones; times 0 where the lens leaves no picture."""
     from PIL import Image
 
     mask = np.ones(pose.size, np.float32)
