@@ -218,7 +218,12 @@ def attribute(name: str, known: Iterable[str]) -> Any:
 def instance(group: str, chosen: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
-    A name or a class gives one instance with default settings, shared by all calls; an object is returned as it is.
+    A name or a class gives one instance with default settings, shared by all calls. An object is returned as it is; so
+    is the object that a name stands for if it is no class, such as a function.
+
+    Raises:
+        InputError: no such group or name.
+        PluginError: the plugin cannot be loaded.
     """
     if not isinstance(chosen, (str, type)):
         return chosen

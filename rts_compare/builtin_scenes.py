@@ -92,7 +92,7 @@ def _with_exact(part: Part) -> tuple[Part, Part]:
 
 
 def _upright(points: np.ndarray, ax: float, ay: float) -> np.ndarray:
-    """Points (V, 3) float64 of an object upright along z: made upright along y, `normalised`, and turned."""
+    """Points (V, 3) float64 of an object upright along z: set upright along y, `normalised`, turned (`rotation_xy`)."""
     return normalised(np.asarray(points, np.float64)[:, [0, 2, 1]] * [1, 1, -1]) @ rotation_xy(ax, ay).T
 
 

@@ -393,7 +393,14 @@ def _rows(
     samplers: Mapping[str, str],
     times: Mapping[Setting, dict[str, float]],
 ) -> list[dict]:
-    """Rows of a mode: one for each timed setting, and one with "ms" None for each setting without a time."""
+    """Rows of a mode: one for each timed setting, and one with "ms" None for each setting without a time.
+
+    Args:
+        mode: the mode.
+        errors: setting without engine, its sampler a value of `samplers` → scores.
+        samplers: as in `Plan`.
+        times: setting with its own sampler and engine → time.
+    """
     timed: dict[Setting, list[Setting]] = {}
     for setting in times:
         timed.setdefault(setting._replace(sampler=samplers[setting.sampler], engine=""), []).append(setting)

@@ -19,7 +19,7 @@ def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
 
 @lru_cache(2)
 def loss_weights(height: int, width: int, count: int = LOSSES) -> np.ndarray:
-    """Weights (count, H, W, 3) float32 of random losses L = Σ w · image: smooth, of fixed seed and unit variance."""
+    """Weights (count, H, W, 3) float32, read-only, of random losses L = Σ w · image: smooth, fixed seed, variance 1."""
     from scipy.ndimage import gaussian_filter
 
     noise = np.random.default_rng(0).normal(size=(count, height, width, 3))

@@ -89,7 +89,7 @@ class InterleavedTiming:
         times.extend(kept)
 
     def timed(self, name: tuple) -> list[float]:
-        """Seconds of `CONSECUTIVE` calls after one to warm up; of a single call if it is slow or the first hopeless."""
+        """Seconds of `CONSECUTIVE` calls after one to warm up; of one if it is slow or the first `hopeless` (`run`)."""
         with limited(LONGEST):
             if name not in self._made:
                 self._made[name] = self.calls[name]()

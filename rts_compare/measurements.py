@@ -116,7 +116,7 @@ class Measurements:
         return self._pixels[mode]
 
     def leave_out_what_rests(self) -> None:
-        """Drop the modes along which no point and no colour of the image changes.
+        """Drop the modes along which no point and no colour of the image changes, each with a line in `left_out`.
 
         Raises:
             InputError: no mode is left.
@@ -400,7 +400,10 @@ class Measurements:
         )
 
     def call(self, group: str, setting: Setting) -> Callable[[], Any]:
-        """A function that computes an image of the scene and a loss's gradient by the parameters of a group's modes."""
+        """A function that computes an image of the scene and a loss's gradient by the parameters of a group's modes.
+
+        `setting` names its engine, one of `engines`. The function waits until the engine is done.
+        """
         engine = next(e for e in self.engines if e.name == setting.engine)
         at, size = self.at_rates(group)[setting.rate].at, self.scene.size
         live, rebuilt = self._live(group, engine)
@@ -419,7 +422,7 @@ class Measurements:
         return rebuilt(live)
 
     def _live(self, group: str, engine: Engine) -> tuple[list[Array], Callable[[list[Array]], Tree]]:
-        """The parameters that a group's modes change, and a function: values for these → all parameters."""
+        """The parameters that a group's modes change, arrays of `engine`; and a function: values for these → all."""
         scene = self.scene
         changing = [
             not scene.separate or any(np.any(np.asarray(d)) for d in of_modes)

@@ -189,7 +189,7 @@ class _Ways(NamedTuple):
         return part.replace(theta=theta, transform=transform)
 
     def changes_something(self, mode: str, parts: Sequence[Part], exact: Sequence[Part]) -> bool:
-        """True if a mode changes anything, and entries of θ of the same shapes in `parts` and `exact`."""
+        """True if a mode changes something; entries of θ that it changes must have one shape in `parts` and `exact`."""
         if mode == "camera":  # Without perspective, moving ahead changes nothing.
             return bool(np.any(np.asarray(self.camera.projection)[3, :3]))
         if mode not in self.changes:
@@ -216,7 +216,7 @@ def _translation(along: np.ndarray) -> np.ndarray:
 
 
 def _rotation(about: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """The derivative (4, 4), by the angle, of a rotation about an axis through a point."""
+    """The derivative (4, 4), by the angle in radians, of a rotation about a unit axis (3,) through a point (3,)."""
     x, y, z = about
     generator = np.zeros((4, 4))
     generator[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
@@ -294,7 +294,10 @@ def _away(points: np.ndarray) -> np.ndarray:
 
 
 def _coloring(part: Part, camera: Camera) -> dict[str, np.ndarray]:
-    """Entry of θ with the base colour → the direction in which it changes; {} if none can change."""
+    """Entry of θ with the base colour → the direction in which it changes; {} if none can change.
+
+    An unlit part without colours changes "color", an entry that its θ lacks.
+    """
     theta, reads = part.theta, part.surface.reads(part.theta)
     [checked], _ = check_scene(part, camera)
     if checked.reads is not None and not {"color", "uv"} & set(checked.reads):

@@ -214,7 +214,8 @@ class Search:
     def _in_vain(self, setting: Setting, cells: Sequence[Setting], accurate: list[Setting]) -> bool:
         """True if this splatter and samples are too inaccurate even with the most layers and finest surface.
 
-        That setting is tried here, once any other setting of this splatter, sampler and samples was tried.
+        That setting is tried here, once any other setting of this splatter, sampler and samples was tried. If it is
+        accurate enough, it is added to `accurate`.
         """
         level = [s for s in cells if s._replace(layers=0, rate="") == setting._replace(layers=0, rate="")]
         best = max(level, key=lambda s: (self._work(s)[2], self._work(s)[0]))

@@ -195,7 +195,10 @@ def _kept_image(
     path: Path,
     done: Callable[[], None],
 ) -> np.ndarray:
-    """One of the four images (H, W, 3) of the differences, kept on disk so that an interrupted run can go on."""
+    """One of the four images (H, W, 3) of the differences, kept at `path` so that an interrupted run can go on.
+
+    `seen` gives parts and camera; it is called only if there is no such file. For the others see `area_image`.
+    """
     kept = _read(path)
     if kept is not None:
         for _ in points:

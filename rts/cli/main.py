@@ -77,7 +77,10 @@ def _installed_command(name: str) -> Any:
 
 
 def _as_command(name: str, found: Any, settings: dict[str, Any] | None = None) -> Any:
-    """A function, or a `typer.Typer`, as a command of this name."""
+    """A function, or a `typer.Typer`, as a command of this name; a PluginError if it is neither.
+
+    `settings` are those of the command's context; a `typer.Typer` has its own.
+    """
     try:
         if not isinstance(found, typer.Typer):
             alone = typer.Typer(rich_markup_mode="markdown", add_completion=False)
@@ -193,7 +196,7 @@ def _view(text: str) -> tuple[float, ...]:
 
 
 def _background(text: str) -> tuple[float, ...] | None:
-    """The linear colour of a colour's name; None for transparent."""
+    """The linear colour (3,), 0 to 1, of a colour's name or "#rrggbb"; None for "none", which is transparent."""
     from PIL import ImageColor
 
     from rts.files.srgb import decode_srgb

@@ -63,7 +63,7 @@ def write_plugin(kind: str, name: str, folder: Any = None, triangles: bool = Fal
 
 
 def _names(kind: str, name: str) -> dict[str, str]:
-    """Values for the templates, by their names there, from a plugin's kind and name."""
+    """Values for the templates, by their names there, from a plugin's kind and name; bad or taken names are refused."""
     module = name.replace("-", "_")
     if not re.fullmatch(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise InputError(

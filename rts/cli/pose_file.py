@@ -89,7 +89,7 @@ def _entry(entries: Any, name: str) -> Any:
 
 
 def posed(parts: Sequence[Part], transform: Array, shader: Any = None) -> list[Part]:
-    """The parts moved by a transform of the world, perhaps with another shader."""
+    """The parts moved by a transform (4, 4) after their own, in world space; `shader` replaces theirs unless None."""
     return [
         part.replace(
             transform=transform if part.transform is None else matmul(transform, part.transform),

@@ -32,7 +32,7 @@ class PoseFit(NamedTuple):
         rotation: (3,) axis times angle, radians, about `center`.
         translation: (3,) world units.
         center: (3,) world.
-        trail: the best pose so far, at each step; the last is the result.
+        trail: the best pose so far of its stage, at each step; then, as a last entry, the result.
         history: the loss at each step: mean square of the difference of silhouettes, or a robust loss of it, at that
             step's resolution and blur.
         levels: the number of steps at each stage, from coarse to fine.
@@ -161,7 +161,7 @@ def fit_pose(
 
 
 def _best_so_far(visited: list[np.ndarray], result: Fit) -> list[np.ndarray]:
-    """For each step, the parameters with the lowest loss so far at its stage.
+    """For each step, the parameters, of those `visited` at each step, with the lowest loss so far at its stage.
 
     Levenberg–Marquardt reports rejected trials, too.
     """

@@ -31,7 +31,7 @@ def box(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit sphere: vertices (V, 3) and faces (20 · 4ⁿ, 3), n the number of subdivisions."""
+    """Unit sphere: vertices (V, 3) and faces (20 · 4ⁿ, 3) for n subdivisions. Kept for later calls; read only."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)

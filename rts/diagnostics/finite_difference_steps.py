@@ -21,7 +21,12 @@ FADING = 0.7
 
 
 class _Probe(Splatter):
-    """A splatter that shows the image positions of samples, or their colours, in the front layer or in all."""
+    """A splatter whose image (H, W, 4) holds what samples have, unspread; zeros where a cell is empty.
+
+    Args:
+        color: True for the samples' colours; False for their pixel positions, (x, y, x, y).
+        deep: True for the sum over layers, each weighted by `FADING` times the one in front; False for the front layer.
+    """
 
     def __init__(self, color: bool, deep: bool):
         self.color, self.deep = color, deep
@@ -46,15 +51,15 @@ def _of_engine(engine: Engine, image: Callable[[Tree], Array], parameters: Tree)
 def pixel_step(
     engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree, *, deep: bool = False
 ) -> float | None:
-    """A step along a direction that moves the image by a pixel or, where nothing moves, changes its colour.
+    """The step along a direction by which the fastest point in the image moves by a pixel.
 
-    None where neither changes.
+    Where nothing moves, the step by which the fastest colour changes by 0.05; None where no colour changes.
 
     Args:
         engine: the engine of the parameters.
         image: parameters and options of `rts.render` → (H, W, 4).
         parameters: the point of the derivative.
-        direction: a tree of the parameters' structure.
+        direction: a tree of the parameters' structure; the step is a factor of it.
         deep: True to look at motion and colour in all kept layers, not only in the front one.
     """
     for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):

@@ -74,8 +74,9 @@ def gradient_image(
         scale: the change that is shown at full strength; None for the largest there is.
 
     Raises:
-        InputError: parameters that have no derivative; a direction of another structure; an image that is no (H, W, C)
-            array of the parameters' engine, or whose derivative is not finite.
+        InputError: parameters that have no derivative or are traced; a direction of another structure, or none for
+            several numbers; a scale that is not positive; an image that is no (H, W, C) array of the parameters'
+            engine, or whose derivative is not finite.
         EngineError: arrays of two engines.
     """
     _check_function("image", image, "a function: parameters → (H, W, C)")
@@ -186,8 +187,8 @@ def check_gradient(
         The two derivatives of each number that was checked, the reasons, and a picture; see `GradientCheck`.
 
     Raises:
-        InputError: parameters that have no derivative, nothing that depends on them, or arguments that `rts.render`
-            refuses.
+        InputError: parameters that have no derivative or are traced; nothing that depends on them; an argument out of
+            its range; results of another kind from `scene` or `loss`; or what `rts.render` refuses.
         EngineError: arrays of two engines.
     """
     clock = Clock(budget_s)
@@ -244,7 +245,7 @@ def _traceable(engine: Engine) -> Iterator[None]:
 
 
 def _differentiable(parameters: Tree, caller: str) -> tuple[Engine, Tree]:
-    """The engine of differentiable parameters, and the parameters with dicts in the order of `leaves`."""
+    """The engine of a user's parameters, and these with dicts in the order of `leaves`; traced ones are refused."""
     engine = differentiable(parameters)
     if any(engine.traced(x) for x in leaves(parameters)):
         raise InputError(f"parameters holds traced arrays; call {caller} outside jit and other transforms")
@@ -257,7 +258,7 @@ def _check_function(name: str, given: Any, expected: str) -> None:
 
 
 def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
-    """The direction as arrays of the engine, of the parameters' names and shapes."""
+    """The direction as arrays of the engine and of the parameters' dtypes; other names or shapes are refused."""
     given, wanted = ([(name, tuple(np.shape(x))) for name, x in named_leaves(t)] for t in (direction, parameters))
     if given != wanted:
         raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")
@@ -285,7 +286,7 @@ def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array],
 
 
 def _smooth_weighting(size: tuple[int, int], engine: Engine, parameters: Tree) -> Callable[[Array], Array]:
-    """Image → the sum of its pixels with smooth random weights."""
+    """A loss: image (H, W, 4) → the sum of its values with smooth random weights, the same for equal sizes."""
     from scipy.ndimage import gaussian_filter
 
     weights = np.random.default_rng(0).normal(size=(*size, 4))

@@ -15,7 +15,7 @@ def phases(wanted: bool | None) -> Iterator[Phase]:
     """A context with a `Phase`, a function that shows a bar for each phase, with the time that is left.
 
     Args:
-        wanted: True to show bars; None to show them on a terminal.
+        wanted: True to show bars, False for none; None to show them on a terminal.
     """
     if wanted is False or (wanted is None and not sys.stderr.isatty()):
         yield lambda what, steps: lambda: None

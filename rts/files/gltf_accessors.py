@@ -46,7 +46,10 @@ def count_of(value: Any) -> int:
 
 
 def _layout(accessor: dict[str, Any], descriptions: list[dict[str, Any]]) -> tuple[int, int, int]:
-    """Bytes of an accessor in its view: where its rows begin, from one row to the next, and in one row."""
+    """Counts of bytes of an accessor that has a view: to its first row, from one row to the next, and in one row.
+
+    `descriptions` are the file's bufferViews, as JSON.
+    """
     row = np.dtype(TYPES[accessor["componentType"]]).itemsize * WIDTHS[accessor["type"]]
     stride = descriptions[accessor["bufferView"]].get("byteStride", row)
     return count_of(accessor.get("byteOffset", 0)), count_of(stride), row
@@ -55,7 +58,17 @@ def _layout(accessor: dict[str, Any], descriptions: list[dict[str, Any]]) -> tup
 def check_accessor(
     index: int, accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: list[bytes], fail: Any
 ) -> None:
-    """Refuse an accessor whose rows are not in its view, or overlap, or begin where numbers of its type cannot."""
+    """Refuse an accessor whose rows are not in its view, or overlap, or begin where numbers of its type cannot.
+
+    An accessor without a view stands for zeros; it may promise up to `MOST` rows.
+
+    Args:
+        index: the accessor's number, for errors.
+        accessor: its JSON.
+        descriptions: the JSON of the bufferViews.
+        views: the bytes of each bufferView.
+        fail: text → error.
+    """
     count = count_of(accessor["count"])
     if count_of(accessor["componentType"]) not in TYPES:
         raise fail(f"accessor {index} has componentType {accessor['componentType']}; expected one of {list(TYPES)}")
@@ -121,7 +134,15 @@ def check_attributes(
 
 
 def _check_components(name: str, kind: str, accessor: dict[str, Any], quantized: bool, fail: Any) -> None:
-    """Refuse a type of numbers that the format does not allow for an attribute."""
+    """Refuse a type of numbers that the format does not allow for an attribute.
+
+    Args:
+        name: of the attribute and its primitive, for errors.
+        kind: of the attribute, such as "POSITION", or "indices"; kinds not in `COMPONENTS` may have any type.
+        accessor: its JSON.
+        quantized: True if the file uses KHR_mesh_quantization, which allows more.
+        fail: text → error.
+    """
     component = TYPES[accessor["componentType"]]
     if accessor.get("normalized", False) not in (True, False):
         raise fail(f"{name} has normalized = {accessor['normalized']!r}; expected true or false")
@@ -135,7 +156,7 @@ def _check_components(name: str, kind: str, accessor: dict[str, Any], quantized:
 
 
 def _check_overlap(name: str, read: dict[str, int], tree: dict[str, Any], fail: Any) -> None:
-    """Refuse attributes of one primitive that share bytes."""
+    """Refuse attributes of one primitive that share bytes of a view, where their rows are equally far apart."""
     places = []
     for kind, index in read.items():
         accessor = tree["accessors"][index]
@@ -152,7 +173,7 @@ def _check_overlap(name: str, read: dict[str, int], tree: dict[str, Any], fail: 
 
 
 def _check_bounds(path: Path, name: str, read: dict[str, int], tree: dict[str, Any], views: list[bytes]) -> None:
-    """Warn of numbers that are not between the bounds that their accessor gives, or do not reach them."""
+    """Warn of positions or indices not between the bounds that their accessor gives, or that do not reach these."""
     for kind in ("POSITION", "indices"):
         accessor = tree["accessors"][read[kind]] if kind in read else {}
         if "min" not in accessor or "max" not in accessor or not accessor["count"]:
@@ -181,7 +202,10 @@ def _check_corners(
     views: list[bytes],
     fail: Any,
 ) -> None:
-    """Refuse corners that make no triangles, or refer to vertices that are not there."""
+    """Refuse corners that make no triangles, or refer to vertices that are not there.
+
+    `indices` is the accessor of a primitive's table of corners; None where its `count` vertices are the corners.
+    """
     corners, owner = count, f"POSITION of {name}"
     if indices is not None:
         accessor = tree["accessors"][indices]

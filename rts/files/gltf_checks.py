@@ -85,7 +85,11 @@ def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[s
 
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
-    """Refuse a damaged file. Return it as a GLB if it holds numbers that trimesh would misread, else None."""
+    """Refuse a damaged file, of JSON `text` and, in a GLB, the `binary` part for its first buffer.
+
+    Returns:
+        The file as a GLB that trimesh reads rightly, if it holds numbers that trimesh would misread; else None.
+    """
     place = "its tree"
     try:
         tree = json.loads(text, parse_constant=_no_number, object_pairs_hook=_unique)
@@ -132,7 +136,13 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) -> bytes:
-    """A GLB with the accessors of `changes` converted: "u1", to colours of 8 bits; "f4", integers to fractions."""
+    """A GLB with some accessors converted; `tree` is changed in place.
+
+    Args:
+        tree: the JSON.
+        views: the bytes of each bufferView.
+        changes: accessor's index → "u1", to colours of 8 bits, or "f4", from integers to the fractions they stand for.
+    """
     blocks = [content + bytes(-len(content) % 4) for content in views]
     descriptions = [dict(view, buffer=0) for view in tree["bufferViews"]]
     for index, kind in sorted(changes.items()):
@@ -194,7 +204,11 @@ def _view(index: int, view: dict[str, Any], buffers: list[bytes], fail: Any) -> 
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[int, str]:
-    """Refuse unfit attributes. Return the accessors that trimesh would misread, with the types to convert them to."""
+    """Refuse an unfit mode, material or attribute; warn of points and lines.
+
+    Returns:
+        Indices of the accessors that trimesh would misread, with the types to convert them to; see `_changed`.
+    """
     mode = count_of(primitive.get("mode", 4))
     if mode > 5:
         raise fail(f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)")
@@ -252,7 +266,7 @@ def _check_material(
     file: Callable[[str], bytes],
     fail: Any,
 ) -> None:
-    """Refuse an invalid colour or texture, which trimesh would leave out."""
+    """Refuse an invalid colour or texture, which trimesh would leave out; warn of what is not read of a texture."""
     look = material.get("pbrMetallicRoughness", {})
     factor = np.array(look.get("baseColorFactor", [1.0] * 4), np.float64)
     if factor.shape != (4,):

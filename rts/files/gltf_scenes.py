@@ -15,7 +15,10 @@ _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
 def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
-    """Refuse nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots."""
+    """Refuse nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots.
+
+    Skins, instances and morph targets, which are not read, are warned of.
+    """
     nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
     parents = _check_forest(nodes, fail)
     shown = {index for index, node in enumerate(nodes) if "mesh" in node}
@@ -52,7 +55,7 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
 
 
 def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
-    """The parents of nodes, refused if nodes form no forest: a walk among them might never end."""
+    """Child → parent, indices of nodes; refused if nodes form no forest, since a walk among them might never end."""
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for child in map(count_of, node.get("children", [])):

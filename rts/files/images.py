@@ -110,7 +110,7 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
 
 
 def _duration(kind: str, fps: float) -> int:
-    """Milliseconds of a frame, rounded as the format needs; 0 for .mp4."""
+    """Milliseconds of a frame, rounded as the format needs; 0 for .mp4. Rates that it cannot hold are refused."""
     step = {".gif": 10, ".png": 1}.get(kind)
     if step is None:
         return 0
@@ -149,7 +149,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
 
 
 def _host(image: Any, name: str) -> np.ndarray:
-    """A checked image as NumPy floats, (H, W, 3 or 4) or (H, W)."""
+    """An image as NumPy floats, (H, W, 3 or 4), or (H, W) for one channel; all else is refused, as `name`."""
     shapes = "(H, W, 4), (H, W, 3), (H, W, 1) or (H, W)"
     pixels: Any = image
     if isinstance(image, (list, tuple)):
@@ -180,7 +180,7 @@ def _host(image: Any, name: str) -> np.ndarray:
 
 
 def _bytes(image: np.ndarray) -> np.ndarray:
-    """8-bit sRGB with straight alpha of a premultiplied linear image."""
+    """uint8 sRGB of a linear image, clipped to [0, 1]: (H, W, 4) premultiplied, made straight; (H, W, 3); or (H, W)."""
     array = image.astype(np.float64)
     if array.ndim == 3 and array.shape[2] == 4:
         alpha = np.clip(array[..., 3:], 0, 1)

@@ -149,7 +149,16 @@ def _welded(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _settled(
     rows: np.ndarray, table: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """One row for each vertex, and no table, if the faces around each vertex agree; otherwise rows and their table."""
+    """Rows of an attribute for a mesh: one for each vertex and no table, if the faces around each vertex agree.
+
+    Otherwise the rows that faces refer to, and their table.
+
+    Args:
+        rows: (A, C), values of the attribute.
+        table: (T, 3), the row of each corner.
+        faces: (T, 3), the vertex of each corner.
+        count: the number of vertices.
+    """
     if len(rows) == count and np.array_equal(table, faces):
         return rows, None
     by_vertex = np.zeros((count, rows.shape[1]), rows.dtype)

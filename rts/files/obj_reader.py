@@ -32,7 +32,18 @@ _NUMERIC = re.compile(r"[-+./eE\s]*\d[-+./eE\d\s]*")
 
 
 class _Lines:
-    """The statements of an OBJ file, by kind, each with its line number."""
+    """The statements of an OBJ file, by kind.
+
+    Attributes:
+        path: the file.
+        rows: "v", "vt", "vn" → texts of numbers.
+        numbers: "v", "vt", "vn" → line numbers of these.
+        faces: (line number, text of its corners, index of its material), with no negative index.
+        tags: (line number, text) of the statements "t".
+        libraries: names of files of materials.
+        materials: name → index, in order of first use; None, for faces before any "usemtl", is 0.
+        unknown: unknown keys, each with its first line.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -147,7 +158,8 @@ class _Lines:
     def polygons(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Zero-based indices of position, uv and normal (H, 3) of all corners, and the corner count of each face (F,).
 
-        An index that is not given is −1.
+        An index that is not given is −1. `counts` are the numbers of positions, uv and normals; indices beyond these
+        are refused.
         """
         corners: list[tuple[int, ...]] = []
         sizes: list[int] = []
@@ -166,7 +178,7 @@ class _Lines:
     def triangles(self, points: np.ndarray, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Zero-based indices of position, uv and normal (T, 3 corners, 3), and the material (T,).
 
-        See `rts.files.polygons.cut`; `points` are the positions (V, 3).
+        See `rts.files.polygons.cut`; `points` are the positions (V, 3), and `counts` those of `polygons`.
         """
         table, sizes = self.polygons(counts)
         cut, owner, forced = polygons.cut(points, table[:, 0], sizes)
@@ -236,7 +248,10 @@ def read_polygons(path: Path) -> Polygons:
 
 
 def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (V, 3), or (V, 6) with colours, texture coordinates and normals; a file without faces is refused."""
+    """Positions (V, 3), or (V, 6) with a colour each; texture coordinates (A, 2); and normals (B, 3).
+
+    A file without faces is refused.
+    """
     v, vt, vn = lines.array("v", (3, 6)), lines.array("vt", (2,)), lines.array("vn", (3,))
     if not lines.faces:
         what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
@@ -245,7 +260,7 @@ def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _colors(v: np.ndarray) -> np.ndarray | None:
-    """The colours (V, 3) in rows of positions; None if there are none."""
+    """The colours (V, 3) in [0, 1] of positions (V, 6), from 0 to 1 or to 255; None if these are (V, 3)."""
     return v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1) if v.shape[1] == 6 else None
 
 

@@ -111,9 +111,9 @@ def inside(folder: Path, name: str, referrer: Path, start: Path | None = None) -
 
 
 def cache_folder() -> Path:
-    """The folder of files that are costly to make, such as compiled libraries, which later processes read.
+    """The folder, which may not exist yet, of files that are costly to make, such as compiled libraries.
 
-    Without a home folder, one of this process alone.
+    Later processes read them. Without a home folder, it is a folder of this process alone.
     """
     try:
         if sys.platform == "darwin":

@@ -87,8 +87,9 @@ def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
         file: name → bytes of a file that it refers to.
 
     Raises:
-        InputError: rows or entries of lists are not as many as promised, or are not numbers; a face has less than 3
-            corners, or refers to a vertex that is not there; colours are no colours; a texture is no image.
+        InputError: there is no sound header; rows or entries of lists are not as many as promised, or are not numbers;
+            x, y and z or the faces' lists are missing; a face has less than 3 corners, or refers to a vertex that is
+            not there; colours are no colours; a texture is no image.
     """
 
     def fail(what: str) -> InputError:
@@ -101,7 +102,12 @@ def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
 
 
 def written(path: Path, kind: str, mesh: Mesh) -> bytes:
-    """A binary PLY of a mesh, its polygons cut into triangles.
+    """A binary PLY of a mesh, its polygons cut into triangles; without faces, of its vertices alone.
+
+    Args:
+        path: the path of the mesh's file, for errors.
+        kind: the name of its format, for errors.
+        mesh: the mesh.
 
     Raises:
         InputError: a face has less than 3 corners, or refers to a missing vertex; colours are no colours.
@@ -128,7 +134,7 @@ def written(path: Path, kind: str, mesh: Mesh) -> bytes:
 
 
 def _face_table(path: Path, mesh: Mesh, fail: Fail) -> tuple[list[str], bytes]:
-    """The lines of the header that promise the faces, and the faces, all of them triangles."""
+    """The lines of the header that promise the faces, and the rows of the faces, all triangles; there must be faces."""
     sizes, corners = mesh.faces or (np.zeros(0), np.zeros(0))
     count = len(mesh.vertices["x"])
     if sizes.min() < 3:
@@ -160,7 +166,10 @@ def _face_table(path: Path, mesh: Mesh, fail: Fail) -> tuple[list[str], bytes]:
 
 
 def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> dict[str, np.ndarray]:
-    """The columns, with colours as uint8; they may go to 1 as floats, to 255 or to 65535, and others are refused."""
+    """The columns, those of colours as uint8; as they are if red, green or blue is missing.
+
+    Floats may go to 1 or to 255, integers to 255, uint16 to 65535. Other colours are refused.
+    """
     if not {"red", "green", "blue"} <= set(columns):
         return columns
     names = [name for name in COLORS if name in columns]
@@ -214,7 +223,10 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
 
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
-    """The header's elements, layout and name of a texture; and the byte where the data begin."""
+    """The header's elements, layout and name of a texture, or ""; and the byte where the data begin.
+
+    The layout is "ascii", "binary_little_endian" or "binary_big_endian".
+    """
     # Lines of a Macintosh end in CR alone.
     newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", data) else b"\n"
     end = data.find(newline + b"end_header") + 1
@@ -261,7 +273,17 @@ def _joined(sizes: Any, entries: list[np.ndarray], dtype: str) -> Lists:
 
 
 def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) -> dict[str, dict[str, Any]]:
-    """The tables of a file in text, one row a line; blank lines do not count."""
+    """The tables of a file in text, one row a line; blank lines do not count.
+
+    Args:
+        elements: the tables that the header promises, in order.
+        before: the number of lines before `data`, for errors.
+        data: the bytes after the header.
+        fail: text → error.
+
+    Returns:
+        Element's name → property's name → column (R,), or `Lists` of R lists.
+    """
     lines = enumerate(lines_of(data), start=before + 1)
     numbered = [(number, line) for number, line in lines if line.strip(" \t\f\v")]
     if len(numbered) != sum(element.rows for element in elements):
@@ -276,7 +298,10 @@ def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) 
 
 
 def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray | list[list[float]]:
-    """The numbers in each of `rows` (line number, line): an array (R, C) if lines have equally many, else lists."""
+    """The numbers in each of `rows` (line number, line), at least one: (R, C) float64, or lists of unequal lengths.
+
+    A line of other than numbers is refused.
+    """
     try:
         lines = [line for _, line in rows]
         if is_plain("".join(lines)):
@@ -326,7 +351,10 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> di
 
 
 def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, int]] | None:
-    """Start and end of each property's entries in a row of numbers; None if the row is too long or too short."""
+    """Each property with start and end of its entries in a row of numbers; those of a list follow its length.
+
+    None if the row is too long or too short.
+    """
     places, at = [], 0
     for p in properties:
         length = 1
@@ -341,7 +369,7 @@ def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, i
 
 
 def _typed(element: Element, p: Property, values: np.ndarray, numbers: Any, fail: Fail) -> np.ndarray:
-    """Numbers (R, C) as the type that the header promises."""
+    """Values (R, C) as the type that the header promises, refused if that has no such integer. `numbers` are lines'."""
     with np.errstate(over="ignore", invalid="ignore"):
         typed = values.astype(p.type)
     wrong = (typed != values).any(axis=1) if p.type[0] != "f" else np.zeros(len(values), bool)
@@ -374,7 +402,10 @@ def _binary_tables(elements: list[Element], data: bytes, at: int, order: str, fa
 
 
 def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int] | None:
-    """The table, and the byte where it ends, if all rows have lists as long as the first; else None."""
+    """The table at byte `at`, by columns, and the byte where it ends, if all rows have lists as long as the first.
+
+    None otherwise, or where the file would end before. `order` is "<" for little-endian numbers, else ">".
+    """
     fields: list[Any] = []
     place = at
     for p in element.properties:
@@ -407,7 +438,7 @@ def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str
 
 
 def _different(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int]:
-    """The table, read row by row, and the byte where it ends; a struct.error if the file ends before."""
+    """The result of `_alike` for rows of any lengths, read row by row; a struct.error if the file ends before."""
     parts: dict[str, list[tuple[Any, ...]]] = {p.name: [] for p in element.properties}
     steps = [
         (parts[p.name], CODES[p.type], np.dtype(p.type).itemsize, struct.Struct(order + CODES[p.length_type or "u1"]))

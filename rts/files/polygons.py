@@ -51,7 +51,14 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
 
 
 def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Indices of the polygons whose fan has a triangle that faces away from the polygon."""
+    """Sorted indices of the polygons whose fan has a triangle that faces away from the polygon.
+
+    Args:
+        points: (V, 3).
+        triangles: (T, 3) into `points`, all fans.
+        owner: (T,), the polygon of each triangle.
+        sizes: (F,), the number of corners of each polygon.
+    """
     several = (sizes > 3)[owner]
     if not several.any():
         return np.zeros(0, np.int64)
@@ -66,7 +73,7 @@ def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes:
 
 
 def _ears(ring: np.ndarray) -> np.ndarray | None:
-    """Triangles (n − 2, 3) int of one polygon of corners (n, 3), or None if no triangles fit."""
+    """Triangles (n − 2, 3) int64, corners from 0 on, of one polygon of corners (n, 3); None if no triangles fit."""
     import mapbox_earcut
 
     size = np.abs(ring).max()
@@ -94,6 +101,11 @@ def _with_slivers(triangles: np.ndarray, count: int) -> np.ndarray:
     """The triangles of a polygon, and triangles without area for corners on a line that were left out.
 
     Around such corners, edges of the outline or of triangles have no partner. These edges make loops, which are filled.
+    If they do not, the triangles stay as they are.
+
+    Args:
+        triangles: (T, 3), corners from 0 to `count` − 1.
+        count: the number of corners of the polygon.
     """
     if len(triangles) == count - 2:
         return triangles

@@ -116,7 +116,10 @@ def _pieces(scene: Any, mesh_type: type, linear: bool) -> list[Piece]:
 
 
 def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray | None, np.ndarray | None]:
-    """Attributes "uv" and "colors", the texture and the material's colour."""
+    """Attributes "uv" and "colors", the texture and the material's colour, as in `Piece`.
+
+    Of GLB and glTF, `gltf`, alpha counts as the material's alphaMode says.
+    """
     visual, attributes, texture, color = mesh.visual, {}, None, None
     if visual.kind == "texture":
         if visual.uv is not None and len(visual.uv) == len(mesh.vertices):
@@ -145,7 +148,10 @@ def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray 
 def _cut_out(
     texture: np.ndarray | None, color: np.ndarray | None, cutoff: float
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """A texture (h, w, 4) and a material's colour (4,) whose product has alpha 1 from the cutoff on, and 0 below."""
+    """The texture and colour of a material, whose product has alpha 1 from the cutoff on, and 0 below.
+
+    A texture (h, w, 3) and a colour (3,) have no alpha, and stay as they are, as None does.
+    """
     factor = 1.0 if color is None or len(color) < 4 else color[3]
     if texture is not None and texture.shape[-1] == 4:
         alpha = (texture[..., 3:] * factor >= cutoff).astype(texture.dtype)

@@ -56,7 +56,14 @@ def refuse_independent(residuals: Callable, loss: Callable | None, parameters: T
     """Refuse a function whose results no derivative connects to the parameters. Called for a gradient of zero.
 
     A result is connected if the engine differentiates it: in torch it then has a graph, in jax it is traced. A gradient
-    may be zero though everything is connected, for example if nothing is in view.
+    may be zero though everything is connected, for example if nothing is in view. Nothing is refused if the engine
+    marks no array, so that independence cannot be seen.
+
+    Args:
+        residuals: parameters → array.
+        loss: residuals → array (); None for one that depends on them.
+        parameters: where to try; at least one number in arrays of the engine.
+        engine: the engine of the parameters.
 
     Raises:
         InputError: the residuals do not depend on the parameters, or the loss not on the residuals.
@@ -96,7 +103,8 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
         shapes: the shapes of these arrays.
 
     Returns:
-        Text such as "light.direction along (0.32, 0.53, 0.78), gain"; at most a few directions.
+        Text such as "light.direction along (0.32, 0.53, 0.78), gain": three entries, and the number of the others.
+        An array of which every number is undetermined goes by its name alone.
     """
     from scipy.linalg import qr
 
@@ -129,7 +137,17 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
 
 
 def _terms(name: str, shape: tuple, part: np.ndarray) -> list[str]:
-    """Terms for the entries of a direction in one array."""
+    """Words for the entries of a direction in one array, or none if all entries are zero.
+
+    Args:
+        name: the array's name.
+        shape: its shape.
+        part: (n,), its entries of a direction of length 1.
+
+    Returns:
+        One text, such as "light[2]" or "light along (0.32, 0.53, 0.78)". Of more than 4 entries, one text for each
+        that is not zero, the largest first.
+    """
     used = np.flatnonzero(part)
     if not len(used):
         return []

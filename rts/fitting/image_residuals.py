@@ -157,12 +157,12 @@ class ImageResiduals(Residuals):
         return self._loss
 
     def _take(self, target: Any, weights: Any) -> None:
-        """Set the target (H, W, ·) of one view, and its weights."""
+        """Set target and weights of one view, once checked. Shapes are those that the class says, without B."""
         self._target, self._channels = _checked_target(target, self.size, self._image_channels)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
 
     def __call__(self, parameters: Tree) -> Array:
-        """`weights * (image − target)`, of the target's shape, whatever the loss."""
+        """`weights * (image − target)`, of the target's shape, whatever the loss; blurred if a stage says so."""
         parts, camera = self.scene(parameters)
         options = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
         if not self._views:
@@ -173,7 +173,7 @@ class ImageResiduals(Residuals):
         )
 
     def _difference(self, image: Array, parameters: Tree) -> Array:
-        """`weights * (image − target)` of one view."""
+        """The residuals of one view, as of `__call__`, from its image (H, W, C + 1)."""
         image = self._beside_target(image, parameters)
         target, weights, _ = self._constants(image)
         self._refuse_other(image.shape[-1] - 1)
@@ -187,7 +187,7 @@ class ImageResiduals(Residuals):
         return namespace(image).reshape(difference, tuple(self._target.shape))
 
     def _refuse_other(self, channels: int) -> None:
-        """Refuse images of another number of channels than the target is for."""
+        """Refuse images whose number of channels besides alpha is not the `channels` that the caller gave."""
         if channels != self._image_channels:
             raise InputError(
                 f"the scene's shaders give {channels} channels besides alpha, and the target is for "
@@ -203,7 +203,10 @@ class ImageResiduals(Residuals):
         `sigma`, weighted differences are blurred, and Levenberg–Marquardt takes the Jacobian.
 
         Args:
-            stage: the resolution.
+            stage: the resolution, as a share of this one's.
+
+        Returns:
+            New residuals; the present ones stay as they are.
         """
         other = copy(self)
         other._views = [view.at_stage(stage) for view in self._views]
@@ -219,7 +222,14 @@ class ImageResiduals(Residuals):
         return other
 
     def scene(self, parameters: Tree) -> tuple[Any, Any]:
-        """Parts and camera for these parameters; of several views a list of cameras."""
+        """Parts as the user's function gives them, and the camera; for targets of several views a list of cameras.
+
+        Of residuals of one view among several, the camera is that view's. At a reduced resolution, cameras have no
+        aspect of their own.
+
+        Raises:
+            InputError: other results of the function, no camera, or not one camera for each view.
+        """
         parts, camera = self._scene_as_given(parameters)
         several = bool(self._views) or self._view is not None
         if not several and (not isinstance(camera, Camera) or camera.is_stacked):
@@ -262,9 +272,10 @@ class ImageResiduals(Residuals):
         return not overrides(self, "__call__", ImageResiduals)
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
-        """Mean loss () of the n residuals, JᵀSJ / n (U, U) and JᵀWr / n (U,) for the U numbers in the parameters.
+        """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for the U numbers in the parameters.
 
-        W and S are diagonals, ones for the loss "linear"; see `Loss.weights`.
+        J is the Jacobian of r. W and S are diagonals, ones for the loss "linear"; see `Loss.weights`. Of several views,
+        means over the views. The Jacobian (n, U) is made only where the splatter needs it, as for a blurred image.
         """
         if self._views and self._ordinary:
             self.scene(parameters)  # Refused where there are not as many cameras.
@@ -285,7 +296,10 @@ class ImageResiduals(Residuals):
         return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 
     def _swept(self, splatter: SummingSplatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` by the splatter's sums, in the bands of `render`; None where the splatter has no sums."""
+        """`normal_equations` without a Jacobian: by the splatter's method of that name, band of rows by band.
+
+        None where the splatter's method gives None.
+        """
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
             equations = self._swept_band(splatter, parameters, engine, top, rows)
@@ -300,7 +314,10 @@ class ImageResiduals(Residuals):
     def _swept_band(
         self, splatter: SummingSplatter, parameters: Tree, engine: Engine, top: int, rows: int
     ) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` of some rows of the image alone."""
+        """`normal_equations` of a band: of `rows` rows of the image, from row `top` on, with means over the band alone.
+
+        None where the splatter's method gives None.
+        """
         vector, unflatten = flatten(parameters)
         parts, camera = self.scene(parameters)
         size = rows, self.size[1]
@@ -319,7 +336,13 @@ class ImageResiduals(Residuals):
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
         def swept(shown: Callable[..., Splats], fields: _Fields, known: Splats) -> tuple[Array, Array, Array] | None:
-            """Normal equations of the splats that `shown` makes of parts, camera and context; `known` is constant."""
+            """Normal equations of one grid of cells, or None; see `_swept_band`.
+
+            Args:
+                shown: parts, the camera of the image, that of the band and a context → splats.
+                fields: target, weights and background of the grid's pixels.
+                known: the splats' cells and marks, which are constant; positions and colours are filled in.
+            """
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))
@@ -358,12 +381,21 @@ class ImageResiduals(Residuals):
         return value, matrix, gradient
 
     def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
-        """A tree in the engine of the parameters or of the target, whichever is not NumPy's."""
+        """The tree, its NumPy arrays moved to the engine of the parameters, or of the target if parameters are NumPy's.
+
+        Raises:
+            EngineError: torch and jax arrays meet.
+        """
         own, like = (self._target, self._weights, self._background), exemplar(parameters)
         return constants(tree, engine_of(tree, parameters, own), exemplar(own) if like is None else like)
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
-        """Target (H, W, C), weights (H, W, 1 or C) and background, with alpha, in the engine of an array."""
+        """Target, weights and background without derivatives, in the engine of the array `like`.
+
+        Returns:
+            Target (H, W, c) of c channels, 1 for alpha alone; weights (H, W, 1 or c) or None; and the background
+            (H, W, C + 1), opaque where it was given without alpha, or None.
+        """
         engine = engine_of(like, self._target, self._weights, self._background)
         fields = constants((self._target, self._weights, self._background), engine, like)
         xp = namespace(like)
@@ -380,7 +412,13 @@ class ImageResiduals(Residuals):
 
 
 class _Fields(NamedTuple):
-    """Target (h, w, C), weights and background of an image of h × w pixels; arrays or None."""
+    """Fields of an image of h × w pixels.
+
+    Attributes:
+        target: (h, w, c), alpha (c = 1), colours (3) or both (4).
+        weights: (h, w, 1) or (h, w, c); None for ones.
+        background: (h, w, 4), or None.
+    """
 
     target: Array
     weights: Array | None
@@ -392,7 +430,8 @@ def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]
 
     Args:
         fields: fields of the image, or of a band of it, (H, W, …).
-        pixel: (H, W), `fine.pixel` in the engine of the fields: the index of an active pixel in the layout, else −1.
+        pixel: (H, W), `fine.pixel` in the engine of the fields. Pixels with fine samples (active) have an index into
+            the picture that shows these side by side, the layout; the others have −1.
         fine: the fine samples, whose layout is h × w pixels without its apron.
 
     Returns:
@@ -430,7 +469,11 @@ def _checked_loss(loss: Any, f_scale: Any) -> Loss:
 
 
 def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tuple[Array, Array | None]:
-    """Target and weights in fewer pixels (h, w), with as many axes and channels as before."""
+    """Target (H, W, …) and weights in fewer pixels `size` (h, w), with as many axes and channels as before.
+
+    A pixel of the target is the mean over its area by squared weights, or the plain mean where weights are all zero. A
+    weight is the root of the mean square; None stays None.
+    """
     xp, kind = namespace(target, weights), target.shape
     weights, target = constants((weights, target), engine_of(target, weights), exemplar((target, weights)))
     target = xp.reshape(target, (*kind[:2], -1))
@@ -446,13 +489,19 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
 
 
 def _are_cameras(value: Any) -> TypeGuard[Cameras]:
-    """True for a camera or a list of cameras."""
+    """True for a camera, or a list or tuple of at least one."""
     listed: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
     return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
 
 
 def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
-    """The number of views of a target; None for one view, without an axis. `several` is True for several cameras."""
+    """The number of views of a target; None for a target of one view, without an axis of views.
+
+    Args:
+        target: as the user gave it. A list is of views if one of its entries has the size of the image.
+        size: (height, width).
+        several: True for several cameras. It decides where (H, W, ·) might be (B, H, W).
+    """
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape: Any = shape_of(target)
@@ -460,7 +509,7 @@ def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None
 
 
 def _of_views(weights: Any, count: int) -> Sequence[Any]:
-    """The weights of each view."""
+    """The weights of each of `count` views: an array or list as given, or a list of None. Another number is refused."""
     if weights is None:
         return [None] * count
     weight_count = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
@@ -474,7 +523,7 @@ def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
 
 
 def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[Array, int]:
-    """The target, checked for images of `channels` besides alpha, and its own number of channels."""
+    """The target, checked, its shape kept; and its own number of channels. Images have `channels` besides alpha."""
     if target is None:
         raise InputError("target is None; expected an array, such as what rts.load_image gives")
     target = from_numbers(target, "target")

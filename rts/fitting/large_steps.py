@@ -45,7 +45,8 @@ class LargeSteps:
         smoothness: λ.
 
     Raises:
-        InputError: an argument is of another kind or shape, or faces name a vertex that is not there.
+        InputError: an argument is of another kind or shape, faces name a vertex that is not there, or no edge; or the
+            smoothness is traced or out of range.
     """
 
     def __init__(self, faces: Any, count: int, smoothness: float = 19.0):
@@ -123,7 +124,13 @@ class LargeSteps:
 
 
 def _factorised(edges: np.ndarray, diagonal: np.ndarray, smoothness: float) -> Any:
-    """A function (V, C) → (V, C) that solves with the symmetric matrix of a diagonal, and −λ at each edge."""
+    """A function (V, C) → (V, C), float64, that solves with a symmetric positive definite matrix.
+
+    Args:
+        edges: (E, 2) integers, each edge once.
+        diagonal: (V,), the matrix's diagonal.
+        smoothness: λ; the matrix has −λ at both ends of an edge, and zeros elsewhere.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.linalg import splu
 
@@ -136,7 +143,10 @@ def _factorised(edges: np.ndarray, diagonal: np.ndarray, smoothness: float) -> A
 
 
 def _specification(u: Array, *, steps: LargeSteps) -> Array:
-    """Chebyshev's iteration (Saad 2003, *Iterative Methods for Sparse Linear Systems*, algorithm 12.1), linear in u."""
+    """Vertices v (V, 3) with (I + λL) v = u (V, 3), up to the dtype's rounding; array code, linear in u.
+
+    Chebyshev's iteration (Saad 2003, *Iterative Methods for Sparse Linear Systems*, algorithm 12.1).
+    """
     half = steps._spread / 2
     middle, root = 1 + half, math.sqrt(1 + 2 * half)  # Eigenvalues are from 1 to 1 + 2 · half.
     eps = float(namespace(u).finfo(u.dtype).eps)

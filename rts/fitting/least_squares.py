@@ -27,7 +27,14 @@ RESOLVED = 10.0
 
 
 class _Linear(NamedTuple):
-    """Residuals linearised at a point: their loss, and the normal equations JᵀSJ and JᵀWr over n."""
+    """Residuals r linearised at a point, on the host.
+
+    Attributes:
+        value: the mean loss of the n residuals.
+        matrix: (U, U) float64, JᵀSJ / n for the Jacobian J; W and S are those of `Loss.weights`.
+        gradient: (U,) float64, JᵀWr / n: half the gradient of the loss.
+        rounding: the machine epsilon of the dtype that these were computed in.
+    """
 
     value: float
     matrix: np.ndarray
@@ -53,6 +60,11 @@ class _Model:
     Args:
         linear: the normal equations.
         sizes: the number of entries of each array of the parameters.
+
+    Attributes:
+        least: the least damping to use, and the eigenvalue below which a direction counts as undetermined.
+        open: (U, k), columns that span the undetermined directions, in numbers of the parameters.
+        units: (U,), factors that make changes of different arrays comparable.
     """
 
     def __init__(self, linear: _Linear, sizes: Sequence[int]):
@@ -71,7 +83,11 @@ class _Model:
         self._open = np.linalg.qr(self.open * self.units[:, None])[0] if self.open.shape[1] else None
 
     def step(self, damping: float) -> tuple[np.ndarray, float]:
-        """The step (U,), and the gain that the model predicts for it."""
+        """The step (U,), and how far the loss falls by it, as the model predicts.
+
+        Args:
+            damping: positive number, added to the eigenvalues of the scaled JᵀSJ.
+        """
         along = self._downhill / (self._values + damping)
         step = self._directions @ along
         if self._open is not None:
@@ -87,20 +103,20 @@ class _Control:
         damping: the damping of the next step.
         growth: the factor by which it grows if the step gains nothing.
         promising: True if the last step gained.
-        jumps: True if a step that should have gained more than rounding gained nothing.
+        jumps: True if a short step that should have gained more than rounding gained nothing, since the last gain.
     """
 
     def __init__(self):
         self.damping, self.growth, self.promising, self.jumps = FIRST_DAMPING, 2.0, True, False
 
     def packed(self, vector: np.ndarray) -> bytes:
-        """The control, and the vector that it belongs to, as bytes."""
+        """The control, and the vector (U,) of parameters that it belongs to, as bytes."""
         file = io.BytesIO()
         np.savez(file, vector=vector, **vars(self))
         return file.getvalue()
 
     def unpacked(self, packed: bytes) -> np.ndarray:
-        """The vector of `packed`; the control is set, too."""
+        """Set the control to the state in bytes of `packed`. Returns the vector (U,)."""
         with np.load(io.BytesIO(packed)) as known:
             self.__dict__.update({name: known[name].item() for name in vars(self)})
             return known["vector"]
@@ -138,8 +154,12 @@ def levenberg_marquardt(
         jit: True to compile.
         loss: the loss of the residuals.
         own: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
-        supersample: samples a pixel along each axis, for residuals of an image.
+        supersample: samples a pixel along each axis, for words on why the fit stopped; None if no images are fitted.
         saving: keeps checkpoints, and gives the state to go on from.
+
+    Raises:
+        InputError: the terms are drawn in batches; or at the start the residuals do not depend on the parameters, or
+            loss or Jacobian is not finite.
     """
     if not terms.whole:
         raise InputError('method "lm" needs all terms at every step; leave out batch and window, or use "adam"')
@@ -208,7 +228,7 @@ def levenberg_marquardt(
 
 
 def _loss_rounding(linear: _Linear, count: int) -> float:
-    """Rounding error of a mean loss of `count` residuals, whose terms are of the size of one."""
+    """Rounding error of a mean loss of `count` residuals, each the difference of two numbers of about 1."""
     return linear.rounding * (linear.value + 2 * math.sqrt(linear.value / max(count, 1)))
 
 
@@ -231,7 +251,16 @@ def _no_step(jumps: bool, supersample: int | None) -> str:
 
 
 def _note_open(model: _Model, parameters: Tree, sizes: Sequence[int], run: Run) -> None:
-    """Add a remark to the run on directions that the residuals do not determine; arrays that never mattered are out."""
+    """Add a remark to the run on directions that the residuals do not determine, if there are some.
+
+    Arrays whose gradient was zero throughout are left out: another remark names these.
+
+    Args:
+        model: the model at the last accepted step.
+        parameters: a tree with the names and shapes of the parameters.
+        sizes: the number of entries of each array.
+        run: the run, which knows whose gradient was not zero.
+    """
     names, arrays = zip(*named_leaves(parameters), strict=True)
     mattered = np.concatenate([np.full(n, m) for n, m in zip(sizes, run.mattered, strict=True)])
     # Without those arrays, columns may depend on each other.
@@ -245,7 +274,17 @@ def _note_open(model: _Model, parameters: Tree, sizes: Sequence[int], run: Run) 
 def normal_equations(
     residuals: Callable[[Tree], Array], parameters: Tree, engine: Engine, loss: Loss = SQUARE
 ) -> tuple[Array, Array, Array]:
-    """Mean loss of the n residuals, JᵀSJ / n and JᵀWr / n, by the Jacobian; see `rts.Residuals`."""
+    """Normal equations of residuals by their whole Jacobian J, (n, U); see `Residuals.normal_equations`.
+
+    Args:
+        residuals: parameters → array of n residuals r, of any shape.
+        parameters: the point, a tree of U numbers in arrays of the engine.
+        engine: the engine, which has derivatives.
+        loss: the loss of each residual.
+
+    Returns:
+        Mean loss (), JᵀSJ / n (U, U) and JᵀWr / n (U,), where W and S are diagonals of `loss.weights(r)`.
+    """
     xp = engine.namespace
     vector, unflatten = flatten(parameters)
     r, rows = engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,)))(vector)
@@ -262,7 +301,10 @@ def normal_equations(
 def _least_squares(
     terms: Terms, loss: Loss, own: bool, parameters: Tree, engine: Engine, run: Run, jit: bool
 ) -> tuple[Callable, Callable]:
-    """Two functions of a vector (U,): to a `_Linear`, loss and normal equations on the host; and to the loss alone."""
+    """Two functions of a vector (U,) of parameters: to a `_Linear`, on the host; and to the loss alone, a float.
+
+    All terms are computed, and their mean is taken; for the arguments see `levenberg_marquardt`.
+    """
     vector, unflatten = flatten(parameters)
 
     def equations(v: Array, data: Tree) -> tuple[Array, Array, Array]:
@@ -302,7 +344,10 @@ def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, 
 
 
 def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
-    """All leaves as one vector, and the function that makes a tree like `parameters` of such a vector."""
+    """All leaves, in order, as one vector (U,), and the function that makes a tree like `parameters` of such a vector.
+
+    The tree has the shapes and dtypes of `parameters`. The vector has the dtype that the engine promotes these to.
+    """
     arrays = list(leaves(parameters))
     xp = namespace(*arrays)
 

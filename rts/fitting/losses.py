@@ -36,7 +36,7 @@ The limits differ from the forms by less than the rounding of float64.
 
 
 def _split(xp: Any, r: Array, f_scale: float) -> tuple[Array, Array, Array]:
-    """Marks of far residuals, |r| / s of these (1 elsewhere), and r / s of the near ones (0 elsewhere)."""
+    """Marks of far residuals, with |r| / s > `FAR`; |r| / s of these (others 1); and r / s of the others (these 0)."""
     ratio = r / f_scale
     far = abs(ratio) > FAR
     return far, xp.where(far, abs(ratio), 1.0), xp.where(far, 0.0, ratio)

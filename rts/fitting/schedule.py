@@ -62,8 +62,8 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
 
     An outline is pulled over one pixel only, to whichever outline is nearest, the right one or not. Blurred images
     show where most of an object is. So the first stage is of few pixels, with many samples each, and blurred by a
-    sixteenth of the image. Later stages double the resolution; the last is the image itself, or as `largest` says. From
-    how far off poses are found: benchmarks/RESULTS.md, "Basin of convergence".
+    sixteenth of the longer side. Later stages double the resolution; the last is the image itself, or as `largest`
+    says. From how far off poses are found: benchmarks/RESULTS.md, "Basin of convergence".
 
     Args:
         size: (height, width) of the residuals.
@@ -92,7 +92,7 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
 
 
 def checked_schedule(schedule: Any) -> Sequence[Stage]:
-    """The stages of a schedule that a user gave, a list or tuple of at least one `Stage`; others are refused."""
+    """The stages, a tuple, of a schedule that a user gave: a list or tuple of at least one `Stage`. Refuses others."""
     stages = tuple(schedule) if isinstance(schedule, (list, tuple)) else ()
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise InputError(
@@ -110,12 +110,12 @@ def box_filtered(image: Array, size: tuple[int, int]) -> Array:
 
 
 def blurred(image: Array, sigma: float) -> Array:
-    """An image (H, W, C) blurred by a Gaussian, as if it were zero beyond its edges; `sigma` is in pixels."""
+    """An image (H, W, C) blurred by a Gaussian, as if it were zero beyond its edges; `sigma` > 0 is in pixels."""
     return _along_axes(image, *(_gaussian(n, sigma) for n in image.shape[:2]))
 
 
 def _along_axes(image: Array, down: np.ndarray, across: np.ndarray) -> Array:
-    """The image (H, W, C) with its columns multiplied by a matrix (h, H), and its rows by one (w, W)."""
+    """The image (h, w, C): columns of (H, W, C) multiplied by the matrix `down` (h, H), rows by `across` (w, W)."""
     xp = namespace(image)
     down, across = (xp.astype(x, image.dtype, copy=False) for x in constants((down, across), engine_of(image), image))
     height, width, channels = image.shape
@@ -124,14 +124,14 @@ def _along_axes(image: Array, down: np.ndarray, across: np.ndarray) -> Array:
 
 
 def _box(few: int, many: int) -> np.ndarray:
-    """Weights (few, many) of a row's pixels in each of fewer pixels."""
+    """Weights (few, many) of the `many` pixels of a row in each of fewer pixels over the same length; rows sum to 1."""
     edges, cells = np.arange(few + 1) * (many / few), np.arange(many + 1.0)
     shared = np.minimum(edges[1:, None], cells[1:]) - np.maximum(edges[:-1, None], cells[:-1])
     return shared.clip(0) * (few / many)
 
 
 def _gaussian(count: int, sigma: float) -> np.ndarray:
-    """Weights (count, count) of a row's pixels in each of its blurred pixels, without pixels beyond its ends."""
+    """Weights (count, count) of a row's pixels in each blurred pixel; they sum to less than 1 near the row's ends."""
     reach = math.ceil(4 * sigma)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     taps /= taps.sum()

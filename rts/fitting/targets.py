@@ -14,12 +14,18 @@ LARGEST = 2.0
 
 
 def check_range(target: Array, count: int, channels: int) -> None:
-    """Refuse alpha far above 1, and warn of such colours; channels that are no colours may have any value.
+    """Refuse alpha far above 1, and warn of such colours. Unless `channels` is 3, they may have any value.
 
     Args:
-        target: (H, W) or (H, W, C).
-        count: its number of channels.
+        target: (H, W) or (H, W, count), floating.
+        count: the target's channels: 1 is alpha, `channels` has no alpha, and `channels + 1` has alpha last.
         channels: the number of channels of the image besides alpha.
+
+    Raises:
+        InputError: an alpha above 2.
+
+    Warns:
+        InputWarning: a colour above 2.
     """
     alpha = target if count == 1 else target[..., -1:] if count == channels + 1 else None
     most = 0.0 if alpha is None else largest(alpha)
@@ -34,7 +40,7 @@ def check_range(target: Array, count: int, channels: int) -> None:
 
 
 def largest(values: Array) -> float:
-    """The largest of some values, zero where they are traced."""
+    """The largest of an array's values, at least one; 0 if they are traced."""
     known = value_of(namespace(values).max(values))
     return 0.0 if known is None else float(known.max())
 

@@ -67,7 +67,7 @@ class ARAP(OfRestShape):
         return spokes - engine.by_host(self._turned_by_host, self._turned, still)[0]
 
     def _turned_by_host(self, spokes: Array) -> tuple[Array, ...]:
-        """The edges at rest (2E, 3), times the roots of their weights, rotated to fit `spokes`; by a compiled loop."""
+        """A tuple of one: edges at rest (2E, 3), times roots of their weights, rotated to fit `spokes`; by a loop."""
         engine = engine_of(spokes)
         dtype = np.float64 if engine.namespace.finfo(spokes.dtype).bits == 64 else np.float32
 

@@ -15,11 +15,11 @@ SWEEPS = 12
 
 
 def turned(spokes: np.ndarray, rest: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """The edges at rest, rotated around each vertex to come nearest to the present edges.
+    """The edges at rest, those of each vertex turned by one rotation to come nearest to the present edges.
 
     Args:
-        spokes: (M, 3) float32 or float64, the present edges, ordered by vertex.
-        rest: (M, 3) float64, the edges at rest.
+        spokes: (M, 3) float32 or float64, the present edges, ordered by the vertex that they begin at.
+        rest: (M, 3) float64, the edges at rest, in the same order.
         starts: (V + 1,) the index of the first edge of each vertex, then M.
 
     Returns:
@@ -50,9 +50,10 @@ def _turn(start, stop, spokes, rest, starts, out):
 
 @numba.njit(error_model="numpy")
 def _nearest_rotation(columns, axes, rotation):
-    """Fill `rotation` with the R of largest tr(Rᵀ M); the identity if M is zero or not finite.
+    """Fill `rotation` (3, 3) with the R of largest tr(Rᵀ M); the identity if M is zero or holds infinity.
 
-    `columns` (3, 3) holds the columns of M as rows. It and the scratch array `axes` (3, 3) are overwritten.
+    `columns` (3, 3) holds the columns of M as rows. It and the scratch array `axes` (3, 3) are overwritten. If M holds
+    NaN, R is NaN or any rotation.
 
     Columns are rotated in pairs until all are orthogonal (Hestenes 1958): M V = U Σ. The axis of the least singular
     value follows from the other two, so that U Vᵀ is a rotation. R is unique even if the least singular value is zero.
@@ -100,9 +101,9 @@ def _length(x):
 
 @numba.njit(error_model="numpy")
 def _orthogonalise(columns, axes, p, q):
-    """Rotate rows p and q of `columns`, and of `axes` alike, until those of `columns` are orthogonal.
+    """Rotate rows p and q of `columns` (3, 3), and of `axes` alike, so that those of `columns` become orthogonal.
 
-    Returns False if they were already.
+    Returns False, and changes nothing, if they were already, or hold NaN.
     """
     first, second, both = 0.0, 0.0, 0.0
     for r in range(3):

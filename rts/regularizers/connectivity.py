@@ -46,8 +46,8 @@ def pairs_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         faces: (T, 3) integers.
 
     Returns:
-        Pairs (P, 2) int32; and (P,) float64, 1 where the faces are oriented alike, so that they pass their edge in
-        opposite directions, and −1 elsewhere.
+        Pairs (P, 2) int32 of indices of faces; and (P,) float64, 1 where the faces are oriented alike, so that they
+        pass their edge in opposite directions, and −1 elsewhere.
 
     Raises:
         InputError: there is no edge.

@@ -83,7 +83,7 @@ def _table(
     """Values of each vertex in a table of `WIDTH` columns; vertices with more values have further rows.
 
     Args:
-        vertex: (M,) integers, in order.
+        vertex: (M,) integers, sorted; a vertex occurs once for each of its values.
         values: (M,) integers, one of the values of each of these vertices.
         shares: (M,) float, the share of each value.
         count: the number of vertices.

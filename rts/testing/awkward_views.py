@@ -15,7 +15,7 @@ from rts.testing.derivatives import joined, split
 
 
 def image_and_gradient(part: Part, camera: Camera, sampler: Any, engine: Engine) -> tuple[np.ndarray, list]:
-    """The image of a part, and the gradient in θ of the image's sum under random weights."""
+    """The image of a part, and the gradient of its sum under random weights: an array for each floating leaf of θ."""
     values, join = split(part.theta)
     weights = engine.constant(derivatives.single(np.random.default_rng(0).random((*scenes.SIZE, 4))))
 

@@ -393,7 +393,7 @@ class EngineConformance(Conformance):
 
 
 def _curvature(engine: Engine, f: Callable, operands: list, along: list, weights: np.ndarray) -> float:
-    """The derivative of ⟨∇, d⟩ along d, ∇ the gradient of ⟨weights, f⟩."""
+    """The second derivative of ⟨weights, f⟩ at the operands, along the direction `along`: a number."""
     xp, w = engine.namespace, engine.constant(weights)
     d = [engine.constant(x.astype(np.float32)) for x in along]
 

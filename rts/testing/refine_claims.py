@@ -49,7 +49,16 @@ def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: st
 
 
 def _off_rays(part: Part, surface: TriangleSurface, inputs: Tree, proxy: Proxy, local: Camera, view: str) -> np.ndarray:
-    """Distances of refined samples from their rays, pixels."""
+    """Distances (M,) of refined samples from their rays, pixels, each at the sample's depth; [0] if none are left.
+
+    Args:
+        part: the part.
+        surface: its surface.
+        inputs: the result of `proxy_inputs`.
+        proxy: the triangles to start from.
+        local: the camera, in the part's local space.
+        view: the name of the view, for messages.
+    """
     sampler = registry.instance("rts.samplers", "reference")
     lifted = lift(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
     try:

@@ -402,7 +402,7 @@ def _new(sampler: Any) -> Any:
 
 
 def claim_like(actual: Sampled, expected: Expected, what: str) -> Silhouettes:
-    """Fail unless samples have the expected ids and depths; at silhouettes ids may differ. Returns their counts."""
+    """Fail unless samples have the expected ids and depths; at silhouettes ids may differ. Returns counts of these."""
     sampled, edge, source = expected
     different = (_ids(actual) != _ids(sampled)).any(axis=(0, -1)) | (_covered(actual) != _covered(sampled)).any(axis=0)
     inside = different & ~edge

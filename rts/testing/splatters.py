@@ -219,7 +219,7 @@ class SplatterConformance(Conformance):
 
 
 def everywhere(layers: int) -> Splats:
-    """A white sample at the centre of every cell, layer k at depth 2 + k."""
+    """A white sample at the centre of every cell, layer k at depth 2 + k; rows are in order of layers, then cells."""
     k, y, x = np.indices((layers, HEIGHT, WIDTH))
     positions = np.stack([x + 0.5, y + 0.5, 2.0 + k], -1).reshape(-1, 3).astype(np.float32)
     return Splats(positions, np.ones((len(positions), 4), np.float32), Cells(_numbered(layers)))
@@ -255,7 +255,10 @@ def steps() -> Splats:
 
 
 def two_colors() -> tuple[Splats, np.ndarray]:
-    """Opaque samples at centres, of one colour on the left and of another on the right, with cells settled in both."""
+    """Opaque samples at centres, of one colour on the left and of another on the right; and a table of settled cells.
+
+    Settled cells are inside of either colour. The table (H, W) holds the row of a sample of their colour, −1 elsewhere.
+    """
     splats, settled = everywhere(1), np.full((HEIGHT, WIDTH), -1, np.int32)
     rgba = np.where(_on_the_left(splats)[:, None], LEFT, RIGHT).astype(np.float32)
     settled[1:-1, 1 : SEAM - 1] = splats.row[0, 0, SEAM - 1]
@@ -298,7 +301,7 @@ def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list],
 
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
-    """The image's derivative when positions move along a direction."""
+    """The image's derivative (h, w, 4), without border, when positions (N, 3) move along a direction (N, 3)."""
     given, d = derivatives.on(engine, (splats, [along]))
     image = _instance(splatter).cropped
     return engine.to_numpy(engine.jvp(lambda x: image(given.replace(positions=x[0])), [given.positions], d)[1])

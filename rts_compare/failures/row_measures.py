@@ -75,6 +75,7 @@ class Derivative(NamedTuple):
 
         Raises:
             Unable: the method does not apply.
+            Unsuited: see `pixel_of`, where it is needed.
         """
         scene = self.scene()
         mode = next(iter(scene.directions)) if self.mode is None else self.mode

@@ -215,7 +215,11 @@ def _mesh(part: Part, rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cuts(index: int, part: Part, to_camera: np.ndarray, focal: float) -> int:
-    """The first of `CUTS` that makes all edges shorter than `EDGE` on screen, or adds no faces; else the last."""
+    """The first of `CUTS` that makes all edges shorter than `EDGE` on screen, or adds no faces; else the last.
+
+    Raises:
+        Unsuited: the part cannot be made a mesh.
+    """
     if not hasattr(part.surface, "tessellate"):
         raise Unsuited(f"part {index} is no mesh, and cannot be made one")
     before = 0
@@ -234,7 +238,11 @@ def _cuts(index: int, part: Part, to_camera: np.ndarray, focal: float) -> int:
 
 
 def _colors(index: int, part: Part, rate: int, count: int) -> np.ndarray:
-    """Colours (V, 3) of the vertices of a part."""
+    """Colours (V, 3) of the `count` vertices of a part, as its shader shows them; white for silhouettes.
+
+    Raises:
+        Unsuited: another shader, a texture, or colours that are translucent or not those of vertices.
+    """
     theta: Mapping[str, Any] = part.theta
     colors = np.ones((count, 3))
     if type(part.shader) is plugin("rts.shaders", "silhouette"):
@@ -251,7 +259,7 @@ def _colors(index: int, part: Part, rate: int, count: int) -> np.ndarray:
 
 
 def _of_vertices(index: int, part: Part, rate: int) -> np.ndarray:
-    """Colours (V, C) of vertices, as in θ."""
+    """Colours (V, C) of vertices, as in θ; of control points, blended to the cut patches. Others are `Unsuited`."""
     colors = part.theta.get("colors")
     if isinstance(colors, np.ndarray):
         if _is_mesh(part) and part.surface.sample_widths[0] == 3:

@@ -89,7 +89,7 @@ def nearest(
 
 
 def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A sphere and a box about points (N, 3) that are seen from a camera: vertices and faces, world space."""
+    """A sphere and a box about points (N, 3) that a camera sees: (vertices (V, 3), world, faces (T, 3)) of each."""
     view = np.asarray(engine_of(camera.view).to_numpy(camera.view), np.float64)
     local = position @ view[:3, :3].T + view[:3, 3]
     low, high = np.percentile(local, 1, axis=0), np.percentile(local, 99, axis=0)
@@ -111,7 +111,16 @@ def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.n
 def _scene(
     subject: Subject, number: Number, vertices: np.ndarray, faces: np.ndarray, motion: np.ndarray, parameters: Tree
 ) -> tuple[Part, Camera]:
-    """The fitted shape and the scene's camera, both moved as the number moves them."""
+    """The fitted shape and the scene's camera, both moved as the number moves them.
+
+    Args:
+        subject: the scene.
+        number: the number that moves.
+        vertices: (V, 3) of the shape, world space.
+        faces: (T, 3) of the shape.
+        motion: (4, 3), from a point (x, y, z, 1) to its velocity for a unit of the number.
+        parameters: {"by": (), the change of the number}.
+    """
     by, engine = parameters["by"], subject.engine
     steps = iter(leaves(number.direction))
     camera = subject.shown(map_leaves(lambda p: p + by * next(steps), subject.parameters))[1]

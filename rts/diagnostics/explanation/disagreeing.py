@@ -50,7 +50,7 @@ class _Error(NamedTuple):
 
     @classmethod
     def of(cls, pushed: np.ndarray, true: np.ndarray) -> _Error:
-        """The error of a derivative image."""
+        """The error of a derivative image (H, W, 4) against the true one."""
         image = low_pass(pushed - true)
         return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
 
@@ -97,26 +97,33 @@ class _Case:
         return self.error.norm > max(NOISY * self.noise, LEFT * self.whole.norm)
 
     def strong(self, error: _Error) -> np.ndarray:
-        """Mask (H, W) bool of the pixels that disagree most."""
+        """Mask (H, W) bool of the pixels that disagree most, both in `error` and before any experiment."""
         size = np.abs(self.number.pushed - self.number.true).max(axis=-1)
         energy = error.energy
         return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
 
     def push(self, change: Change | None = None, **options: Any) -> np.ndarray:
-        """The derivative image with the options that helped, a change of the scene and further options."""
+        """The derivative image (H, W, 4), for a step of the slope's length, as `Number.pushed` is.
+
+        The scene is drawn with the options that helped so far, a change, and further options, none of which are kept.
+        """
         options = {**self.options, **options}
         derivative = self.subject.push(self.number.direction, change, connect=self.connected, **options)
         return derivative * self.number.slope.step
 
     def try_connected(self) -> _Error | None:
-        """The result of `try_out` with derivatives for the arrays that no derivative reaches."""
+        """The result of `try_out` if arrays that no derivative reaches are differentiated; kept only if this helps."""
         self.connected = True
         before = self.try_out()
         self.connected = before is not None
         return before
 
     def try_out(self, **options: Any) -> _Error | None:
-        """Try options; if they make the error much smaller, keep them and return the error before, otherwise None."""
+        """Try options; if they make the error in the pixels `left` much smaller, keep them.
+
+        Returns:
+            The error before; None if the options are not kept.
+        """
         changed = {**self.options, **options}
         pushed = self.push(**options)
         error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
@@ -132,7 +139,10 @@ class _Case:
 
 
 def _constants(case: _Case, touched: Touched) -> None:
-    """Name arrays that no derivative reaches, if the number's derivatives would agree with these differentiated."""
+    """Add findings on arrays that no derivative reaches, if derivatives would agree with these differentiated.
+
+    Also if all that the number changes is such arrays, and the derivative image is zero.
+    """
     constants = why_constant(case.subject, touched)
     if not constants:
         return
@@ -147,7 +157,7 @@ def _constants(case: _Case, touched: Touched) -> None:
 
 
 def _outlines(case: _Case, touched: Touched) -> None:
-    """Name the splatter if the splatter "visible", in its place, makes the error much smaller."""
+    """Add a finding on the splatter if the splatter "visible", in its place, makes the error much smaller."""
     splatter = case.subject.options.get("splatter", "auto")
     if case.subject.splats_as("visible"):
         return
@@ -160,7 +170,7 @@ def _outlines(case: _Case, touched: Touched) -> None:
 
 
 def _transparent(case: _Case, touched: Touched) -> None:
-    """Name shaders that are not opaque, if the splatter "visible" in place of another makes the error much smaller."""
+    """Add a finding on shaders that are not opaque, if the splatter "visible" makes the error much smaller."""
     if case.subject.opaque or case.subject.splats_as("visible"):
         return
     before, advice = case.try_out(splatter="visible"), "Say splatter='visible'."
@@ -189,7 +199,7 @@ def _layers(case: _Case, touched: Touched) -> None:
 
 
 def _bounded(case: _Case, touched: Touched) -> None:
-    """Name surfaces that bound near-singular derivatives, if much of the error is where the bounds matter."""
+    """Add a finding on surfaces that bound near-singular derivatives, if much of the error is where bounds matter."""
     if all(part.surface.unbounded() is None for part in case.subject.parts):
         return
     change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
@@ -205,7 +215,7 @@ def _bounded(case: _Case, touched: Touched) -> None:
 
 
 def _crossing(case: _Case, touched: Touched) -> None:
-    """Name lines where parts pass through one another, if much of the error is beside them."""
+    """Add a finding on lines where parts pass through one another, if much of the error is beside these lines."""
     subject = case.subject
     if len(subject.parts) < 2:
         return
@@ -228,7 +238,7 @@ def _crossing(case: _Case, touched: Touched) -> None:
 
 
 def _colors(case: _Case, touched: Touched) -> None:
-    """Name colours finer than pixels: the error lies inside of surfaces, and more samples remove it."""
+    """Add a finding on colours finer than pixels, if the error lies inside of surfaces, and more samples halve it."""
     subject, number = case.subject, case.number
     taken = subject.supersample
     inside = ~subject.fineness.outlines
@@ -247,7 +257,7 @@ def _colors(case: _Case, touched: Touched) -> None:
 
 
 def _samples(case: _Case, touched: Touched) -> None:
-    """Name too few samples, for thin shapes or for outlines."""
+    """Add findings on too few samples, for thin shapes or for outlines, if more make the error much smaller."""
     taken = case.subject.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
@@ -275,7 +285,16 @@ def _each(count: int) -> str:
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
-    """Name the reason `kind` if pixels at most `widen` from the mask hold much of the remaining error."""
+    """Add a finding of a `kind` if pixels near the mask hold much of the remaining error; these are then explained.
+
+    Args:
+        case: gains a finding, and loses these pixels from `left` and `error`; else it stays as it is.
+        mask: (H, W) bool; nothing is named if it is empty.
+        kind: a key of `KINDS`.
+        because: see `Finding`.
+        advice: see `Finding`.
+        widen: pixels count up to this many steps from the mask, along rows and columns.
+    """
     from scipy.ndimage import binary_dilation
 
     if not mask.any():
@@ -292,7 +311,7 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
 
 
 def _bias(case: _Case, touched: Touched) -> None:
-    """Name a bias of the library that a sphere or a box shows, too; otherwise the cause is unknown.
+    """Add a finding on a bias of the library that a sphere or a box shows, too; else one of the kind "unknown".
 
     Does nothing if other findings leave less than half of the error.
     """
@@ -345,6 +364,9 @@ def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[
         number: the number.
         touched: the arrays of the scene that the number changes.
         going: a function that is true while there is time for another experiment.
+
+    Returns:
+        Findings; none only if time ran out.
     """
     case = _Case(subject, number)
     for experiment in EXPERIMENTS:

@@ -81,7 +81,10 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
 
 
 def differenced(subject: Subject, number: Number, samples: int) -> Number:
-    """`number` with finite differences by `samples`² and (`samples` + 1)² samples a pixel filled in."""
+    """A copy of `number` with new finite differences, by `samples`² and (`samples` + 1)² samples a pixel.
+
+    These are `true`, `noise`, and `difference` and `error` of its slope.
+    """
     step, direction = number.slope.step, number.direction
     to_numpy = subject.engine.to_numpy
 
@@ -118,7 +121,7 @@ def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
 
 
 def chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Sorted indices of `count` entries, or all: half are the largest or NaN, the others random, by a fixed seed."""
+    """Sorted indices of `count` entries of (n,), or all: half the largest or NaN, others random, by a fixed seed."""
     if gradient.size <= count:
         return list(range(gradient.size))
     largest = np.argsort(-np.nan_to_num(np.abs(gradient), nan=np.inf), kind="stable")[: (count + 1) // 2]

@@ -98,7 +98,17 @@ class Subject:
         return scene
 
     def drawn(self, scene: tuple[Any, Camera], change: Change | None = None, size: Any = None, **options: Any) -> Array:
-        """The image (H, W, 4) of a scene after a change; an image in NumPy becomes a constant of the engine."""
+        """The image (H, W, 4) of a scene, as an array of the engine.
+
+        Args:
+            scene: parts and camera.
+            change: a function that changes these first.
+            size: (height, width) where it is not the subject's.
+            **options: options of `rts.render`, in place of the subject's.
+
+        Raises:
+            InputError: shaders give another number of colours than 3, or `rts.render` refuses the scene.
+        """
         parts, camera = scene if change is None else change(listed_parts(scene[0]), scene[1])
         image = render(parts, camera, size or self.size, **{**self.options, **options})
         check_colors(image.shape[-1] - 1)
@@ -123,12 +133,15 @@ class Subject:
             raise InputError(f"the image is {kind_of(image)}: nothing in the scene depends on the parameters")
 
     def moved(self, direction: Tree, by: float) -> Tree:
-        """The parameters, moved along a direction."""
+        """The parameters plus `by` times a direction, a tree of their structure."""
         steps = iter(leaves(direction))
         return map_leaves(lambda p: p + by * next(steps), self.parameters)
 
     def hard(self, direction: Tree, by: float, samples: int, change: Change | None = None) -> Array:
-        """The image at moved parameters, without splatting, with `samples`² samples a pixel."""
+        """The image (H, W, 4) at parameters that are `moved`, without splatting, with `samples`² samples a pixel.
+
+        If shaders are not opaque, at least `DEEP` layers are kept.
+        """
         layers = self.options.get("layers", 2)
         if not self.opaque:
             layers = max(DEEP, 0 if isinstance(layers, str) else layers)
@@ -153,7 +166,7 @@ class Subject:
     def step(
         self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **given: Any
     ) -> float | None:
-        """The result of `pixel_step` for a changed scene.
+        """The result of `pixel_step` for a changed scene: a factor of the direction, or None where nothing changes.
 
         Args:
             direction: a tree of the parameters' structure.
@@ -263,7 +276,10 @@ class Subject:
         return gradients
 
     def touched(self, direction: Tree, step: float) -> Touched:
-        """The arrays of the scene that change with a step along a direction, those held by shaders and surfaces too."""
+        """The arrays of the scene that differ half a step behind and ahead along a direction.
+
+        Arrays that shaders and surfaces hold count, too, by the names "shader" and "surface".
+        """
         scenes = [self.shown(self.moved(direction, by)) for by in (-step / 2, step / 2)]
         before, after = map(self._placed, scenes)
         changed, constant, cut = [], [], []
@@ -304,7 +320,10 @@ class Subject:
         return check_scene(listed_parts(parts), camera)[0]
 
     def sampled(self, **options: Any) -> Sampled:
-        """Samples of the scene at the current parameters, by `rts.sample`."""
+        """Samples of the scene at the current parameters, by `rts.sample` with these options.
+
+        Of the subject's own options, only the sampler and the engine are passed on.
+        """
         given = {name: self.options[name] for name in ("sampler", "engine") if name in self.options}
         return sample(*self.shown(self.parameters), self.size, **given, **options)
 
@@ -346,7 +365,13 @@ def listed_parts(parts: Any) -> list[Part]:
 
 
 def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Iterator[Array]:
-    """Arrays that a function or an object holds: in its closure, defaults and attributes."""
+    """Arrays that a function or an object holds: in its closure, defaults and attributes.
+
+    Args:
+        thing: a function, object, container or array.
+        is_array: value → True if it is an array to yield.
+        depth: how many levels of such things are entered.
+    """
     if is_array(thing):
         yield thing
     elif depth and not isinstance(thing, (str, bytes, type)):

@@ -61,7 +61,12 @@ def fineness(sampled: Callable[..., Sampled], size: tuple[int, int], taken: int)
 
 
 def _thinner(part: np.ndarray, across: int) -> np.ndarray:
-    """Mask of the cells that no disk, `across` cells wide, covers without leaving their part, or their gap."""
+    """Mask (h, w) bool of the cells in shapes, or in gaps between shapes, too thin to hold a disk.
+
+    Args:
+        part: (h, w) integers, the part that each cell shows; −1 in gaps.
+        across: diameter of the disk, cells.
+    """
     from scipy.ndimage import binary_opening, find_objects
 
     disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5

@@ -39,7 +39,7 @@ def is_quiet(derivative: np.ndarray) -> bool:
 
 
 def why_not_finite(number: Number) -> list[Finding]:
-    """Reasons why a number's derivative, or its truth, is NaN or infinite."""
+    """The reason, one, why a number's derivative, or its finite difference, is NaN or infinite."""
     if not np.isfinite(number.true).all():
         mask = ~np.all(np.isfinite(number.true), axis=-1)
         return [Finding("infinite", "the image itself is not finite when it moves", "Look for NaN in the scene.", mask)]
@@ -151,7 +151,7 @@ class _Trial:
         return self._changed(change, **options) & ~self._anyway
 
     def seen_outside(self, change: Change | None = None) -> bool:
-        """True if a larger window, or a camera moved back, sees the number's effect."""
+        """True if a larger window, or a camera moved back or ahead, sees the number's effect, after `change` if any."""
         height, width = self.subject.size
         apron = max(height, width)
         larger = height + 2 * apron, width + 2 * apron
@@ -180,7 +180,10 @@ class _Trial:
 
 
 def why_flat(subject: Subject, number: Number, going: Callable[[], bool]) -> list[Finding]:
-    """A finding if the loss is flat around a number that changes the image, though larger moves change the loss."""
+    """A finding if the loss is flat around a number that changes the image, though larger moves change the loss.
+
+    An empty list if the loss is not flat, or if time runs out: then `going()` is false.
+    """
     engine, step = subject.engine, number.slope.step
     samples = 2
 
@@ -260,7 +263,13 @@ def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str,
 
 
 def _stays(subject: Subject, numbers: Sequence[Number], weights: np.ndarray) -> bool:
-    """True if the image stays the same while numbers move together; that of largest weight moves by its step."""
+    """True if the image stays the same while numbers move together, by finite differences without splatting.
+
+    Args:
+        subject: the scene under test.
+        numbers: N numbers.
+        weights: (N,), the motion of each, in its own step; scaled so that the largest moves by one step.
+    """
     weights = weights / np.abs(weights).max()
     largest = numbers[int(np.argmax(np.abs(weights)))]
 

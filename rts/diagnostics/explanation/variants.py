@@ -51,7 +51,7 @@ def wider(size: tuple[int, int], apron: int) -> Change:
 
 
 def farther(distance: float) -> Change:
-    """A change that moves the camera back along its axis; a negative distance moves it ahead."""
+    """A change that moves the camera back along its axis by a distance in world units; ahead if that is negative."""
     change = np.eye(4)
     change[2, 3] = -distance
 

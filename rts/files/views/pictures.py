@@ -18,7 +18,14 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
 
 class Folder(NamedTuple):
-    """The folder of a data set's pictures, the reduction that they lack, and the folder of masks."""
+    """The folders of a data set's pictures and masks.
+
+    Attributes:
+        pictures: the folder of pictures.
+        downscale: the reduction that is still to be made of pictures.
+        masks: the folder of masks, which may not exist.
+        reduced: how many times as large as the pictures masks are.
+    """
 
     pictures: Path
     downscale: int
@@ -26,7 +33,7 @@ class Folder(NamedTuple):
     reduced: int
 
     def mask(self, name: str) -> Path | None:
-        """The mask of a picture, called as COLMAP calls it: NAME.png, or as the picture, if that is a PNG."""
+        """The mask of a picture, called as COLMAP calls it: NAME.png, or as a picture that is a PNG itself; or None."""
         for mask in (name + ".png", name if name.lower().endswith(".png") else None):
             if mask and (self.masks / mask).is_file():
                 return inside(self.masks, mask, self.masks, self.masks)
@@ -81,7 +88,7 @@ def named_picture(path: Path, place: str, name: object) -> Path:
 
 
 def with_mask(pose: Pose, mask: Path | None, reduced: int = 1) -> Pose:
-    """The pose with a mask, which has the picture's size, or is `reduced` times as large.
+    """The pose with a mask, which has the picture's size, or is `reduced` times as large; as it is if that is None.
 
     Raises:
         InputError: it has another size, or cannot be read.
@@ -98,7 +105,16 @@ def with_mask(pose: Pose, mask: Path | None, reduced: int = 1) -> Pose:
 
 
 def read_picture(pose: Pose, *, linear: bool, behind: np.ndarray | None) -> np.ndarray:
-    """(h, w, 4) premultiplied of a picture, or (h, w, 3) on a colour; undistorted, and means of n × n pixels."""
+    """(h, w, 4) float32 premultiplied of a picture, undistorted, then means of n × n pixels.
+
+    Args:
+        pose: the picture, its lens and its reduction n.
+        linear: True for linear colours, False for the file's own.
+        behind: (3,) colour to put the picture on, for (h, w, 3); None for none.
+
+    Raises:
+        InputError: the picture cannot be read, or has another size than before.
+    """
     path = pose.path
     if linear:
         image = load_image(path)
@@ -114,7 +130,7 @@ def read_picture(pose: Pose, *, linear: bool, behind: np.ndarray | None) -> np.n
 
 
 def read_mask(pose: Pose) -> np.ndarray:
-    """(h, w) float32 in [0, 1]: the mask's picture, as it is encoded, where the undistorted picture is defined."""
+    """(h, w) float32 in [0, 1]: the mask's picture, as encoded, or ones; times 0 where the lens leaves no picture."""
     from PIL import Image
 
     mask = np.ones(pose.size, np.float32)

@@ -91,7 +91,10 @@ def numbers(place: str, what: str, value: Any, *shapes: tuple[int, ...]) -> np.n
 
 
 def rigid(place: str, matrix: Any, *shapes: tuple[int, ...]) -> np.ndarray:
-    """A rigid matrix (4, 4), refused where it is more than a rotation and a position."""
+    """A rigid matrix (4, 4) float64, refused where it is more than a rotation and a position.
+
+    `matrix` has one of the `shapes`: of (3, 3) and (3, 4), what is missing is taken from the identity.
+    """
     known = numbers(place, "the matrix", matrix, *shapes)
     whole = np.eye(4)
     whole[: known.shape[0], : known.shape[1]] = known
