@@ -209,7 +209,7 @@ def test_rays_through_the_middle_of_a_wall_have_no_pair():
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("capacity", [None, 6000])
-def test_pairs_lie_on_the_rays_of_cells_at_outlines_or_at_the_outline(way, capacity):
+def test_pairs_lie_on_the_rays_of_cells_at_outlines(way, capacity):
     f, q, eye, _ = SHAPES["torus across"]
     surface, options = WAYS[way](lambda theta, p: f(theta["q"], p))
     part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")
@@ -224,19 +224,11 @@ def test_pairs_lie_on_the_rays_of_cells_at_outlines_or_at_the_outline(way, capac
     ends.reshape(-1)[outline_cells(row >= 0, np.asarray(found.depth))] = True
     assert there.sum() > 0.9 * ends.sum() and not (there & ~ends).any()
     points = np.asarray(surface.evaluate(part.theta, found)["position"])
-    places = [np.asarray(camera(eye).project(points[side[there]], SIZE)) for side in exits]
-    y, x = np.nonzero(there)
-    apart = np.hypot(*(places[0][:, :2] - np.stack([x, y], axis=1) - 0.5).T)
-    np.testing.assert_allclose(places[0][:, :2], places[1][:, :2], atol=4e-3)
-    if options:
-        assert apart.max() < 2e-3
-        assert min(p[:, 2].min() for p in (p - np.asarray(found.depth)[0][there, None] for p in places)) > -1e-4
-    else:
-        # On a lattice they lie at the outline itself, which most cells are less than a pixel away from.
-        assert np.median(apart) < 1 and apart.max() < 3
-        middle = (points[exits[0][there]] + points[exits[1][there]]) / 2
-        levels, rates = f(q, middle), (f(q, middle + [0, 0, 1e-4]) - f(q, middle - [0, 0, 1e-4])) / 2e-4
-        assert np.median(np.abs(levels)) < 0.05 * PIXEL and np.quantile(np.abs(rates), 0.9) < 0.1
+    for side in exits:
+        place = np.asarray(camera(eye).project(points[side[there]], SIZE))
+        y, x = np.nonzero(there)
+        np.testing.assert_allclose(place[:, :2], np.stack([x, y], axis=1) + 0.5, atol=2e-3)
+        assert (place[:, 2] > np.asarray(found.depth)[0][there] - 1e-4).all()
 
 
 def test_listed_cells_have_the_pairs_of_the_whole_grid():
