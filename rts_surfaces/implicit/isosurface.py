@@ -89,8 +89,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         table: True for a costly `f`: it is evaluated once for each lattice point, not once for each sample at the
             point. A number allots room for so many points where shapes must be known, as in `jax.jit`; True allots
             twice as many as samples.
-        band: a `NarrowBand`, to evaluate `f` near the surface only; θ must not be traced, then. None for the whole
-            lattice.
+        band: a `NarrowBand`, to evaluate `f` near the surface only; θ must not be traced, then. Where pixels are wider
+            than cells, fewer outlines move as exactly as on the whole lattice. None for the whole lattice.
         lipschitz: the most that `f` changes over a unit of length, for the sampler "rays"; None if unknown.
         reads: the entries of θ that `f` reads; None for all.
         attributes: name → function (θ, positions (N, 3)) → (N, C), further entries of the G-buffer.
@@ -172,7 +172,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ----------------------------------------------------------------------------------- triangles and samples
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """Values at lattice points: θ's, or levels of the function, everywhere or in its band."""
+        """Values at lattice points: θ's, or levels of the function, everywhere or in its band and a cell further in."""
         return self.field.look(theta, self.closed, inner=True).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
