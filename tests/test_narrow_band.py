@@ -149,7 +149,7 @@ def test_cells_one_further_inside_come_beside_the_same_band(name, bound):
         # All other cells that have an inside corner of the band's.
         corners = np.zeros(lattice.count, bool)
         corners[plain.numbers[plain.values < 0]] = True
-        wanted = corners_of(corners.reshape(shape)).any(axis=0)
+        wanted = np.any(corners_of(corners.reshape(shape)), axis=0)
         wanted[tuple(plain.cells.T)] = False
         lowest = np.stack(np.unravel_index(band.numbers[band.inner[:, 0]], shape), axis=1)
         assert rows(lowest) == rows(np.argwhere(wanted)) and len(lowest) == wanted.sum()

@@ -60,7 +60,7 @@ class NarrowBand:
     part of the surface between coarse corners of one sign is found only in the margin, and only if it shows at corners
     of halved cells.
 
-    To move outlines, isosurfaces also need levels one cell further inside, where rays that graze the surface are deepest.
+    Isosurfaces also need levels one cell further inside, where rays that graze the surface are deepest.
 
     Args:
         lipschitz: the fastest change of the level, per unit of length; None if unknown.
