@@ -83,7 +83,8 @@ def check_band(band, level, lattice, values):
     assert band.cells.shape == (len(band.cells), 3) and band.corners.shape == (len(band.cells), 8)
     assert len(np.unique(band.numbers)) == len(band.numbers) == len(band.values)
     assert len(np.unique(band.cells, axis=0)) == len(band.cells)
-    np.testing.assert_array_equal(np.unique(band.corners), np.arange(len(band.numbers)))
+    rows = np.concatenate([band.corners, band.inner])
+    np.testing.assert_array_equal(np.unique(rows), np.arange(len(band.numbers)))
     offsets = [(i & 1, i >> 1 & 1, i >> 2 & 1) for i in range(8)]
     for i, offset in enumerate(offsets):
         number = np.ravel_multi_index(tuple((band.cells + offset).T), lattice.shape)
@@ -128,6 +129,34 @@ def test_with_a_lipschitz_bound_all_cells_are_found(name, closed):
             assert rows(band.cells) == rows(wanted), (shape, coarse)
             assert band.evaluations == counted.count
             check_band(band, level, lattice, values)
+
+
+@pytest.mark.parametrize("bound", [True, False])
+@pytest.mark.parametrize("name", FIELDS)
+def test_cells_one_further_inside_come_beside_the_same_band(name, bound):
+    level = FIELDS[name][0]
+    narrow = NarrowBand(FIELDS[name][1] if bound else None, coarse=4)
+    for shape, closed in zip(SHAPES, (True, False, True, False, True), strict=True):
+        lattice = Lattice(CUBE, shape)
+        values, _ = whole(level, lattice, closed)
+        counted = Counted(level)
+        plain, band = narrow.find(level, lattice, closed), narrow.find(counted, lattice, closed, inner=True)
+        check_band(band, level, lattice, values)
+        count = len(plain.numbers)
+        assert plain.inner.shape == (0, 8) and band.inner.dtype == np.int32
+        for a, b in zip(plain[:4], (band.numbers[:count], band.values[:count], *band[2:4]), strict=True):
+            np.testing.assert_array_equal(a, b)
+        # All other cells that have an inside corner of the band's.
+        corners = np.zeros(lattice.count, bool)
+        corners[plain.numbers[plain.values < 0]] = True
+        wanted = np.any(corners_of(corners.reshape(shape)), axis=0)
+        wanted[tuple(plain.cells.T)] = False
+        lowest = np.stack(np.unravel_index(band.numbers[band.inner[:, 0]], shape), axis=1)
+        assert rows(lowest) == rows(np.argwhere(wanted)) and len(lowest) == wanted.sum()
+        for i in range(8):
+            number = np.ravel_multi_index(tuple((lowest + [i & 1, i >> 1 & 1, i >> 2 & 1]).T), shape)
+            np.testing.assert_array_equal(band.numbers[band.inner[:, i]], number)
+        assert plain.evaluations <= band.evaluations == counted.count
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -175,7 +204,8 @@ def test_evaluations_grow_with_the_surface():
 @pytest.mark.parametrize("shape", [(65, 65, 65), (50, 66, 41)])
 def test_no_point_is_evaluated_twice(bound, shape):
     counted = Counted(torus)
-    NarrowBand(bound).find(counted, Lattice(CUBE, shape), closed=True)
+    # With a bound, levels at centres of blocks that are dropped are forgotten; cells further inside may need them.
+    NarrowBand(bound).find(counted, Lattice(CUBE, shape), closed=True, inner=bound is None)
     places = np.concatenate(counted.seen)
     assert len(np.unique(places, axis=0)) == len(places)
 
@@ -299,6 +329,19 @@ def test_nan_shows_in_the_values(bound):
                 assert np.isnan(band.values).any() and len(band.cells) == 1
                 assert band.evaluations == counted.count < 100_000
                 np.testing.assert_array_equal(band.values, level(lattice.points(band.numbers)))
+
+
+def test_nan_shows_one_cell_further_inside():
+    lattice, counted = Lattice(CUBE, (33, 33, 33)), Counted(torus)
+    NarrowBand().find(counted, lattice, True, inner=True)
+    last = counted.seen[-1][-1]  # Evaluated for the sake of inner cells.
+
+    def level(p):
+        return np.where((p == last).all(axis=1), np.nan, torus(p))
+
+    assert not np.isnan(NarrowBand().find(level, lattice, True).values).any()
+    band = NarrowBand().find(level, lattice, True, inner=True)
+    assert np.isnan(band.values).any() and len(band.cells) == 1 and len(band.inner) == 0
 
 
 BAD = {

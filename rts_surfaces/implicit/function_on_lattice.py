@@ -26,7 +26,7 @@ class Looked(NamedTuple):
 
     Attributes:
         inputs: the result of `TriangleSurface.proxy_inputs`: "values" (X, Y, Z); or "values" (M,), "numbers" (M,),
-            "corners" (C, 8) and "cells" (C, 3) of a `Band`.
+            "corners" (C, 8), "cells" (C, 3) and "inner" (D, 8) of a `Band`.
         evaluations: the number of points at which a function was evaluated.
     """
 
@@ -91,8 +91,8 @@ class FunctionOnLattice(Field):
         places = self._lattice.places(numbers, namespace(numbers).float32)
         return self.level(theta, self.suited(theta, places))
 
-    def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """The level at all lattice points, or at the band's; without derivative."""
+    def look(self, theta: Mapping[str, Tree], closed: bool, inner: bool) -> Looked:
+        """The level at all lattice points, or at the band's; without derivative. For `inner` see `NarrowBand.find`."""
         read = {name: theta[name] for name in self.names(theta)}
         engine, like, count = engine_of(read), exemplar(read), self._lattice.count
         if self.band is None:
@@ -115,7 +115,7 @@ class FunctionOnLattice(Field):
             points = self.suited(theta, engine.constant(places.astype(np.float32), like))
             return np.asarray(engine.known(engine.stop_gradient(self.level(theta, points))))[:count]
 
-        band = self.band.find(level, self._lattice, closed)
+        band = self.band.find(level, self._lattice, closed, inner)
         return Looked({k: v for k, v in band._asdict().items() if k != "evaluations"}, band.evaluations)
 
     def _in_planes(self, theta: Mapping[str, Tree], planes: Array) -> Array:

@@ -28,7 +28,7 @@ from rts_surfaces.implicit.lattice import Lattice, check_bounds
 from rts_surfaces.implicit.lattice_field import LatticeField
 from rts_surfaces.implicit.marching_cubes import Triangles
 from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
-from rts_surfaces.implicit.narrow_band import Band, NarrowBand
+from rts_surfaces.implicit.narrow_band import Band, NarrowBand, rows_by_place
 
 NEAR_SINGULAR = 1e-3
 """An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
@@ -89,8 +89,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         table: True for a costly `f`: it is evaluated once for each lattice point, not once for each sample at the
             point. A number allots room for so many points where shapes must be known, as in `jax.jit`; True allots
             twice as many as samples.
-        band: a `NarrowBand`, to evaluate `f` near the surface only; θ must not be traced, then. None for the whole
-            lattice.
+        band: a `NarrowBand`, to evaluate `f` near the surface only; θ must not be traced, then. Where pixels are wider
+            than cells, fewer outlines move as exactly as on the whole lattice. None for the whole lattice.
         lipschitz: the most that `f` changes over a unit of length, for the sampler "rays"; None if unknown.
         reads: the entries of θ that `f` reads; None for all.
         attributes: name → function (θ, positions (N, 3)) → (N, C), further entries of the G-buffer.
@@ -172,8 +172,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     # ----------------------------------------------------------------------------------- triangles and samples
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
-        """Values at lattice points: θ's, or levels of the function, everywhere or in its band."""
-        return self.field.look(theta, self.closed).inputs
+        """Values at lattice points: θ's, or levels of the function, everywhere or in its band and a cell further in."""
+        return self.field.look(theta, self.closed, inner=True).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
         """The triangles of marching cubes, dropped ones included, and their cost.
@@ -186,7 +186,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         """
         theta = map_leaves(lambda x: engine_of(x).stop_gradient(x), from_numbers(theta, "theta"))
         self.check(theta)
-        looked = self.field.look(theta, self.closed)
+        looked = self.field.look(theta, self.closed, inner=False)
         triangles = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
         return Extracted(triangles.vertices, triangles.faces, int(_singular(triangles).sum()), looked.evaluations)
 
@@ -241,7 +241,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
         lattice = self.field.lattice(inputs)
         values = np.ascontiguousarray(inputs["values"]).reshape(-1)
-        band = (inputs["numbers"], inputs["corners"]) if "corners" in inputs else None
+        band = (inputs["corners"], inputs["numbers"]) if "corners" in inputs else None
         points = np.zeros((len(samples.ids), 6), np.int32)
         params = np.zeros((len(samples.ids), self.sample_widths[1]), np.float32)
         least = 0.0 if self.near_singular == "keep" else NEAR_SINGULAR * self._usual_difference(inputs)
@@ -260,16 +260,18 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     def refine_outlines(
         self, inputs: Mapping[str, np.ndarray], rays: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
-        """See `rts.TriangleSurface`; none in a band, whose cells end before deepest points."""
+        """See `rts.TriangleSurface`; in a band none where the search leaves its cells and those one further inside."""
         from rts_surfaces.implicit import lattice_samples_loops
 
-        if "corners" in inputs:
-            return None
         lattice, count = self.field.lattice(inputs), len(depth)
         isovalue, sign = self.field.level_of_values
         values, where = np.ascontiguousarray(inputs["values"]).reshape(-1), (lattice.shape, lattice.low, lattice.step)
         results = np.zeros((count, 2, 6), np.int32), np.zeros((count, 2, 16), np.float32), np.zeros(count, np.bool_)
-        given = values, float(values.dtype.type(isovalue)), sign, self.closed, *where
+        band = None
+        if "corners" in inputs:
+            corners = np.concatenate([inputs["corners"], inputs["inner"]])
+            band = corners, *rows_by_place(inputs["numbers"][corners[:, 0]], lattice.shape)
+        given = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
         given = *given, *rays[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
         parallel(lattice_samples_loops.deepest, count, *given, *results, work=2000 * count)
         points, params, there = results

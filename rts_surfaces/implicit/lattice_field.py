@@ -68,8 +68,8 @@ class LatticeField(ScalarField):
                 field = LatticeField(self.bounds, self.isovalue, self.sign)
                 yield Resampled(shape, field, partial(_every, stride))
 
-    def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
-        """θ["values"] as they are, with 0 evaluations, whether the surface is closed or not."""
+    def look(self, theta: Mapping[str, Tree], closed: bool, inner: bool) -> Looked:
+        """θ["values"] as they are, with 0 evaluations, whatever else is asked for."""
         return Looked({"values": theta["values"]}, 0)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
 from rts_surfaces.implicit.casting import APART, FIRST, GROWTH, HALVINGS, MARCH, REACH
+from rts_surfaces.implicit.narrow_band_loops import row_at
 
 LARGEST = 1e38
 """Larger motions, beyond single precision, become zero: where fields are flat to the last digit nothing moves."""
@@ -19,6 +20,14 @@ def _place(number, shape, low, step, out):
 
 
 @compiled(inline="always")
+def _corner(values, band, base, cell, i, shape):
+    """The value at corner i of a cell: its lowest one has the number `base`; `cell` is its row in a band."""
+    if band is None:
+        return np.float64(values[base + ((i & 1) * shape[1] + (i >> 1 & 1)) * shape[2] + (i >> 2 & 1)])
+    return np.float64(values[band[0][cell, i]])
+
+
+@compiled(inline="always")
 def _slope(values, band, cell, base, at, shape, low, step, caps, out):
     """Fill the gradient (3,) of values interpolated within a cell; zero across sides that are capped."""
     x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
@@ -28,10 +37,7 @@ def _slope(values, band, cell, base, at, shape, low, step, caps, out):
     out[:] = 0
     for i in range(8):
         a, b, c = i & 1, i >> 1 & 1, i >> 2 & 1
-        if band is None:
-            value = np.float64(values[base + (a * shape[1] + b) * shape[2] + c])
-        else:
-            value = np.float64(values[band[1][cell, i]])
+        value = _corner(values, band, base, cell, i, shape)
         along_x, along_y, along_z = (
             (near_x if a else 1 - near_x),
             (near_y if b else 1 - near_y),
@@ -54,7 +60,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
         values: (M,), of all lattice points, indexed by number, or of a band's points, indexed by row.
         isovalue: see `marching_cubes.of_lattice`.
         sign: see `marching_cubes.of_lattice`.
-        band: numbers (M,) of the band's points, and rows (C, 8) of the corners of its cells; None without one.
+        band: rows (C, 8) of the corners of a band's cells, and numbers (M,) of its points; None without one.
         shape: (X, Y, Z).
         low: (3,), the first point.
         step: (3,), the distance of neighbours along each axis.
@@ -76,7 +82,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
             if band is None:
                 number_a, number_b = np.int64(row_a), np.int64(row_b)
             else:
-                number_a, number_b = np.int64(band[0][row_a]), np.int64(band[0][row_b])
+                number_a, number_b = np.int64(band[1][row_a]), np.int64(band[1][row_b])
             points[n, 2 * k], points[n, 2 * k + 1] = number_a, number_b
             if params.shape[1] == 4:
                 continue
@@ -91,7 +97,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
         if params.shape[1] == 4:
             continue
         cell = np.int64(ids[n, 6])
-        base = cell if band is None else np.int64(band[0][band[1][cell, 0]])
+        base = cell if band is None else np.int64(band[1][band[0][cell, 0]])
         _slope(values, band, cell, base, at, shape, low, step, ids[n, 7], slope)
         divisor = max(slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2], least * least)
         for i in range(3):
@@ -113,41 +119,36 @@ def hand_on(start, stop, faces, ends, cells, caps, ids):
 
 
 @compiled
-def _level(values, isovalue, sign, capped, shape, low, step, at, near, slope):
+def _level(values, band, isovalue, sign, capped, shape, low, step, at, near, slope):
     """The level at a point, interpolated along each axis.
 
-    Fills `near`, the point's places in its cell, 0 to 1 along each axis, and the gradient `slope`. Beyond the bounds
-    the level is infinite; if `capped` it is at least the distance beyond them.
+    Fills `near`, the point's places in its cell, 0 to 1 along each axis, and the gradient `slope`. Beyond the bounds,
+    and where a band has no cell, the level is infinite and the gradient NaN; if `capped`, the level beyond the bounds
+    is at least the distance beyond them.
 
     Returns:
-        The level, the number of the cell's lowest corner, and True if a cap decides.
+        The level, the number of the cell's lowest corner, the cell's row in a band, and True if a cap decides.
     """
-    side, beyond, base = 0, -np.inf, 0
+    side, beyond, base, cell = 0, -np.inf, 0, 0
     for i in range(3):
         place = (at[i] - low[i]) / step[i]
         over = max(-place, place - (shape[i] - 1)) * step[i]
         if over > beyond:
             side, beyond = i, over
-        cell = min(max(int(np.floor(place)), 0), shape[i] - 2)
-        base, near[i] = base * shape[i] + cell, min(max(place - cell, 0.0), 1.0)
-    if beyond > 0 and not capped:
-        return np.inf, 0, True
-    x, y, z = near
+        lowest = min(max(int(np.floor(place)), 0), shape[i] - 2)
+        base, near[i] = base * shape[i] + lowest, min(max(place - lowest, 0.0), 1.0)
+    if band is not None:
+        across = base // shape[2]
+        cell = row_at(across // shape[1], across % shape[1], base % shape[2], shape, band[1], band[2])
+    if (beyond > 0 and not capped) or cell < 0:
+        slope[:] = np.nan
+        return np.inf, 0, 0, True
     # Along x, then along y, then along z.
-    a, b = base, base + shape[1] * shape[2]
-    i00, i01, i10, i11 = 0, 1, shape[2], shape[2] + 1
-    f00, f01, f10, f11 = (
-        np.float64(values[a + i00]),
-        np.float64(values[a + i01]),
-        np.float64(values[a + i10]),
-        np.float64(values[a + i11]),
-    )
-    d00, d01, d10, d11 = (
-        np.float64(values[b + i00]) - f00,
-        np.float64(values[b + i01]) - f01,
-        np.float64(values[b + i10]) - f10,
-        np.float64(values[b + i11]) - f11,
-    )
+    x, y, z = near
+    f00, f01 = _corner(values, band, base, cell, 0, shape), _corner(values, band, base, cell, 4, shape)
+    f10, f11 = _corner(values, band, base, cell, 2, shape), _corner(values, band, base, cell, 6, shape)
+    d00, d01 = _corner(values, band, base, cell, 1, shape) - f00, _corner(values, band, base, cell, 5, shape) - f01
+    d10, d11 = _corner(values, band, base, cell, 3, shape) - f10, _corner(values, band, base, cell, 7, shape) - f11
     f0, f1 = f00 + x * d00, f01 + x * d01
     e0, e1 = f10 + x * d10 - f0, f11 + x * d11 - f1
     f0, f1 = f0 + y * e0, f1 + y * e1
@@ -160,8 +161,8 @@ def _level(values, isovalue, sign, capped, shape, low, step, at, near, slope):
         upper = at[side] > low[side]
         slope[0], slope[1], slope[2] = 0.0, 0.0, 0.0
         slope[side] = 1.0 if upper else -1.0
-        return beyond, base, True
-    return level, base, False
+        return beyond, base, cell, True
+    return level, base, cell, False
 
 
 @compiled
@@ -175,6 +176,7 @@ def deepest(
     start,
     stop,
     values,
+    band,
     isovalue,
     sign,
     capped,
@@ -194,7 +196,9 @@ def deepest(
     Args:
         start: the first ray.
         stop: the ray after the last.
-        values: (M,), of all lattice points.
+        values: see `fill`.
+        band: rows (C, 8) of the corners of a band's cells; and the rows of these cells, by the places of their lowest
+            corners, see `narrow_band.rows_by_place`. None without a band.
         isovalue: see `fill`.
         sign: see `fill`.
         capped: True if the surface is closed at the bounds.
@@ -221,21 +225,21 @@ def deepest(
         apart = max(APART * reach, min(0.5 * min(step), reach / 6))
         # Steps that grow pass the deepest point.
         before, t, move = 0.0, 0.0, FIRST * reach
-        value, _, _ = _level(values, isovalue, sign, capped, shape, low, step, first, near, slope)
+        value, _, _, _ = _level(values, band, isovalue, sign, capped, shape, low, step, first, near, slope)
         a, b, after = 0.0, 0.0, value
         for _ in range(MARCH):
             _along(first, unit, t + move, at)
-            after, _, _ = _level(values, isovalue, sign, capped, shape, low, step, at, near, slope)
+            after, _, _, _ = _level(values, band, isovalue, sign, capped, shape, low, step, at, near, slope)
             if after > value:
                 a, b = before, t + move
                 break
             before, t, move, value = t, t + move, GROWTH * move, after
-        if b == 0 or not np.isfinite(after):  # It falls all along, or leaves an open surface through its bounds.
+        if b == 0:  # It falls all along.
             continue
         for _ in range(HALVINGS // 2):
             middle = (a + b) / 2
             _along(first, unit, middle, at)
-            _level(values, isovalue, sign, capped, shape, low, step, at, near, slope)
+            _level(values, band, isovalue, sign, capped, shape, low, step, at, near, slope)
             if slope[0] * unit[0] + slope[1] * unit[1] + slope[2] * unit[2] < 0:
                 a = middle
             else:
@@ -244,14 +248,16 @@ def deepest(
         falls, rises = 0.0, 0.0
         for k in range(2):
             _along(first, unit, b if k else a, at)
-            value, base, cap = _level(values, isovalue, sign, capped, shape, low, step, at, near, ends[k])
+            value, base, cell, cap = _level(values, band, isovalue, sign, capped, shape, low, step, at, near, ends[k])
             rate = ends[k, 0] * unit[0] + ends[k, 1] * unit[1] + ends[k, 2] * unit[2]
             if k:
                 rises = max(rate, 0.0)
             else:
                 falls = max(-rate, 0.0)
             level += value / 2
-            _tetrahedron(values, isovalue, base, shape, at, near, points[n, k], params[n, k])
+            if not np.isfinite(value):  # It falls until it leaves an open surface through its bounds, or the band.
+                break
+            _tetrahedron(values, band, isovalue, base, cell, shape, at, near, points[n, k], params[n, k])
             params[n, k, 15] = np.nan if cap else params[n, k, 15]
         share = rises / (falls + rises) if falls + rises > 0 else 0.5
         across, square = 0.0, 0.0
@@ -275,12 +281,12 @@ def deepest(
 
 
 @compiled
-def _tetrahedron(values, isovalue, base, shape, at, near, points, params):
+def _tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params):
     """Fill the four lattice points that interpolate at a point, their weights, the point, and its level.
 
     Changes `near`, the point's places in its cell.
     """
-    number, left, level = base, 1.0, 0.0
+    number, corner, left, level = base, 0, 1.0, 0.0
     for k in range(6):
         points[k], params[3 + k] = number, 0
         if k > 3:
@@ -289,10 +295,10 @@ def _tetrahedron(values, isovalue, base, shape, at, near, points, params):
         axis = 0 if near[0] >= near[1] and near[0] >= near[2] else 1 if near[1] >= near[2] else 2
         own = near[axis] if k < 3 else 0.0
         params[3 + k] = left - own
-        level += (left - own) * (np.float64(values[number]) - isovalue)
+        level += (left - own) * (_corner(values, band, base, cell, corner, shape) - isovalue)
         if k < 3:
             number += shape[1] * shape[2] if axis == 0 else shape[2] if axis == 1 else 1
-            left, near[axis] = own, -1.0
+            corner, left, near[axis] = corner | 1 << axis, own, -1.0
     for i in range(3):
         params[9 + i] = at[i]
     params[15] = level

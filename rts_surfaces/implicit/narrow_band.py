@@ -28,11 +28,13 @@ class Band(NamedTuple):
     """Cells of a lattice that a surface passes through, and their corners.
 
     Attributes:
-        numbers: (M,) int64, the points of the lattice that are corners of the cells, each once.
+        numbers: (M,) int64, the points of the lattice that are corners of cells, each once.
         values: (M,) the levels there, in the dtype of the level.
         corners: (C, 8) int32, the rows of `numbers` of the corners of each cell. Corner i has the offsets (i & 1,
             i >> 1 & 1, i >> 2 & 1) along x, y and z.
         cells: (C, 3) int32, the coordinates of the lowest corner of each cell; each cell once, in no special order.
+        inner: (D, 8) int32, like `corners`, of cells one further inside: other cells that have an inside corner of
+            these `cells`. Points of theirs alone come last in `numbers`. Empty unless asked for.
         evaluations: the number of points at which the level was evaluated.
     """
 
@@ -40,6 +42,7 @@ class Band(NamedTuple):
     values: np.ndarray
     corners: np.ndarray
     cells: np.ndarray
+    inner: np.ndarray
     evaluations: int
 
 
@@ -56,6 +59,8 @@ class NarrowBand:
     has no holes: if the four corners shared with a neighbour differ in sign, the neighbour is in it, too. A separate
     part of the surface between coarse corners of one sign is found only in the margin, and only if it shows at corners
     of halved cells.
+
+    Isosurfaces also need levels one cell further inside, where rays that graze the surface are deepest.
 
     Args:
         lipschitz: the fastest change of the level, per unit of length; None if unknown.
@@ -86,7 +91,7 @@ class NarrowBand:
         if not is_count(self.chunk):
             raise InputError(f"chunk is {quoted(self.chunk)}; expected an integer of at least 1")
 
-    def find(self, level: Level, lattice: Lattice, closed: bool) -> Band:
+    def find(self, level: Level, lattice: Lattice, closed: bool, inner: bool = False) -> Band:
         """Find the cells whose corners differ in sign.
 
         Args:
@@ -94,6 +99,7 @@ class NarrowBand:
             lattice: the lattice.
             closed: True if the surface is capped at the lattice's boundary. Cells are in the band, too, if one of their
                 corners is inside and on the boundary.
+            inner: True to evaluate the level one cell further inside, too; see `Band.inner`.
 
         Returns:
             The band; it is empty if there are no such cells. If the level is NaN at a point of the lattice, the search
@@ -105,13 +111,15 @@ class NarrowBand:
                 grid, cells, rows = _followed(evaluate, int(self.coarse or 8), int(self.margin), bool(closed))
             else:
                 grid, cells, rows = _bounded(evaluate, int(self.coarse or 16), self.lipschitz, bool(closed))
+            beside = grid.corners(_inner(grid, cells, rows) if inner else cells[:0])
         except _Unknown as unknown:
             evaluate.refuses = False
             point = np.array(np.unravel_index(unknown.number, lattice.shape))
             grid, cells = _Grid(evaluate, 1), np.minimum(point, np.array(lattice.shape) - 2)[None].astype(np.int32)
-            rows = grid.corners(cells)
+            rows, beside = grid.corners(cells), np.empty((0, 8), np.int32)
+        rows = np.concatenate([rows, beside])
         numbers, values = loops.compact(rows, grid.numbers, grid.values)
-        return Band(numbers, values, rows, cells, evaluate.count)
+        return Band(numbers, values, rows[: len(cells)], cells, rows[len(cells) :], evaluate.count)
 
 
 class _Unknown(Exception):
@@ -281,3 +289,17 @@ def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray
         rows = grid.corners(blocks)
         fronts.append((blocks, rows))
     return np.concatenate([f[0] for f in fronts]), np.concatenate([f[1] for f in fronts])
+
+
+def _inner(grid: _Grid, cells: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Other cells (D, 3) that have a corner of these cells (C, 3) which is inside; `rows` are (C, 8)."""
+    directory, bricks = _bricks(grid.counts, np.uint8)
+    bricks, used = loops.marked(cells, grid.counts, directory, bricks, 0)
+    return loops.inner(cells, rows, grid.values, grid.counts, directory, bricks, used)
+
+
+def rows_by_place(numbers: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """A directory and bricks that tell the row of each lattice point by number (M,); see `narrow_band_loops.row_at`."""
+    directory, bricks = _bricks(shape, np.int32)
+    state = directory, bricks, 0, np.empty_like(numbers), 0
+    return directory, loops.given_rows(numbers, 1, shape, shape, *state)[0]

@@ -238,6 +238,14 @@ def given_rows(known, side, shape, counts, directory, bricks, used, numbers, cou
     return bricks, used, numbers, count
 
 
+@compiled
+def row_at(x, y, z, counts, directory, bricks):
+    """The row of a corner, or −1 if it has none."""
+    place, at = _brick(x, y, z, counts)
+    brick = directory[place]
+    return bricks[brick, at] if brick >= 0 else -1
+
+
 @loop
 def places_of(start, stop, numbers, shape, low, step, places):
     """Fill rows `start` to before `stop` of `places` (M, 3) float64: points of the lattice, in space.
@@ -438,6 +446,31 @@ def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
                 new, used = _mark(x, y, z, counts, directory, bricks, used)
                 count += new
     return found[:count].copy(), bricks, used
+
+
+@loop
+def inner(blocks, rows, values, counts, directory, bricks, used):
+    """Find and mark the unmarked blocks that have an inside corner of these blocks; see `beyond`. Returns (K, 3)."""
+    found, count = np.empty((64, 3), np.int32), 0
+    for b in range(len(blocks)):
+        if count + 26 > len(found):
+            found = _grown(found, count)
+        if used + 26 > len(bricks):
+            bricks = _grown(bricks, used)
+        inside = _inside(rows, b, values)
+        for way in range(27):
+            shared, within = inside, True
+            for a in range(3):
+                step = (way // 3**a) % 3 - 1
+                at = blocks[b, a] + step
+                found[count, a] = at
+                within &= 0 <= at < counts[a]
+                shared &= UPPER[a] if step > 0 else ALL ^ UPPER[a] if step < 0 else ALL
+            if within and shared:
+                x, y, z = found[count, 0], found[count, 1], found[count, 2]
+                new, used = _mark(x, y, z, counts, directory, bricks, used)
+                count += new
+    return found[:count].copy()
 
 
 @loop
