@@ -243,7 +243,11 @@ class Search:
         return best
 
     def _bound(self, setting: Setting) -> float:
-        """The largest of a setting's errors along the modes, or the first beyond the tolerance; kept in `bounds`."""
+        """The largest of a setting's errors along the modes, or the first beyond the tolerance, a lower bound.
+
+        Infinite if a measurement fails. Always looked up anew; written to `bounds` under `_cell(setting)`. A mode
+        beyond the tolerance is tried first from then on.
+        """
         worst = 0.0
         for mode in self.modes:
             error = self._along(mode, setting)

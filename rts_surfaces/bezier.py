@@ -57,10 +57,13 @@ class Bezier(Patches):
     def load(cls, path: Path) -> list[Part]:
         """Load patches as one part, from an .npz or from text in the format of Newell's teapot.
 
-        The text begins with the number of patches. For each follow 16 indices of points, from 1 on, separated by
-        commas. Then come the number of points, and three coordinates for each. An .npz has "indices" (n, 16), from 0
-        on, and "points" (m, 3). Points that coincide exactly become one. In files of both kinds u × v points inwards,
-        so u and v are exchanged.
+        A text begins with a line that holds the number of patches. A line for each follows: 16 indices of points, from
+        1 on, separated by commas or spaces. Then come a line with the number of points, and a line of three coordinates
+        for each. An .npz has "indices" (n, 16), from 0 on, and "points" (m, 3). In files of both kinds u × v is assumed
+        to point inwards, so u and v are exchanged.
+
+        Rows of θ["points"] are not those of the file: points are sorted, those that coincide exactly become one, and
+        those that no patch names are left out.
 
         Raises:
             InputError: the file is damaged, or its indices refer to points that it lacks.

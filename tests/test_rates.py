@@ -49,6 +49,18 @@ class TestMesh:
             # Colours are those of a vertex nearby.
             assert np.abs(part.theta["colors"] - 0.5 - 0.5 * part.theta["vertices"]).max() < 0.08
 
+    def test_attributes_of_other_names_stay(self, sphere):
+        surface = rts.Mesh(sphere.surface.faces, indices={"features": None})
+        theta = {"vertices": sphere.theta["vertices"], "features": sphere.theta["colors"]}
+
+        def shader(theta, gbuffer, camera):
+            return np.concatenate([gbuffer["features"], np.ones_like(gbuffer["features"][:, :1])], axis=1)
+
+        shader.opaque = True
+        part = changed(rts.Part(surface, theta, shader), surface.rates(theta)[0])
+        image = rts.render(part, rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (16, 16))
+        np.testing.assert_allclose(image[8, 8], (0.5, 0.5, 0.9, 1), atol=0.08)
+
     def test_attributes_have_derivatives(self, sphere):
         torch = pytest.importorskip("torch")
         rate = sphere.surface.rates(sphere.theta)[0]

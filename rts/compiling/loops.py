@@ -56,7 +56,9 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 @contextmanager
 def alone(folder: str, writes: bool = True) -> Iterator[None]:
-    """Hold the lock of a folder of loops: one process writes at a time, if the system and the file system have locks.
+    """A context that holds the lock of a folder of loops: one process writes at a time, while nobody reads.
+
+    Without effect where the system or the file system has no locks, or the lock cannot be opened. Not to be nested.
 
     numba reads a function's index, chooses a name for the code, and writes both, one after the other. Two processes
     that do so at once, for different types, may choose the same name: one type's calls would then run the other's code.

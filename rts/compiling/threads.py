@@ -188,7 +188,10 @@ if sys.platform != "win32":
 
 
 def thread_count() -> int:
-    """Number of threads to use: RTS_NUM_THREADS of the environment, or else the number of cores for this process."""
+    """Number of threads to use: RTS_NUM_THREADS of the environment, if it is a whole number above 0.
+
+    Otherwise the number of cores that this thread may run on (Linux), or of all cores (other systems).
+    """
     wanted = os.environ.get("RTS_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)

@@ -57,7 +57,10 @@ def adaptive() -> None:
 
 
 def gradient_of_vertices() -> None:
-    """Differentiate a picture of one part in its vertices, and in its pose, if torch or jax is installed."""
+    """Differentiate a picture of one part in its vertices, and another in its pose, by torch, or else by jax.
+
+    Does nothing if neither is installed.
+    """
     part = octahedra()[0]
     if (found := engine()) is not None:
         array, gradient = found

@@ -81,7 +81,11 @@ class Run:
             self._reference, self._last_gain = loss, len(self.history)
 
     def numbers(self) -> dict[str, Any]:
-        """The record so far, but for the best parameters, as JSON holds it."""
+        """The numbers of a checkpoint beside the best parameters, as JSON holds them; `go_on` takes them.
+
+        These are the history, the losses and gradients that decide, and when there was a gain. Why the run stopped,
+        remarks, and the number of residuals are not among them.
+        """
         own = "history", "best_loss", "mattered", "validated", "_last_gain", "_reference"
         return {name: copy(getattr(self, name)) for name in own}
 

@@ -131,7 +131,10 @@ def _box(few: int, many: int) -> np.ndarray:
 
 
 def _gaussian(count: int, sigma: float) -> np.ndarray:
-    """Weights (count, count) of a row's pixels in each blurred pixel; they sum to less than 1 near the row's ends."""
+    """Weights (count, count) by which each blurred pixel, a row, takes the pixels of a line; `sigma` > 0 is in pixels.
+
+    Weights end at 4 σ, rounded up. They sum to less than 1 nearer to the ends of the line.
+    """
     reach = math.ceil(4 * sigma)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     taps /= taps.sum()

@@ -41,9 +41,10 @@ def find(kept, cells):
 
 @loop
 def mark_ends(start, stop, cells, covered, depth, ends):
-    """Fill `ends` (M,) for cells [start, stop) of a list: True where the front ends towards a neighbour.
+    """Fill `ends` (M,) for cells [start, stop) of a list: True where the front ends towards one of eight neighbours.
 
-    `cells` (M,) are flat indices of covered cells. For `covered` and `depth` (K, H, W) see `exits.outline_cells`.
+    Neighbours outside of the grid do not count. `cells` (M,) are flat indices of covered cells. For `covered` and
+    `depth` (K, H, W) see `exits.outline_cells`.
     """
     layers, height, width = covered.shape
     for i in range(start, stop):

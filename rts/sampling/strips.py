@@ -39,7 +39,7 @@ class FineGrid(NamedTuple):
     Attributes:
         size: (height, width) in pixels.
         side: s, fine cells along each side of a pixel.
-        apron: fine cells around active pixels, and around the image.
+        apron: fine cells around active pixels, and around the image; also coarse cells around the coarse grid.
     """
 
     size: tuple[int, int]

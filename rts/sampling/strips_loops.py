@@ -153,7 +153,9 @@ def _end(marks, first):
 
 @loop
 def count(start, stop, active, pieces, firsts, side, apron, high, width, counts):
-    """Write to `counts` how many cells active pixels need in each of the lines [start, stop) of the grid.
+    """Write to `counts` how many cells the active pixels of the given pieces need in the grid's lines [start, stop).
+
+    The apron around each active pixel is included. A cell that several pixels or pieces need counts once.
 
     Args:
         start: first line.

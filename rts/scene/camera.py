@@ -500,11 +500,15 @@ class Camera:
         return view, projection
 
     def to_nvdiffrast(self, *, top_down: bool = False, size: tuple[int, int] | None = None) -> tuple[Array, Array]:
-        """Matrices (modelview, projection) for nvdiffrast.
+        """Matrices (modelview, projection), (4, 4) each, for nvdiffrast; multiply projection @ modelview.
 
         Args:
-            top_down: whether row 0 of nvdiffrast's image is to be the top, as in this library.
+            top_down: whether row 0 of nvdiffrast's image is to be the top, as in this library: y of the projection is
+                then negated. Otherwise the matrices are the camera's own, and nvdiffrast's image is ours upside down.
             size: as in `to_opengl`.
+
+        Raises:
+            InputError: the ratio is open, and there is no size.
         """
         camera = self if size is None else self.for_size(size)
         return (camera._flipped() if top_down else camera).to_opengl()

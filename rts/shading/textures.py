@@ -92,7 +92,11 @@ def level_of(footprint: Array, size: tuple[int, int]) -> Array:
 
 
 def _halved(x: Array) -> Array:
-    """An array (n, …) with half as many rows, max(n // 2, 1), each an average of neighbouring rows."""
+    """An array (n, a, b) with half as many rows, max(n // 2, 1): a single row stays.
+
+    For even n each new row is the mean of two old ones. For odd n it is that of the n / (n // 2) old rows that it
+    covers, three of them in part, so that the mean over all rows stays.
+    """
     n = shape_of(x)[0]
     if n == 1:
         return x

@@ -313,7 +313,11 @@ class Cells:
 
     @cached_property
     def crossings(self) -> Crossings:
-        """The targets whose derivative is that of a line where surfaces cross."""
+        """Targets beside lines where surfaces cross, and the terms of their derivatives.
+
+        A column of −1 marks a target whose derivative turned out not to be that of a line. Empty unless the splatter is
+        "visible" with the setting `crossings`.
+        """
         bits, some = self._pairs
         if not len(bits):
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
