@@ -31,7 +31,8 @@ LIGHT = {"direction": np.array([0.3, 0.8, 0.5], np.float32), "ambient": np.full(
 SIZE, FOV, VIEWS, HELD_OUT, BATCH = 256, 40.0, 24, 8, 4
 OFF = 2.0
 """Degrees, and percent of the diagonal, by which cameras are off."""
-POINTS = 30_000
+POINTS = 300_000
+"""Points on each mesh for the chamfer. With a tenth of them it would be 0.2 % for two samples of one mesh."""
 
 
 class Stage(NamedTuple):
