@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -20,7 +19,7 @@ PICTURE = 128
 """The most pixels along a side of a picture on a frustum."""
 FRUSTUM = 0.12
 """Size of frustums over the distance of cameras from their middle."""
-DISTANCE = 2.2
+DISTANCE = 2.0
 """Distance of the first look from an object over the radius of the object."""
 
 
@@ -96,7 +95,8 @@ class Page:
     def look(self, vertices: np.ndarray) -> None:
         """Turn all browsers, and those that come, to the object of these vertices (V, 3), from the right and above."""
         low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
-        self._sphere = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
+        center = (low + high) / 2
+        self._sphere = center, float(np.linalg.norm(vertices - center, axis=1).max()) or 1.0
         for client in self._server.get_clients().values():
             self._place(client)
 
@@ -136,9 +136,7 @@ class Page:
         threading.Thread(target=self._add_frustums, args=(list(views), poses, scale), daemon=True).start()
 
     def _add_frustums(self, views: Sequence[rts.View], poses: Sequence[tuple], scale: float) -> None:
-        add: Any = self._server.scene.add_camera_frustum
-        new = "thickness_units" in inspect.signature(add).parameters  # The name of the width since viser 1.1.
-        width = {"thickness": 2.0, "thickness_units": "screen"} if new else {"line_width": 2.0}
+        width: Any = {"thickness": 2.0, "thickness_units": "screen"}
         own = self._frustums
         for number, (view, (K, R, place)) in enumerate(zip(views, poses, strict=True)):
             height, across = view.size
@@ -151,7 +149,7 @@ class Page:
                 picture = None
             if own is not self._frustums:  # Hidden meanwhile.
                 return
-            own.append(add(f"/cameras/{number}", **shape, image=picture, **width))
+            own.append(self._server.scene.add_camera_frustum(f"/cameras/{number}", **shape, image=picture, **width))
 
 
 @contextlib.contextmanager
