@@ -23,7 +23,9 @@ def view(
     surface: Annotated[
         str, typer.Option(help="Name of the surface that reads the model: mesh, or such as bezier for patches.")
     ] = "mesh",
-    up: Annotated[str, typer.Option(help="The axis that is upright: y or z. Cameras of --views decide otherwise.")] = "y",
+    up: Annotated[
+        str, typer.Option(help="The axis that is upright: y or z. Cameras of --views decide otherwise.")
+    ] = "y",
 ) -> None:
     """Show a model in the browser, until Ctrl-C.
 

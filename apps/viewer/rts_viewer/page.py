@@ -19,7 +19,7 @@ PICTURE = 128
 """The most pixels along a side of a picture on a frustum."""
 FRUSTUM = 0.12
 """Size of frustums over the distance of cameras from their middle."""
-DISTANCE = 2.0
+DISTANCE = 2.4
 """Distance of the first look from an object over the radius of the object."""
 
 
@@ -84,7 +84,7 @@ class Page:
         if name in self._meshes:
             self._meshes[name].glb_data = data
         else:
-            self._meshes[name] = self._server.scene.add_glb(f"/{name}", data)
+            self._meshes[name] = self._server.scene.add_glb(f"/{name}", data, cast_shadow=False, receive_shadow=False)
 
     def hide(self) -> None:
         """Take all meshes and cameras off the page."""

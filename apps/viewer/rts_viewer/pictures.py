@@ -6,7 +6,7 @@ import io
 import math
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 SIZE = (320, 160)
 """Width and height of the curve, pixels."""
@@ -57,6 +57,7 @@ def loss_curve(steps: np.ndarray, losses: np.ndarray) -> np.ndarray:
     """
     picture = Image.new("RGB", SIZE, PAPER)
     draw = ImageDraw.Draw(picture)
+    draw.font = ImageFont.load_default(12)
     finite = np.isfinite(losses)
     steps, losses = steps[finite], losses[finite]
     if len(losses) == 0:
