@@ -10,11 +10,11 @@ import sys
 import time
 
 import numpy as np
+import rts_viewer
 import torch
 import trimesh
 
 import rts
-import rts_viewer
 
 STEPS, SIZE, CUTS = 40, (128, 128), 4
 

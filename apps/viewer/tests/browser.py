@@ -85,7 +85,7 @@ class Browser:
 
     def click(self, label):
         """Press the button of this label."""
-        find = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === %s)" % json.dumps(label)
+        find = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {json.dumps(label)})"
         until(lambda: self.run(f"!!({find})"), 30)
         self.run(f"({find}).click()")
 

@@ -4,10 +4,10 @@ import contextlib
 import socket
 
 import numpy as np
+import rts_viewer
 import trimesh
 
 import rts
-import rts_viewer
 
 RED, GREEN = (0.8, 0.02, 0.02), (0.02, 0.6, 0.05)
 

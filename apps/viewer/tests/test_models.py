@@ -13,13 +13,13 @@ import pytest
 import trimesh
 from helpers import RED, ball, free_port, view, watching
 from PIL import Image
+from rts_viewer.glb import Triangles, glb, smooth_normals
+from rts_viewer.model import triangles_of
+from rts_viewer.pictures import png
 from typer.testing import CliRunner
 
 import rts
 from rts.cli.main import app
-from rts_viewer.glb import Triangles, glb, smooth_normals
-from rts_viewer.model import triangles_of
-from rts_viewer.pictures import png
 
 pytestmark = pytest.mark.files
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from browser import Browser, program, until
 from helpers import GREEN, RED, ball, free_port, view, watching
-
-import rts
 from rts_viewer.history import History, State
 from rts_viewer.pictures import loss_curve, small
+
+import rts
 
 pytestmark = pytest.mark.files
 
