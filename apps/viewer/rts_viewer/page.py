@@ -43,6 +43,7 @@ class Page:
     def __init__(self, port: int, host: str, label: str):
         try:
             import viser
+            from viser.transforms import SO3
         except ImportError as error:
             raise rts.PluginError(f"the viewer needs viser ({error}): pip install ./apps/viewer") from error
         check_address(host, port)
@@ -50,7 +51,7 @@ class Page:
         with _quiet():
             self._server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         self._threads = set(threading.enumerate()) - before
-        self._turn = viser.transforms.SO3.from_matrix
+        self._turn = SO3.from_matrix
         self.url, self.gui = url(host, port), self._server.gui
         self._meshes: dict[str, Any] = {}
         self._frustums: list[Any] = []

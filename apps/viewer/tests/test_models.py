@@ -41,7 +41,7 @@ def test_another_reader_finds_the_mesh_in_the_file():
     np.testing.assert_array_equal(mesh.vertices, vertices)
     np.testing.assert_array_equal(mesh.faces, faces)
     np.testing.assert_allclose(mesh.vertex_normals, vertices, atol=0.02)  # A sphere's normals.
-    np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3] / 255, colors, atol=1 / 255)
+    np.testing.assert_allclose(mesh.visual.vertex_attributes["color"], colors)
     assert tables["materials"][0]["alphaMode"] == "OPAQUE" and tables["materials"][0]["doubleSided"]
 
 

@@ -4,6 +4,7 @@ import socket
 import sys
 import threading
 import urllib.request
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -131,6 +132,25 @@ def test_stop_ends_a_fit_even_a_paused_one(paused):
         assert not paused or fit.steps == 5
         watch.begin()  # A new fit is not stopped.
         assert watch.step(0, 1.0, vertices, faces) is False
+
+
+def test_the_slider_goes_back_and_following_goes_on():
+    vertices, faces, _ = ball()
+    with watching() as watch:
+        watch.begin()
+        for number in (0, 10, 20):
+            watch.step(number, 1.0, vertices, faces)
+        until(lambda: watch._slider.value == 20, 30)
+        user = SimpleNamespace(client="one")  # What viser tells of an event that came from a browser.
+        watch._slider.value = 12
+        watch._slid(user)
+        until(lambda: "step 10**" in watch._text.content, 30)
+        watch.step(30, 1.0, vertices, faces)
+        until(lambda: "at step 30" in watch._text.content, 30)
+        assert watch._slider.value == 12 and "step 10**" in watch._text.content and not watch._follow.value
+        watch._follow.value = True
+        watch._followed(user)
+        until(lambda: "step 30**" in watch._text.content and watch._slider.value == 30, 30)
 
 
 def test_steps_are_checked_and_copied():
