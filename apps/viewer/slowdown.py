@@ -1,7 +1,8 @@
-"""Time of a fit's steps with and without `Watch.step` in its callback: `python apps/viewer/slowdown.py [PAIRS]`.
+"""Cost of `Watch.step` in the callback of a fit: `python apps/viewer/slowdown.py [STEPS]`.
 
-Fits of the colours and positions of a sphere's vertices to pictures, with and without, take turns. No browser is open,
-since a browser on the same machine takes time of its own.
+First the processor time that a page takes by itself, which other programs on the machine disturb little. Then the time
+of steps of one fit, of colours and positions of a sphere's vertices to pictures: in blocks of five, with and without,
+which take turns. No browser is open, since one on the same machine takes time of its own.
 """
 
 import socket
@@ -16,13 +17,32 @@ import trimesh
 
 import rts
 
-STEPS, SIZE, CUTS = 40, (128, 128), 4
+BLOCK, SIZE = 5, (128, 128)
 
 
-def fitted(watch):
-    """Seconds of each step of a fit, the first five left out, and seconds of each call of `watch.step`."""
-    sphere = trimesh.creation.icosphere(CUTS)
-    vertices, faces = np.asarray(sphere.vertices, np.float32), np.asarray(sphere.faces)
+def sphere(cuts):
+    """Vertices and faces."""
+    mesh = trimesh.creation.icosphere(cuts)
+    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces)
+
+
+def occupied(watch, cuts, seconds=10.0):
+    """The share of one core that a page takes while steps come 20 times a second, and a step's own processor time."""
+    vertices, faces = sphere(cuts)
+    watch.begin()
+    start, before, own, number = time.perf_counter(), time.process_time(), 0.0, 0
+    while (spent := time.perf_counter() - start) < seconds:
+        called = time.thread_time()
+        watch.step(number, 1 / (1 + number), vertices, faces, np.abs(vertices))
+        own += time.thread_time() - called
+        number += 1
+        time.sleep(0.05)
+    return (time.process_time() - before) / spent, own / number
+
+
+def fitted(watch, steps):
+    """Seconds of steps of a fit without and with a page, the first block left out."""
+    vertices, faces = sphere(4)
     surface, colors = rts.Mesh(faces), 0.5 + 0.5 * vertices
     cameras = [rts.Camera.look_at(eye, (0, 0, 0)) for eye in ((3, 1, 0), (0, 1, 3), (-3, 1, 0), (0, 1, -3))]
 
@@ -32,47 +52,38 @@ def fitted(watch):
 
     target = images({"vertices": torch.tensor(0.8 * vertices), "colors": torch.tensor(colors)})
     start = {"vertices": torch.tensor(vertices), "colors": torch.full((len(vertices), 3), 0.5)}
-    times, calls = [], []
+    times, number = ([], []), [time.perf_counter()]
 
     def callback(step, parameters, loss):
-        times.append(time.perf_counter())
-        if watch is None:
-            return False
-        points, shades = (parameters[name].detach().numpy() for name in ("vertices", "colors"))
-        stopped = watch.step(step, loss, points, faces, shades.clip(0, 1))
-        calls.append(time.perf_counter() - times[-1])
-        return stopped
+        with_page = len(number) // BLOCK % 2
+        if with_page:
+            points, shades = (parameters[name].detach().numpy() for name in ("vertices", "colors"))
+            watch.step(step, loss, points, faces, shades.clip(0, 1))
+        number.append(time.perf_counter())
+        if len(number) > BLOCK + 1:
+            times[with_page].append(number[-1] - number[-2])
 
-    if watch is not None:
-        watch.begin()
-    options = {"steps": STEPS, "learning_rate": 1e-3, "callback": callback, "progress": False}
+    watch.begin()
+    options = {"steps": steps, "learning_rate": 1e-3, "callback": callback, "progress": False}
     rts.fit(lambda parameters: images(parameters) - target, start, **options)
-    return np.diff(times)[5:].tolist(), calls
+    return times
 
 
-def main(pairs=7):
-    """Print medians of both, and their ratio."""
+def main(steps=200):
+    """Print both."""
     with socket.socket() as tried:
         tried.bind(("127.0.0.1", 0))
         port = tried.getsockname()[1]
     watch = rts_viewer.Watch(port)
-    fitted(None)  # Compiles.
-    plain, watched, calls, ratios = [], [], [], []
-    for _ in range(pairs):
-        start = time.process_time()
-        plain += fitted(None)[0]
-        middle = time.process_time()
-        steps, taken = fitted(watch)
-        ratios.append((time.process_time() - middle) / (middle - start))
-        watched, calls = watched + steps, calls + taken
+    for cuts in (4, 6):
+        share, own = occupied(watch, cuts)
+        triangles = 20 * 4**cuts
+        print(
+            f"{triangles} triangles: the page takes {100 * share:.1f} % of a core, Watch.step {1e3 * own:.2f} ms of it"
+        )
+    without, with_ = (1e3 * statistics.median(x) for x in fitted(watch, steps))
+    print(f"a step of a fit takes {without:.1f} ms without and {with_:.1f} ms with a page: {with_ / without:.3f}")
     watch.close()
-    medians = [1e3 * statistics.median(x) for x in (plain, watched)]
-    print(
-        f"a step takes {medians[0]:.1f} ms without and {medians[1]:.1f} ms with a page: {medians[1] / medians[0]:.3f}"
-    )
-    shown = ", ".join(f"{ratio:.3f}" for ratio in sorted(ratios))
-    print(f"processor time of whole fits, with over without: median {statistics.median(ratios):.3f} of {shown}")
-    print(f"Watch.step takes {1e3 * np.median(calls):.2f} ms, {1e3 * np.percentile(calls, 95):.2f} ms at most in 95 %")
 
 
 if __name__ == "__main__":
