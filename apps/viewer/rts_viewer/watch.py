@@ -20,7 +20,7 @@ from rts_viewer.pictures import loss_curve
 PAUSE = 0.25
 """The least time from one mesh to the next, seconds."""
 SHARE = 30
-"""The least time from one mesh to the next, in times of making one: so that a fit loses some 3 % at most."""
+"""The least time from one mesh to the next, in times of making one: a fit loses at most one part in 31 to it."""
 
 
 class Watch:
