@@ -27,6 +27,7 @@ PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs")
 COMING_FROM = [page for page in PAGES if page.startswith("docs/coming-from/")]
 ELSEWHERE = {
     "rts demo": "make wheel",
+    "rts view model.obj": "make apps",
     "rts plugins --matrix": "test_compatibility.py",
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",

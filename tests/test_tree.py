@@ -130,6 +130,15 @@ def test_measuring_imports_public_names_alone():
         assert not private(path, public), path
 
 
+def test_apps_import_public_names_alone():
+    public = {"rts": [*rts.__all__, *rts.registry.built_in_attributes()], **toolkit()}
+    public["rts.plugin_api"] = [name.rpartition(".")[2] for name in toolkit()]
+    own = sorted((ROOT / "apps").glob("*/rts_*/*.py"))
+    assert len(own) > 5
+    for path in own:
+        assert not private(path, public), path
+
+
 def test_a_private_import_is_found(tmp_path):
     path = tmp_path / "plugin.py"
     path.write_text(
@@ -181,8 +190,14 @@ def test_the_architecture_has_a_line_for_every_file():
     for name, path in FILES.items():
         if path.name != "__init__.py" or name == "rts":
             assert re.search(rf"\b{path.name}\b", tree), f"{name} is not in docs/architecture.md"
+    apps = [path for path in (ROOT / "apps").rglob("*.py") if path.parent.name != "tests"]
+    for path in apps:
+        assert path.name == "__init__.py" or re.search(rf"\b{path.name}\b", tree), (
+            f"{path} is not in docs/architecture.md"
+        )
     for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_loops.py", "").replace("test_<what>.py", "")):
-        assert any(path.stem == named for path in FILES.values()), f"docs/architecture.md names {named}.py"
+        known = any(path.stem == named for path in (*FILES.values(), *apps))
+        assert known, f"docs/architecture.md names {named}.py"
 
 
 def long_lines(text):
