@@ -7,7 +7,6 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gpytoolbox
 import numpy as np
 import scipy.spatial
 import torch
@@ -121,7 +120,10 @@ def _remeshed(model: Model, faces: int) -> Model:
     mesh = trimesh.Trimesh(model.vertices, model.faces, process=False)
     if _is_manifold(mesh):
         length = math.sqrt(4 * mesh.area / (math.sqrt(3) * faces))
-        found = gpytoolbox.remesh_botsch(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), ROUNDS, length)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # Its import takes old names of SciPy.
+            from gpytoolbox import remesh_botsch
+        found = remesh_botsch(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), ROUNDS, length)
         vertices, corners = (np.asarray(x) for x in found)
     else:
         warnings.warn("the mesh is no manifold; faces are split, not remeshed", rts.RtsWarning, 3)
