@@ -11,6 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-r
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
+APPS := $(wildcard apps/*)
 LOOPS := $(shell grep -rl --include=*.py -E '@loop|numba' rts rts_backends rts_surfaces)
 
 # What opens the pages of comparisons, where no other browser that the tests know is there.
@@ -19,9 +20,9 @@ BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || co
 SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++ $(BROWSER)
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
-.PHONY: check demo test test-all test-xla warmup lint types wheel oldest clean system
+.PHONY: check demo test test-all test-xla apps warmup lint types wheel oldest clean system
 
-check: lint types test test-all test-xla wheel oldest
+check: lint types test test-all test-xla apps wheel oldest
 
 demo: $(VENV)/.demo
 	$(BIN)/rts demo -o out
@@ -37,6 +38,10 @@ test-all: warmup
 # jax as users have it: XLA improves programs, which elsewhere in the tests would take longer than it saves.
 test-xla: warmup
 	XLA_FLAGS= $(PYTEST) tests/test_jax.py
+
+# Distributions of their own, which use the library.
+apps: warmup $(VENV)/.apps
+	@for app in $(APPS); do echo "== $$app"; $(PYTEST) $$app/tests || exit 1; done
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 warmup: system $(VENV)/.test $(VENV)/.warm
@@ -89,6 +94,10 @@ $(VENV)/.test: $(BIN)/python $(SOURCES) $(EXAMPLE)/pyproject.toml
 	$(INSTALL) -e '.[all,test]' -e ./$(EXAMPLE)
 	@touch $@ $(VENV)/.demo
 
+$(VENV)/.apps: $(VENV)/.test $(APPS:%=%/pyproject.toml)
+	$(INSTALL) $(APPS:%=-e ./%)
+	@touch $@
+
 $(VENV)/.dev: $(BIN)/python $(SOURCES)
 	$(INSTALL) --group dev
 	@touch $@
@@ -100,4 +109,4 @@ $(OLDEST)/.installed: $(OLDEST)/bin/python pyproject.toml constraints-oldest.txt
 .PRECIOUS: %/bin/python
 
 clean:
-	rm -rf $(VENV) $(OLDEST) out build dist *.egg-info $(EXAMPLE)/*.egg-info
+	rm -rf $(VENV) $(OLDEST) out build dist *.egg-info $(EXAMPLE)/*.egg-info $(APPS:%=%/*.egg-info)

@@ -25,6 +25,12 @@ FILES = {
     for path in sorted((ROOT / package).rglob("*.py"))
 }
 
+APPS = {
+    f"{path.parent.name}.{path.stem}": path
+    for path in sorted((ROOT / "apps").glob("*/rts_*/*.py"))
+    if path.name != "__init__.py"
+}
+
 COMPILING = ("rts.compiling.loops", "rts.plugin_api.loops")
 
 
@@ -125,7 +131,8 @@ def test_measuring_imports_public_names_alone():
     public |= {name: defined(FILES[name]) for name in modules}
     public["rts.diagnostics.command_tools"] = import_module("rts.diagnostics.command_tools").__all__
     own = [path for name, path in FILES.items() if name.startswith("rts_compare")]
-    assert len(own) > 30
+    assert len(own) > 30 and len(APPS) > 10
+    own += APPS.values()
     for path in own:
         assert not private(path, public), path
 
@@ -178,11 +185,12 @@ def test_a_docstring_says_by_itself_what_it_speaks_of():
 def test_the_architecture_has_a_line_for_every_file():
     text = (ROOT / "docs/architecture.md").read_text()
     tree = text[text.index("## The tree") :].split("```")[1]
-    for name, path in FILES.items():
+    files = FILES | APPS
+    for name, path in files.items():
         if path.name != "__init__.py" or name == "rts":
             assert re.search(rf"\b{path.name}\b", tree), f"{name} is not in docs/architecture.md"
     for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_loops.py", "").replace("test_<what>.py", "")):
-        assert any(path.stem == named for path in FILES.values()), f"docs/architecture.md names {named}.py"
+        assert any(path.stem == named for path in files.values()), f"docs/architecture.md names {named}.py"
 
 
 def long_lines(text):
@@ -198,7 +206,7 @@ def long_lines(text):
 
 
 def test_lines_of_markdown_are_short():
-    folders = [ROOT / name for name in ("docs", "benchmarks", "examples", "tests")]
+    folders = [ROOT / name for name in ("apps", "docs", "benchmarks", "examples", "tests")]
     pages = [*ROOT.glob("*.md"), *(page for folder in folders for page in folder.rglob("*.md"))]
     assert len(pages) > 10
     assert not {str(p.relative_to(ROOT)): long for p in pages if (long := long_lines(p.read_text()))}

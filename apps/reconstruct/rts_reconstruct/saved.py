@@ -43,6 +43,7 @@ class Saved:
         beside = self.folder / "stages.new.npz"
         np.savez(beside, about=np.array(about), **arrays)
         os.replace(beside, self.file)
+        self.running(len(losses) - 1).unlink(missing_ok=True)
 
     def read(self) -> tuple[Model, list[list[float]], float] | None:
         """The model after the last stage that ended, losses of each stage, and the seconds taken; None if none ended.

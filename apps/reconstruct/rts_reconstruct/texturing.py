@@ -16,8 +16,8 @@ from rts_reconstruct.model import Atlas, Model, moved_camera, surface_of, textur
 from rts_reconstruct.pictures import Pictures
 from rts_reconstruct.stages import Settings
 
-RATE = 0.02
-"""Adam's rate for texels."""
+FAINT = 0.02
+"""Texels with less than this share of the median weight in pictures follow them more slowly."""
 PADDING = 4
 """Texels between the charts of an atlas."""
 
@@ -56,35 +56,64 @@ def fitted(
 ) -> tuple[Model, list[float]]:
     """The model with its texture fitted to the pictures, and the losses of the steps; see `stages.fitted`.
 
-    Texels that no picture shows stay as they are.
+    A step moves each texel by the weighted mean of differences at the pixels that show it, as in SIRT (Gilbert 1972,
+    *Iterative Methods for the Three-dimensional Reconstruction of an Object from Projections*). Adam would move texels
+    that pictures hardly show as far as all others, and fill the texture with specks. Texels that no picture shows stay
+    as they are.
     """
     atlas = model.atlas
     assert atlas is not None
     surface = surface_of(model)
     poses = {"poses": torch.tensor(model.poses)}
+    scale, start = torch.tensor(_scales(model, pictures)), torch.tensor(atlas.texture)
+    batch = min(settings.batch, len(pictures.views))
+
+    def texture_of(p: Any) -> Any:
+        return start + scale * p["changes"]
+
     residuals = rts.ViewResiduals(
-        lambda p: textured(surface, model.vertices, atlas.uv, p["texture"]),
+        lambda p: textured(surface, model.vertices, atlas.uv, texture_of(p)),
         pictures.views,
-        batch=min(settings.batch, len(pictures.views)),
+        batch=batch,
         seed=settings.seed,
         cameras=(lambda p, camera, view: moved_camera(poses, camera, view)) if settings.cameras else None,
         background=None if pictures.outlined else pictures.background,
     )
 
     def colors_of(p: Any) -> np.ndarray:
-        shown = atlas._replace(texture=p["texture"].detach().numpy())
+        shown = atlas._replace(texture=texture_of(p).detach().numpy())
         return shown.colors(model.faces, len(model.vertices))
 
     fit = rts.fit(
         residuals,
-        {"texture": torch.tensor(atlas.texture)},
+        {"changes": torch.zeros_like(start)},
+        method="sgd",
         steps=steps,
-        learning_rate=RATE,
+        # The derivative of a square has a factor 2. A texel that one picture shows must not overshoot in its turn.
+        learning_rate=0.5 * batch / len(pictures.views),
         validate_every=steps,
         checkpoint=checkpoint,
         callback=lambda step, p, loss: report(step, loss, lambda: (model.vertices, model.faces, colors_of(p))),
         progress=settings.progress,
     )
-    texture = np.clip(fit.parameters["texture"].numpy(), 0, 1)
+    texture = np.clip(texture_of(fit.parameters).numpy(), 0, 1)
     atlas = atlas._replace(texture=texture)
     return model._replace(atlas=atlas, colors=atlas.colors(model.faces, len(model.vertices))), fit.history
+
+
+def _scales(model: Model, pictures: Pictures) -> np.ndarray:
+    """Factors (R, R, 1) on changes of texels: one over the root of their weight in the mean over pixels and pictures.
+
+    Gradient descent by changes is then descent by texels, where each has one over its weight as its rate.
+    """
+    assert model.atlas is not None
+    surface, poses = surface_of(model), {"poses": torch.tensor(model.poses)}
+    texture = torch.tensor(model.atlas.texture, requires_grad=True)
+    for number, view in enumerate(pictures.views):
+        part = textured(surface, model.vertices, model.atlas.uv, texture)
+        image = rts.render(part, moved_camera(poses, view.camera, number), view.size)
+        image[..., : view.image.shape[2]].mean().backward()  # Linear in the texture: the gradient is the weight.
+    assert texture.grad is not None
+    weights = texture.grad[..., :1].numpy() / len(pictures.views)
+    faint = FAINT * float(np.median(weights[weights > 0])) if (weights > 0).any() else 1.0
+    return np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 0) + faint), 0).astype(np.float32)

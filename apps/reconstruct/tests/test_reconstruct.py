@@ -263,12 +263,13 @@ def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
     for name in ("mesh.obj", "mesh.glb"):
         image = np.asarray(rts.render(rts.load(out / name)[0].replace(shader="unlit"), cameras()[3], (SIZE, SIZE)))
         assert np.abs(image - images()[3]).mean() < 0.05, name
-    rows = list(csv.DictReader((out / "views.csv").open()))
+    rows = list(csv.DictReader((out / "views.csv").read_text().splitlines()))
     assert [row["held_out"] for row in rows] == list("00010001")
     assert all(float(row["psnr_db"]) > 20 and float(row["iou"]) > 0.9 for row in rows)
     page = (out / "report.html").read_text()
     assert page.count("data:image/png") == 6 and "<polyline" in page and "http" not in page
-    assert Image.open(out / "turntable.gif").n_frames == 36
+    with Image.open(out / "turntable.gif") as turning:
+        assert turning.n_frames == 36
 
 
 @pytest.mark.thorough
