@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 import rts
 from rts_reconstruct.measures import Measured
@@ -24,9 +26,9 @@ def write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
     files = [folder / "mesh.obj", folder / "mesh.glb"]
     colors = np.clip(model.colors, 0, 1)
     if model.atlas is None:
-        mesh = trimesh.Trimesh(vertices, model.faces, vertex_colors=_bytes(colors), process=False)
         files[0].write_text(_obj(vertices, model, colors), encoding="utf-8")
-        mesh.visual.vertex_colors = _bytes(_decoded(colors))  # glTF's are linear, OBJ's are as pictures have them.
+        linear = _bytes(_decoded(colors))  # glTF's colours are linear, OBJ's are as pictures have them.
+        mesh = trimesh.Trimesh(vertices, model.faces, vertex_colors=linear, process=False)
         mesh.export(files[1])
         return files
     picture = Image.fromarray(_bytes(model.atlas.texture))
@@ -35,8 +37,8 @@ def write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
     files[0].write_text(_obj(vertices, model, None), encoding="utf-8")
     # glTF has one row a vertex for both positions and map.
     rows, corners = _rows(model)
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
-    visual = trimesh.visual.TextureVisuals(uv=model.atlas.uv[rows[:, 1]], material=material)
+    material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
+    visual = TextureVisuals(uv=model.atlas.uv[rows[:, 1]], material=material)
     trimesh.Trimesh(vertices[rows[:, 0]], corners, visual=visual, process=False).export(files[1])
     return [*files, folder / "mesh.mtl", folder / "texture.png"]
 

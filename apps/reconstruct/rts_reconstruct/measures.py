@@ -55,7 +55,10 @@ def measured(model: Model, pictures: Pictures) -> list[Measured]:
     for place, view in enumerate(pictures.views + pictures.held_out):
         render = shown(model, pictures, place)
         image = view.image
-        pair = [on(image, pictures.background), on(render if pictures.outlined else render[..., :3], pictures.background)]
+        pair = [
+            on(image, pictures.background),
+            on(render if pictures.outlined else render[..., :3], pictures.background),
+        ]
         weights = np.ones(view.size) if view.mask is None else view.mask
         error = float((weights[..., None] * (pair[0] - pair[1]) ** 2).sum() / (3 * max(weights.sum(), 1)))
         iou = None

@@ -85,7 +85,9 @@ def _smaller(view: rts.View, size: int, world: World) -> rts.View:
     n = -(-max(view.size) // size)
     height, width = (extent // n for extent in view.size)
     if min(height, width) < 1:
-        raise rts.InputError(f"size is {size}, and {view.name or 'a view'} has {view.size} pixels; choose a larger size")
+        raise rts.InputError(
+            f"size is {size}, and {view.name or 'a view'} has {view.size} pixels; choose a larger size"
+        )
     camera = view.camera.window(view.size, (0, 0), (height * n, width * n))
 
     def means(picture: np.ndarray) -> np.ndarray:
@@ -98,7 +100,7 @@ def _smaller(view: rts.View, size: int, world: World) -> rts.View:
         functools.cache(lambda: means(view.image)),
         (height, width),
         name=view.name,
-        mask=functools.cache(lambda: None if (mask := view.mask) is None else means(mask)),
+        mask=None if view.mask is None else functools.cache(lambda: means(np.asarray(view.mask))),
         path=view.path,
     )
 

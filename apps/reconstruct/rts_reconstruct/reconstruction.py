@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from rts.diagnostics.command_tools import output_folder, writing
 
 import rts
+from rts.diagnostics.command_tools import output_folder, writing
 from rts_reconstruct import files, job, measures, pictures, stages, texturing
 from rts_reconstruct.model import Model
 from rts_reconstruct.report import write_report
@@ -127,9 +126,12 @@ def reconstruct(
             that no view sees; or a folder that cannot be written.
     """
     defaults: dict[str, Any] = QUICK if quick else {"steps": STEPS, "size": SIZE, "texture": TEXTURE, "faces": 1}
-    steps, size = steps if steps is not None else defaults["steps"], size if size is not None else defaults["size"]
-    texture = texture if texture is not None else defaults["texture"]
-    _check(steps=(steps, 3), size=(size, 8), batch=(batch, 1), texture=(texture, 0), held_out=(held_out, 0), seed=(seed, 0))
+    steps = int(defaults["steps"]) if steps is None else steps
+    size = int(defaults["size"]) if size is None else size
+    texture = int(defaults["texture"]) if texture is None else texture
+    _check(
+        steps=(steps, 3), size=(size, 8), batch=(batch, 1), texture=(texture, 0), held_out=(held_out, 0), seed=(seed, 0)
+    )
     if 0 < texture < 16:
         raise rts.InputError(f"texture is {texture}; expected at least 16 texels a side, or 0 for vertex colours")
     folder = output_folder(out)

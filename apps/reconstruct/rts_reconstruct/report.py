@@ -19,9 +19,11 @@ MOST = 8
 """The most views that are shown."""
 POINTS = 400
 """The most points of the curve of losses."""
-STYLE = """body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+STYLE = """body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222 }
 img { max-width: 100%; image-rendering: pixelated } figure { margin: 1rem 0 } figcaption { color: #666 }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums } td, th { padding: .1rem .8rem; text-align: right }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums } td, th { padding: .1rem .8rem;
+  text-align: right }
 th { border-bottom: 1px solid #999 } .held { background: #eef4ff } .pair { display: flex; gap: .3rem }
 .pair img { width: 32%; min-width: 0 }"""
 
@@ -112,9 +114,7 @@ def _curve(losses: Sequence[list[float]]) -> str:
 
 def _table(rows: Sequence[Measured]) -> str:
     def cells(name: str, psnr: float | None, ssim: float | None, iou: float | None) -> str:
-        texts = [
-            "" if x is None else format(x, form) for x, form in ((psnr, ".2f"), (ssim, ".4f"), (iou, ".4f"))
-        ]
+        texts = ["" if x is None else format(x, form) for x, form in ((psnr, ".2f"), (ssim, ".4f"), (iou, ".4f"))]
         return f"<td>{html.escape(name)}</td>" + "".join(f"<td>{text}</td>" for text in texts)
 
     lines = []

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.spatial
 import torch
 import trimesh
+from scipy.spatial import KDTree
 
 import rts
 from rts_reconstruct.job import shared
@@ -129,8 +129,8 @@ def _remeshed(model: Model, faces: int) -> Model:
         warnings.warn("the mesh is no manifold; faces are split, not remeshed", rts.RtsWarning, 3)
         vertices, corners = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         while 2 * len(corners) < faces:
-            vertices, corners = trimesh.remesh.subdivide(vertices, corners)
-    away, near = scipy.spatial.cKDTree(model.vertices).query(vertices, k=NEAREST)
+            vertices, corners = trimesh.remesh.subdivide(vertices, corners)[:2]
+    away, near = KDTree(model.vertices).query(vertices, k=NEAREST)
     weights = 1 / (away + 1e-6)
     colors = np.einsum("vk,vkc->vc", weights / weights.sum(axis=1, keepdims=True), model.colors[near])
     return model._replace(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import scipy.ndimage
@@ -46,7 +47,7 @@ def _of_file(path: str | Path, pictures: Pictures) -> trimesh.Trimesh:
     if not all(hasattr(part.surface, "faces") for part in parts):
         raise rts.InputError(f"{path} holds other surfaces than triangles; expected a mesh to start from")
     meshes = [trimesh.Trimesh(np.asarray(part.theta["vertices"]), part.surface.faces, process=False) for part in parts]
-    mesh = trimesh.util.concatenate(meshes)
+    mesh: Any = trimesh.util.concatenate(meshes)
     mesh = trimesh.Trimesh(pictures.world.inside(mesh.vertices), mesh.faces, process=False)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces())
@@ -73,7 +74,7 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
         seen += inside
     least[seen < 2] = 0  # Space that nobody looks into is no object.
     values = scipy.ndimage.gaussian_filter(least.reshape((LATTICE,) * 3), 0.7)
-    labels, count = scipy.ndimage.label(values > 0.5)
+    labels, count = cast(Any, scipy.ndimage.label(values > 0.5))
     if count == 0:
         raise rts.InputError(
             "the masks have no point in common; expected masks, or alpha, of one object, and cameras that fit them"
@@ -101,8 +102,8 @@ def _check_seen(vertices: np.ndarray, views: Sequence[rts.View]) -> None:
     if len(blind) == len(views):
         low, high = np.asarray(vertices).min(axis=0), np.asarray(vertices).max(axis=0)
         raise rts.InputError(
-            f"none of {len(views)} views sees anything of the start, which lies between {np.round(low, 2).tolist()} and "
-            f"{np.round(high, 2).tolist()} (1 is what all cameras see); check the cameras, or give another start"
+            f"none of {len(views)} views sees anything of the start, which lies between {np.round(low, 2).tolist()} "
+            f"and {np.round(high, 2).tolist()} (1 is what all cameras see); check the cameras, or give another start"
         )
     if blind:
         names = ", ".join(str(views[i].name or i) for i in blind[:3]) + (", …" if len(blind) > 3 else "")

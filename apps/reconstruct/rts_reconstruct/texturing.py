@@ -38,7 +38,8 @@ def _baked(model: Model, size: int) -> Model:
     part = rts.Part(rts.Mesh(faces), {"vertices": flat, "colors": model.colors[rows]}, "unlit")
     camera = rts.Camera.orthographic((0.5, 0.5, 1), (0.5, 0.5, 0), height=1.0, aspect=1.0, far=2.0)
     picture = np.asarray(rts.render(part, camera, (size, size), splatter="none"))
-    nearest = scipy.ndimage.distance_transform_edt(picture[..., 3] < 0.5, return_distances=False, return_indices=True)
+    bare = picture[..., 3] < 0.5
+    nearest: Any = scipy.ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True)
     texture = picture[..., :3][tuple(nearest)]
     corners = model.faces[np.arange(len(faces))]  # Faces keep their order; their corners have rows of the map.
     assert np.array_equal(rows[faces], corners), "the atlas has another order of faces"
@@ -61,8 +62,8 @@ def fitted(
     that pictures hardly show as far as all others, and fill the texture with specks. Texels that no picture shows stay
     as they are.
     """
-    atlas = model.atlas
-    assert atlas is not None
+    assert model.atlas is not None
+    atlas: Atlas = model.atlas
     surface = surface_of(model)
     poses = {"poses": torch.tensor(model.poses)}
     scale, start = torch.tensor(_scales(model, pictures)), torch.tensor(atlas.texture)

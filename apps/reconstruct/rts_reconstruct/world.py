@@ -1,4 +1,4 @@
-"""The world in which a mesh is fitted: its origin in the middle of where cameras look, its unit what all of them see."""
+"""The world in which a mesh is fitted: its origin is where cameras look, its unit the radius that all of them see."""
 
 from __future__ import annotations
 
