@@ -51,8 +51,13 @@ def colored(surface: Any, vertices: Any, colors: Any) -> rts.Part:
 
 
 def textured(surface: Any, vertices: Any, uv: Any, texture: Any) -> rts.Part:
-    """A mesh with a texture, which needs no light."""
-    return rts.Part(surface, {"vertices": vertices, "uv": uv, "texture": texture}, "textured")
+    """A mesh with a texture, which needs no light.
+
+    Pixels average the texture over their footprint, as viewers do. So in a fit all texels below a pixel follow it, and
+    pixels that see the surface at a grazing angle count little for each of their many texels.
+    """
+    shader = rts.plugin("shaders", "textured")(mip=True)
+    return rts.Part(surface, {"vertices": vertices, "uv": uv, "texture": texture}, shader)
 
 
 def surface_of(model: Model) -> Any:

@@ -33,17 +33,25 @@ def _baked(model: Model, size: int) -> Model:
     atlas.generate(pack_options=_options(size))
     rows, faces, uv = atlas[0]
     faces, uv = faces.astype(np.int32), uv.astype(np.float32)
-    # The atlas is a flat mesh, whose picture is the texture.
-    flat = np.concatenate([uv, np.zeros_like(uv[:, :1])], axis=1)
-    part = rts.Part(rts.Mesh(faces), {"vertices": flat, "colors": model.colors[rows]}, "unlit")
-    camera = rts.Camera.orthographic((0.5, 0.5, 1), (0.5, 0.5, 0), height=1.0, aspect=1.0, far=2.0)
-    picture = np.asarray(rts.render(part, camera, (size, size), splatter="none"))
-    bare = picture[..., 3] < 0.5
-    nearest: Any = scipy.ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True)
-    texture = picture[..., :3][tuple(nearest)]
+    picture = _flat(uv, faces, model.colors[rows], size)
+    texture = _spread(picture[..., :3], picture[..., 3] < 0.5)
     corners = model.faces[np.arange(len(faces))]  # Faces keep their order; their corners have rows of the map.
     assert np.array_equal(rows[faces], corners), "the atlas has another order of faces"
     return model._replace(atlas=Atlas(uv, faces, texture.astype(np.float32)))
+
+
+def _flat(uv: np.ndarray, faces: np.ndarray, colors: np.ndarray, size: int) -> np.ndarray:
+    """The picture (R, R, 4) of an atlas, which is a flat mesh, with colours (U, 3)."""
+    flat = np.concatenate([uv, np.zeros_like(uv[:, :1])], axis=1)
+    part = rts.Part(rts.Mesh(faces), {"vertices": flat, "colors": colors}, "unlit")
+    camera = rts.Camera.orthographic((0.5, 0.5, 1), (0.5, 0.5, 0), height=1.0, aspect=1.0, far=2.0)
+    return np.asarray(rts.render(part, camera, (size, size), splatter="none"))
+
+
+def _spread(texture: np.ndarray, bare: np.ndarray) -> np.ndarray:
+    """The texture with colours of the nearest others at bare texels, so that averages at seams are of such colours."""
+    nearest: Any = scipy.ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True)
+    return texture[tuple(nearest)]
 
 
 def _options(size: int) -> Any:
@@ -66,7 +74,9 @@ def fitted(
     atlas: Atlas = model.atlas
     surface = surface_of(model)
     poses = {"poses": torch.tensor(model.poses)}
-    scale, start = torch.tensor(_scales(model, pictures)), torch.tensor(atlas.texture)
+    bare = _flat(atlas.uv, atlas.faces, np.ones((len(atlas.uv), 3), np.float32), len(atlas.texture))[..., 3] < 0.5
+    scale = torch.tensor(np.where(bare[..., None], 0, _scales(model, pictures)))  # Between charts nothing is fitted.
+    start = torch.tensor(atlas.texture)
     batch = min(settings.batch, len(pictures.views))
 
     def texture_of(p: Any) -> Any:
@@ -97,7 +107,7 @@ def fitted(
         callback=lambda step, p, loss: report(step, loss, lambda: (model.vertices, model.faces, colors_of(p))),
         progress=settings.progress,
     )
-    texture = np.clip(texture_of(fit.parameters).numpy(), 0, 1)
+    texture = _spread(np.clip(texture_of(fit.parameters).numpy(), 0, 1), bare)
     atlas = atlas._replace(texture=texture)
     return model._replace(atlas=atlas, colors=atlas.colors(model.faces, len(model.vertices))), fit.history
 
