@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-r
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
-APPS := apps/viewer
+APPS := $(patsubst %/pyproject.toml,%,$(wildcard apps/*/pyproject.toml))
 LOOPS := $(shell grep -rl --include=*.py -E '@loop|numba' rts rts_backends rts_surfaces)
 
 # What opens the pages of comparisons, where no other browser that the tests know is there.
@@ -41,7 +41,7 @@ test-xla: warmup
 
 # Distributions of their own that are built on the library, each with its tests.
 apps: warmup $(VENV)/.apps
-	for app in $(APPS); do $(BIN)/python -m pytest $$app/tests || exit 1; done
+	@for app in $(APPS); do echo "== $$app"; $(BIN)/python -m pytest $$app/tests || exit 1; done
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 warmup: system $(VENV)/.test $(VENV)/.warm

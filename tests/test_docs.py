@@ -31,6 +31,7 @@ ELSEWHERE = {
     "rts plugins --matrix": "test_compatibility.py",
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
+    "rts reconstruct photos/ -o out/thing --quick": "make apps",
 }
 """Commands that take long, and who runs them."""
 

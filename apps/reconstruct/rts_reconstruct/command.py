@@ -1,0 +1,75 @@
+"""The command `rts reconstruct`. Slow modules are imported as it runs, so that `rts --help` is quick."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+import rts
+
+
+def reconstruct(
+    views: Annotated[
+        Path,
+        typer.Argument(help="Folder or file of pictures with cameras: transforms.json, COLMAP, LLFF, cameras.json."),
+    ],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("reconstruction"),
+    start: Annotated[str, typer.Option(help="ball, hull (of alpha or masks), or a file of a mesh.")] = "ball",
+    steps: Annotated[int | None, typer.Option(help="Steps of the shape; 1300.", show_default=False)] = None,
+    size: Annotated[int | None, typer.Option(help="Longer side of pictures, at most; 256.", show_default=False)] = None,
+    batch: Annotated[int, typer.Option(help="Pictures in a step.")] = 4,
+    texture: Annotated[
+        int | None, typer.Option(help="Texels a side; 1024. 0 for vertex colours.", show_default=False)
+    ] = None,
+    held_out: Annotated[int, typer.Option(help="Hold out every so many views, to measure only; 0 for none.")] = 8,
+    fit_cameras: Annotated[bool, typer.Option("--fit-cameras", help="Fit the poses of cameras, too.")] = False,
+    background: Annotated[
+        str | None, typer.Option(help="R,G,B from 0 to 1, of pictures without alpha and masks; else that of borders.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: small pictures, few steps and faces.")] = False,
+    seed: Annotated[int, typer.Option(help="Of the order of pictures.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run was.")] = False,
+) -> None:
+    """Fit a textured mesh to photographs with cameras.
+
+    Writes mesh.obj, mesh.glb, turntable.gif, views.csv and report.html.
+
+    Example: rts reconstruct photos/ -o out/thing --quick && open out/thing/report.html
+    """
+    from rts_reconstruct.job import first
+    from rts_reconstruct.reconstruction import reconstruct as reconstructed
+
+    try:
+        found = reconstructed(
+            views,
+            out,
+            start=start,
+            steps=steps,
+            size=size,
+            batch=batch,
+            texture=texture,
+            held_out=held_out,
+            fit_cameras=fit_cameras,
+            background=None if background is None else _colour(background),
+            quick=quick,
+            seed=seed,
+            resume=resume,
+        )
+    except KeyboardInterrupt:
+        kept = f"{out / 'mesh.obj'} is of the last stage" if (out / "mesh.obj").is_file() else "no stage has ended"
+        typer.echo(f"rts: interrupted; {kept}, and the same command with --resume goes on", err=True)
+        raise typer.Exit(130) from None
+    if first():
+        names = ", ".join(file.name for file in found.files)
+        Console(soft_wrap=True, highlight=False).print(escape(f"{found!r}: {names} in {out}"))
+
+
+def _colour(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise rts.InputError(f"--background is {text!r:.60}; expected three numbers, such as 1,1,1") from None

@@ -1,0 +1,102 @@
+"""Files of a reconstruction: the mesh as OBJ and glTF, a turntable, and the table of views."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+import rts
+from rts_reconstruct.measures import Measured
+from rts_reconstruct.model import Model
+from rts_reconstruct.pictures import Pictures
+
+FRAMES, FPS, TURNTABLE = 36, 12, 256
+
+
+def write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
+    """Write `mesh.obj`, with `mesh.mtl` and `texture.png` if there is one, and `mesh.glb`, in the data set's world."""
+    vertices = pictures.world.outside(model.vertices)
+    files = [folder / "mesh.obj", folder / "mesh.glb"]
+    colors = np.clip(model.colors, 0, 1)
+    if model.atlas is None:
+        files[0].write_text(_obj(vertices, model, colors), encoding="utf-8")
+        linear = _bytes(_decoded(colors))  # glTF's colours are linear, OBJ's are as pictures have them.
+        mesh = trimesh.Trimesh(vertices, model.faces, vertex_colors=linear, process=False)
+        mesh.export(files[1])
+        return files
+    picture = Image.fromarray(_bytes(model.atlas.texture))
+    picture.save(folder / "texture.png")
+    (folder / "mesh.mtl").write_text("newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd texture.png\n")
+    files[0].write_text(_obj(vertices, model, None), encoding="utf-8")
+    # glTF has one row a vertex for both positions and map.
+    rows, corners = _rows(model)
+    material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
+    visual = TextureVisuals(uv=model.atlas.uv[rows[:, 1]], material=material)
+    trimesh.Trimesh(vertices[rows[:, 0]], corners, visual=visual, process=False).export(files[1])
+    return [*files, folder / "mesh.mtl", folder / "texture.png"]
+
+
+def _rows(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (M, 2) of a vertex and a row of the map, and the faces (T, 3) between them."""
+    assert model.atlas is not None
+    pairs = np.stack([model.faces, model.atlas.faces], axis=-1).reshape(-1, 2)
+    rows, corners = np.unique(pairs, axis=0, return_inverse=True)
+    return rows, corners.reshape(-1, 3)
+
+
+def _obj(vertices: np.ndarray, model: Model, colors: np.ndarray | None) -> str:
+    """The text of an OBJ file: positions once each, so that the surface is closed, and seams in the map alone."""
+    lines = ["mtllib mesh.mtl", "usemtl surface"] if colors is None else []
+    both = vertices if colors is None else np.concatenate([vertices, colors], axis=1)
+    lines += ["v " + " ".join(f"{x:.7g}" for x in row) for row in both]
+    if model.atlas is None:
+        return "\n".join([*lines, *("f " + " ".join(map(str, face)) for face in model.faces + 1), ""])
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in model.atlas.uv]
+    faces = np.stack([model.faces, model.atlas.faces], axis=-1) + 1
+    lines += ["f " + " ".join(f"{v}/{t}" for v, t in face) for face in faces]
+    return "\n".join([*lines, ""])
+
+
+def write_turntable(path: Path, model: Model, pictures: Pictures) -> None:
+    """Write an animation of the model, which turns about the axis that is up in most pictures, on white."""
+    ups = np.array([np.linalg.inv(np.asarray(v.camera.view))[:3, 1] for v in pictures.views])
+    up = ups.mean(axis=0)
+    up = up / length if (length := np.linalg.norm(up)) > 0.2 else np.array([0.0, 1.0, 0.0])
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
+    low, high = model.vertices.min(axis=0), model.vertices.max(axis=0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    frames = []
+    for angle in 2 * np.pi * np.arange(FRAMES) / FRAMES:
+        way = np.cos(angle) * across + np.sin(angle) * np.cross(up, across) + 0.4 * up
+        eye = middle + 3.1 * radius * way / np.linalg.norm(way)
+        camera = rts.Camera.look_at(eye, middle, up, fov_y=40)
+        frame = np.asarray(rts.render(model.part, camera, (TURNTABLE, TURNTABLE), supersample=2, background=(1, 1, 1)))
+        frames.append(_decoded(np.clip(frame[..., :3], 0, 1)).astype(np.float32))
+    rts.save_animation(path, frames, fps=FPS)
+
+
+def write_table(path: Path, rows: Sequence[Measured]) -> None:
+    """Write the measures of views as CSV, in the order of the data set."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["view", "name", "held_out", "psnr_db", "ssim", "iou"])
+        for row in sorted(rows, key=lambda row: row.number):
+            iou = "" if row.iou is None else f"{row.iou:.4f}"
+            writer.writerow([row.number, row.name, int(row.held_out), f"{row.psnr:.2f}", f"{row.ssim:.4f}", iou])
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+
+
+def _decoded(encoded: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB-encoded ones (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,30 @@
+"""One process, or a job of several that `torchrun` starts, whose first one writes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+
+def join() -> bool:
+    """Join the job of `torchrun`, if there is one. Returns True in its first process, and where there is no job."""
+    if "RANK" in os.environ and not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("gloo")
+    return first()
+
+
+def first() -> bool:
+    """True in the first process of a job, and where there is no job."""
+    return not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0
+
+
+def shared(function: Callable[[], Any]) -> Any:
+    """The result of a function that the first process alone calls."""
+    if not torch.distributed.is_initialized():
+        return function()
+    results = [function() if first() else None]
+    torch.distributed.broadcast_object_list(results)
+    return results[0]

@@ -1,0 +1,71 @@
+"""The model that is fitted: a mesh, its colours or its texture, and the poses of cameras."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import rts
+
+
+class Atlas(NamedTuple):
+    """A texture (R, R, 3), row 0 on top, and its map: uv (U, 2), and (T, 3) rows of it for each face."""
+
+    uv: np.ndarray
+    faces: np.ndarray
+    texture: np.ndarray
+
+    def colors(self, faces: np.ndarray, count: int) -> np.ndarray:
+        """Colours (V, 3) of vertices, by the texels at their places."""
+        size = len(self.texture)
+        uv = np.zeros((count, 2), np.float32)
+        uv[faces.reshape(-1)] = self.uv[self.faces.reshape(-1)]
+        column, row = (np.clip((x * size).astype(int), 0, size - 1) for x in (uv[:, 0], 1 - uv[:, 1]))
+        return self.texture[row, column]
+
+
+class Model(NamedTuple):
+    """A mesh (V, 3), (T, 3) with colours (V, 3) or an atlas; poses (B, 6) of the world before each camera.
+
+    Vertices are in the world of `Pictures`, colours sRGB-encoded.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+    poses: np.ndarray
+    atlas: Atlas | None = None
+
+    @property
+    def part(self) -> rts.Part:
+        """The mesh as a part, in its colours."""
+        if self.atlas is None:
+            return colored(rts.Mesh(self.faces), self.vertices, self.colors)
+        return textured(surface_of(self), self.vertices, self.atlas.uv, self.atlas.texture)
+
+
+def colored(surface: Any, vertices: Any, colors: Any) -> rts.Part:
+    """A mesh with colours (V, 3), which need no light."""
+    return rts.Part(surface, {"vertices": vertices, "colors": colors}, "unlit")
+
+
+def textured(surface: Any, vertices: Any, uv: Any, texture: Any) -> rts.Part:
+    """A mesh with a texture, which needs no light.
+
+    Pixels average the texture over their footprint, as viewers do. So in a fit all texels below a pixel follow it, and
+    pixels that see the surface at a grazing angle count little for each of their many texels.
+    """
+    shader = rts.plugin("shaders", "textured")(mip=True)
+    return rts.Part(surface, {"vertices": vertices, "uv": uv, "texture": texture}, shader)
+
+
+def surface_of(model: Model) -> Any:
+    """The faces of a model with an atlas, and those of its map."""
+    assert model.atlas is not None
+    return rts.Mesh(model.faces, {"uv": model.atlas.faces})
+
+
+def moved_camera(p: Any, camera: rts.Camera, view: Any) -> rts.Camera:
+    """The camera of a view, with the world before it moved by the view's pose."""
+    return camera.within(rts.rigid(p["poses"][view]))

@@ -1,0 +1,144 @@
+"""Stages of a fit: from few vertices and large smoothness to many and little; remeshed in between."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import KDTree
+
+import rts
+from rts_reconstruct.job import shared
+from rts_reconstruct.model import Model, colored, moved_camera
+from rts_reconstruct.pictures import Pictures
+
+ROUNDS = 5
+"""Rounds of remeshing."""
+NEAREST = 3
+"""The old vertices from which a new one has its colour."""
+
+
+class Stage(NamedTuple):
+    """Steps with one set of rates, on a mesh of about so many faces.
+
+    Attributes:
+        faces: the number of faces to remesh to, about.
+        share: the share of all steps.
+        smoothness: that of `rts.LargeSteps`.
+        shape: the learning rate of the shape.
+        colors: that of colours.
+        poses: that of cameras.
+    """
+
+    faces: int
+    share: float
+    smoothness: float
+    shape: float
+    colors: float
+    poses: float
+
+
+STAGES = (
+    Stage(5_000, 0.3, 40, 0.1, 0.02, 0.002),
+    Stage(20_000, 0.3, 40, 0.05, 0.02, 0.001),
+    Stage(30_000, 0.4, 20, 0.01, 0.005, 0.0003),
+)
+
+
+class Settings(NamedTuple):
+    """How all stages fit: views a step, the seed, True to fit cameras, True to show progress (None: on a terminal)."""
+
+    batch: int
+    seed: int
+    cameras: bool
+    progress: bool | None
+
+
+def fitted(
+    model: Model, pictures: Pictures, stage: Stage, steps: int, settings: Settings, checkpoint: Path | None, report: Any
+) -> tuple[Model, list[float]]:
+    """The model after a stage, on its own mesh; and the losses of its steps.
+
+    Args:
+        model: the model before.
+        pictures: the pictures.
+        stage: the rates.
+        steps: the number of steps.
+        settings: what all stages share.
+        checkpoint: the file of the fit's state, or None.
+        report: called as (step, loss, vertices, faces, colors); a true result stops the fit.
+    """
+    steps_of = rts.LargeSteps(model.faces, len(model.vertices), stage.smoothness)
+    surface = rts.Mesh(model.faces)
+    start = {"shape": torch.tensor(steps_of.encode(model.vertices)), "colors": torch.tensor(model.colors)}
+    rates = {"shape": stage.shape, "colors": stage.colors}
+    if settings.cameras:
+        start["poses"], rates["poses"] = torch.tensor(model.poses), stage.poses
+    residuals = rts.ViewResiduals(
+        lambda p: colored(surface, steps_of.decode(p["shape"]), p["colors"]),
+        pictures.views,
+        batch=min(settings.batch, len(pictures.views)),
+        seed=settings.seed,
+        cameras=moved_camera if settings.cameras else None,
+        background=None if pictures.outlined else pictures.background,
+    )
+
+    def vertices_of(p: Any) -> np.ndarray:
+        return np.asarray(steps_of.decode(p["shape"].detach()), np.float32)
+
+    fit = rts.fit(
+        residuals,
+        start,
+        steps=steps,
+        learning_rate=rates,
+        validate_every=steps,
+        checkpoint=checkpoint,
+        callback=lambda step, p, loss: report(
+            step, loss, lambda: (vertices_of(p), model.faces, p["colors"].detach().numpy())
+        ),
+        progress=settings.progress,
+    )
+    best = fit.parameters
+    poses = best["poses"].numpy() if settings.cameras else model.poses
+    return Model(vertices_of(best), model.faces, best["colors"].numpy(), poses), fit.history
+
+
+def remeshed(model: Model, faces: int) -> Model:
+    """The model on a mesh of about so many faces of like size (Botsch and Kobbelt 2004), its colours carried over.
+
+    A mesh that is no manifold cannot be remeshed: its faces are split, while there are less than half as many.
+    """
+    return shared(lambda: _remeshed(model, faces))
+
+
+def _remeshed(model: Model, faces: int) -> Model:
+    mesh = trimesh.Trimesh(model.vertices, model.faces, process=False)
+    if _is_manifold(mesh):
+        length = math.sqrt(4 * mesh.area / (math.sqrt(3) * faces))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # Its import takes old names of SciPy.
+            from gpytoolbox import remesh_botsch
+        found = remesh_botsch(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), ROUNDS, length)
+        vertices, corners = (np.asarray(x) for x in found)
+    else:
+        warnings.warn("the mesh is no manifold; faces are split, not remeshed", rts.RtsWarning, 3)
+        vertices, corners = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        while 2 * len(corners) < faces:
+            vertices, corners = trimesh.remesh.subdivide(vertices, corners)[:2]
+    away, near = KDTree(model.vertices).query(vertices, k=NEAREST)
+    weights = 1 / (away + 1e-6)
+    colors = np.einsum("vk,vkc->vc", weights / weights.sum(axis=1, keepdims=True), model.colors[near])
+    return model._replace(
+        vertices=vertices.astype(np.float32), faces=corners.astype(np.int32), colors=colors.astype(np.float32)
+    )
+
+
+def _is_manifold(mesh: trimesh.Trimesh) -> bool:
+    """True if no edge has more than two faces, and faces beside each other have the same sense."""
+    counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
+    return int(counts.max(initial=0)) <= 2 and bool(mesh.is_winding_consistent)

@@ -1,0 +1,110 @@
+"""Meshes to start from: a ball, the visual hull of masks, or a file."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import scipy.ndimage
+import trimesh
+
+import rts
+from rts_reconstruct.pictures import Pictures
+
+RADIUS = 0.57
+"""The ball's radius, as a share of that of a ball that all cameras see."""
+LATTICE, REACH = 64, 1.1
+"""Points of a hull's lattice along each axis, and how far it reaches from the origin."""
+
+
+def start(kind: str | Path, pictures: Pictures) -> trimesh.Trimesh:
+    """A mesh to start from, in the world of the pictures.
+
+    Args:
+        kind: "ball", "hull", or the path of a mesh in the world of the data set.
+        pictures: the pictures.
+
+    Raises:
+        InputError: a hull of pictures that do not tell the object, or whose masks have nothing in common; a file that
+            cannot be read; or a mesh that no view sees.
+    """
+    if str(kind) == "ball":
+        mesh = trimesh.creation.icosphere(4, radius=RADIUS)
+    elif str(kind) == "hull":
+        mesh = _hull(pictures)
+    else:
+        mesh = _of_file(kind, pictures)
+    _check_seen(mesh.vertices, pictures.views)
+    return mesh
+
+
+def _of_file(path: str | Path, pictures: Pictures) -> trimesh.Trimesh:
+    """A mesh of a file, with vertices that coincide as one."""
+    parts = rts.load(path)
+    if not all(hasattr(part.surface, "faces") for part in parts):
+        raise rts.InputError(f"{path} holds other surfaces than triangles; expected a mesh to start from")
+    meshes = [trimesh.Trimesh(np.asarray(part.theta["vertices"]), part.surface.faces, process=False) for part in parts]
+    mesh: Any = trimesh.util.concatenate(meshes)
+    mesh = trimesh.Trimesh(pictures.world.inside(mesh.vertices), mesh.faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _hull(pictures: Pictures) -> trimesh.Trimesh:
+    """The largest piece of the space that no mask excludes (Laurentini 1994), by marching cubes."""
+    if not pictures.outlined:
+        raise rts.InputError(
+            "start is 'hull', which needs to know where the object is; the pictures have neither alpha nor masks: "
+            "add masks, or start from 'ball' or a mesh"
+        )
+    axis = np.linspace(-REACH, REACH, LATTICE)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    least, seen = np.ones(len(points)), np.zeros(len(points), int)
+    for view in pictures.views:
+        alpha = view.image[..., 3]
+        x, y = np.moveaxis(np.asarray(view.camera.project(points, view.size)), -1, 0)[:2]
+        inside = visible(view, points)
+        found = scipy.ndimage.map_coordinates(alpha, [y[inside] - 0.5, x[inside] - 0.5], order=1, mode="nearest")
+        least[inside] = np.minimum(least[inside], found)
+        seen += inside
+    least[seen < 2] = 0  # Space that nobody looks into is no object.
+    values = scipy.ndimage.gaussian_filter(least.reshape((LATTICE,) * 3), 0.7)
+    labels, count = cast(Any, scipy.ndimage.label(values > 0.5))
+    if count == 0:
+        raise rts.InputError(
+            "the masks have no point in common; expected masks, or alpha, of one object, and cameras that fit them"
+        )
+    largest = 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    values = np.where(scipy.ndimage.binary_dilation(labels == largest), values, 0)
+    bounds = (-REACH,) * 3, (REACH,) * 3
+    surface = rts.plugin("surfaces", "isosurface")(bounds, 0.5, inside="above")
+    found = surface.extract({"values": values.astype(np.float32)})
+    mesh = trimesh.Trimesh(found.vertices, found.faces)
+    return max(mesh.split(only_watertight=False), key=lambda piece: len(piece.faces))
+
+
+def visible(view: rts.View, points: np.ndarray) -> np.ndarray:
+    """True for points (N, 3) that lie before the camera, within its picture."""
+    pixels = np.asarray(view.camera.project(points, view.size))[..., :2]
+    height, width = view.size
+    before = np.asarray(view.camera.depth(points)) > 0
+    return before & ((pixels >= 0) & (pixels <= (width, height))).all(axis=-1)
+
+
+def _check_seen(vertices: np.ndarray, views: Sequence[rts.View]) -> None:
+    """Refuse a start that no view sees; warn of views that see nothing of it."""
+    blind = [i for i, view in enumerate(views) if not visible(view, np.asarray(vertices)).any()]
+    if len(blind) == len(views):
+        low, high = np.asarray(vertices).min(axis=0), np.asarray(vertices).max(axis=0)
+        raise rts.InputError(
+            f"none of {len(views)} views sees anything of the start, which lies between {np.round(low, 2).tolist()} "
+            f"and {np.round(high, 2).tolist()} (1 is what all cameras see); check the cameras, or give another start"
+        )
+    if blind:
+        names = ", ".join(str(views[i].name or i) for i in blind[:3]) + (", …" if len(blind) > 3 else "")
+        warnings.warn(f"{len(blind)} of {len(views)} views see nothing of the start: {names}", rts.RtsWarning, 3)

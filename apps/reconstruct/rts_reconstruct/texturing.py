@@ -1,0 +1,130 @@
+"""A texture for a mesh whose shape is known: an atlas, the colours of vertices baked into it, and a fit to pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+import torch
+import xatlas
+
+import rts
+from rts_reconstruct.job import shared
+from rts_reconstruct.model import Atlas, Model, moved_camera, surface_of, textured
+from rts_reconstruct.pictures import Pictures
+from rts_reconstruct.stages import Settings
+
+FAINT = 0.02
+"""Texels with less than this share of the median weight in pictures follow them more slowly."""
+PADDING = 4
+"""Texels between the charts of an atlas."""
+
+
+def baked(model: Model, size: int) -> Model:
+    """The model with a texture of `size` × `size` texels, which shows the colours of its vertices."""
+    return shared(lambda: _baked(model, size))
+
+
+def _baked(model: Model, size: int) -> Model:
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(model.vertices, model.faces.astype(np.uint32))
+    atlas.generate(pack_options=_options(size))
+    rows, faces, uv = atlas[0]
+    faces, uv = faces.astype(np.int32), uv.astype(np.float32)
+    picture = _flat(uv, faces, model.colors[rows], size)
+    texture = _spread(picture[..., :3], picture[..., 3] < 0.5)
+    corners = model.faces[np.arange(len(faces))]  # Faces keep their order; their corners have rows of the map.
+    assert np.array_equal(rows[faces], corners), "the atlas has another order of faces"
+    return model._replace(atlas=Atlas(uv, faces, texture.astype(np.float32)))
+
+
+def _flat(uv: np.ndarray, faces: np.ndarray, colors: np.ndarray, size: int) -> np.ndarray:
+    """The picture (R, R, 4) of an atlas, which is a flat mesh, with colours (U, 3)."""
+    flat = np.concatenate([uv, np.zeros_like(uv[:, :1])], axis=1)
+    part = rts.Part(rts.Mesh(faces), {"vertices": flat, "colors": colors}, "unlit")
+    camera = rts.Camera.orthographic((0.5, 0.5, 1), (0.5, 0.5, 0), height=1.0, aspect=1.0, far=2.0)
+    return np.asarray(rts.render(part, camera, (size, size), splatter="none"))
+
+
+def _spread(texture: np.ndarray, bare: np.ndarray) -> np.ndarray:
+    """The texture with colours of the nearest others at bare texels, so that averages at seams are of such colours."""
+    nearest: Any = scipy.ndimage.distance_transform_edt(bare, return_distances=False, return_indices=True)
+    return texture[tuple(nearest)]
+
+
+def _options(size: int) -> Any:
+    options = xatlas.PackOptions()
+    options.resolution, options.padding, options.bilinear = size, PADDING, True
+    return options
+
+
+def fitted(
+    model: Model, pictures: Pictures, steps: int, settings: Settings, checkpoint: Path | None, report: Any
+) -> tuple[Model, list[float]]:
+    """The model with its texture fitted to the pictures, and the losses of the steps; see `stages.fitted`.
+
+    A step moves each texel by the weighted mean of differences at the pixels that show it, as in SIRT (Gilbert 1972,
+    *Iterative Methods for the Three-dimensional Reconstruction of an Object from Projections*). Adam would move texels
+    that pictures hardly show as far as all others, and fill the texture with specks. Texels that no picture shows stay
+    as they are.
+    """
+    assert model.atlas is not None
+    atlas: Atlas = model.atlas
+    surface = surface_of(model)
+    poses = {"poses": torch.tensor(model.poses)}
+    bare = _flat(atlas.uv, atlas.faces, np.ones((len(atlas.uv), 3), np.float32), len(atlas.texture))[..., 3] < 0.5
+    scale = torch.tensor(np.where(bare[..., None], 0, _scales(model, pictures)))  # Between charts nothing is fitted.
+    start = torch.tensor(atlas.texture)
+    batch = min(settings.batch, len(pictures.views))
+
+    def texture_of(p: Any) -> Any:
+        return start + scale * p["changes"]
+
+    residuals = rts.ViewResiduals(
+        lambda p: textured(surface, model.vertices, atlas.uv, texture_of(p)),
+        pictures.views,
+        batch=batch,
+        seed=settings.seed,
+        cameras=(lambda p, camera, view: moved_camera(poses, camera, view)) if settings.cameras else None,
+        background=None if pictures.outlined else pictures.background,
+    )
+
+    def colors_of(p: Any) -> np.ndarray:
+        shown = atlas._replace(texture=texture_of(p).detach().numpy())
+        return shown.colors(model.faces, len(model.vertices))
+
+    fit = rts.fit(
+        residuals,
+        {"changes": torch.zeros_like(start)},
+        method="sgd",
+        steps=steps,
+        # The derivative of a square has a factor 2. A texel that one picture shows must not overshoot in its turn.
+        learning_rate=0.5 * batch / len(pictures.views),
+        validate_every=steps,
+        checkpoint=checkpoint,
+        callback=lambda step, p, loss: report(step, loss, lambda: (model.vertices, model.faces, colors_of(p))),
+        progress=settings.progress,
+    )
+    texture = _spread(np.clip(texture_of(fit.parameters).numpy(), 0, 1), bare)
+    atlas = atlas._replace(texture=texture)
+    return model._replace(atlas=atlas, colors=atlas.colors(model.faces, len(model.vertices))), fit.history
+
+
+def _scales(model: Model, pictures: Pictures) -> np.ndarray:
+    """Factors (R, R, 1) on changes of texels: one over the root of their weight in the mean over pixels and pictures.
+
+    Gradient descent by changes is then descent by texels, where each has one over its weight as its rate.
+    """
+    assert model.atlas is not None
+    surface, poses = surface_of(model), {"poses": torch.tensor(model.poses)}
+    texture = torch.tensor(model.atlas.texture, requires_grad=True)
+    for number, view in enumerate(pictures.views):
+        part = textured(surface, model.vertices, model.atlas.uv, texture)
+        image = rts.render(part, moved_camera(poses, view.camera, number), view.size)
+        image[..., : view.image.shape[2]].mean().backward()  # Linear in the texture: the gradient is the weight.
+    assert texture.grad is not None
+    weights = texture.grad[..., :1].numpy() / len(pictures.views)
+    faint = FAINT * float(np.median(weights[weights > 0])) if (weights > 0).any() else 1.0
+    return np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 0) + faint), 0).astype(np.float32)

@@ -1,0 +1,155 @@
+"""Reconstructions from small pictures: the whole, its files, and bad input."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+import rts_reconstruct
+import trimesh
+from PIL import Image
+from seen_ellipsoid import CENTER, RADII, SIZE, cameras, images, on_white, views
+from typer.testing import CliRunner
+
+import rts
+from rts.cli.main import app
+
+TINY = dict(steps=9, size=SIZE, batch=3, held_out=4, texture=32, quick=True, progress=False)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of pictures as Blender has it."""
+    path = tmp_path / "photos"
+    path.mkdir()
+    for i, image in enumerate(images()):
+        rts.save_image(path / f"{i}.png", image)
+    rts.save_views(path / "transforms.json", views())
+    return path
+
+
+# ----------------------------------------------------------------------------------------------------- the whole
+
+
+class Watching:
+    """A viewer that notes what it is shown, and asks to stop, or interrupts, at a step."""
+
+    def __init__(self, stop=None, interrupt=None):
+        self.stop, self.interrupt, self.calls, self.ended, self.views = stop, interrupt, [], 0, 0
+
+    def begin(self, views):
+        self.views = len(views)
+
+    def step(self, number, loss, vertices, faces, colors):
+        assert vertices.shape == colors.shape and faces.max() < len(vertices)
+        self.calls.append((number, loss))
+        if self.interrupt is not None and number >= self.interrupt:
+            raise KeyboardInterrupt
+        return self.stop is not None and number >= self.stop
+
+    def end(self):
+        self.ended += 1
+
+
+@pytest.fixture
+def no_pause(monkeypatch):
+    monkeypatch.setattr("rts_reconstruct.reconstruction.PAUSE_S", 0.0)
+
+
+@pytest.mark.thorough
+def test_a_viewer_sees_steps_and_can_stop_them(tmp_path, no_pause):
+    watch = Watching(stop=2)
+    found = rts_reconstruct.reconstruct(views(), tmp_path, watch=watch, **TINY | {"texture": 0})
+    assert ([number for number, _ in watch.calls], watch.ended, watch.views) == ([0, 1, 2], 1, 6)
+    assert found.model.atlas is None and (tmp_path / "mesh.obj").is_file()
+
+
+@pytest.mark.thorough
+def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
+    out = tmp_path / "out"
+    run = CliRunner().invoke(
+        app, f"reconstruct {folder} -o {out} --quick --steps 60 --size {SIZE} --texture 64 --held-out 4".split()
+    )
+    assert run.exit_code == 0, run.output
+    assert re.search(r"PSNR \d+\.\d dB \(held-out views\)", run.output)
+    part = rts.load(out / "mesh.obj")[0]
+    mesh = trimesh.Trimesh(part.theta["vertices"], part.surface.faces, process=False)
+    assert mesh.is_watertight and np.linalg.norm(mesh.centroid - CENTER) < 0.1
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADII.prod(), rel=0.2)
+    # Both files look like the pictures, whose colours load_image decodes.
+    for name in ("mesh.obj", "mesh.glb"):
+        image = np.asarray(rts.render(rts.load(out / name)[0].replace(shader="unlit"), cameras()[3], (SIZE, SIZE)))
+        assert np.abs(image - images()[3]).mean() < 0.05, name
+    rows = list(csv.DictReader((out / "views.csv").read_text().splitlines()))
+    assert [row["held_out"] for row in rows] == list("00010001")
+    assert all(float(row["psnr_db"]) > 20 and float(row["iou"]) > 0.9 for row in rows)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png") == 6 and "<polyline" in page and "http" not in page
+    with Image.open(out / "turntable.gif") as turning:
+        assert turning.n_frames == 36
+
+
+@pytest.mark.thorough
+def test_an_interrupted_run_leaves_a_mesh_and_goes_on_as_if_it_had_not_been(tmp_path, no_pause):
+    whole = rts_reconstruct.reconstruct(views(), tmp_path / "whole", **TINY)
+    with pytest.raises(KeyboardInterrupt):
+        rts_reconstruct.reconstruct(views(), tmp_path / "out", watch=Watching(interrupt=5), **TINY)
+    first = (tmp_path / "out/mesh.obj").read_text()
+    watch = Watching()
+    again = rts_reconstruct.reconstruct(views(), tmp_path / "out", watch=watch, resume=True, **TINY)
+    assert watch.calls[0][0] in (3, 4, 5)
+    np.testing.assert_array_equal(again.model.vertices, whole.model.vertices)
+    np.testing.assert_array_equal(again.model.atlas.texture, whole.model.atlas.texture)
+    assert (tmp_path / "out/mesh.obj").read_text() != first
+
+
+@pytest.mark.thorough
+def test_a_plain_background_is_enough(tmp_path):
+    options = TINY | {"steps": 90, "texture": 0}
+    found = rts_reconstruct.reconstruct(views(on_white), tmp_path, **options)
+    mesh = trimesh.Trimesh(found.pictures.world.outside(found.model.vertices), found.model.faces)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADII.prod(), rel=0.2)
+    assert found.measures[0].iou is None and found.psnr > 20
+
+
+@pytest.mark.thorough
+def test_cameras_that_are_off_are_fitted(tmp_path):
+    rng = np.random.default_rng(0)
+    off = []
+    for view in views():
+        change = np.asarray(rts.rigid(np.concatenate([0.04 * rng.normal(size=3), 0.04 * rng.normal(size=3)])))
+        off.append(rts.View(view.camera.replace(view=change @ view.camera.view), view.image))
+    options = TINY | {"steps": 150, "held_out": 0, "texture": 0}
+    kept = rts_reconstruct.reconstruct(off, tmp_path / "kept", **options)
+    fitted = rts_reconstruct.reconstruct(off, tmp_path / "fitted", fit_cameras=True, **options)
+    assert fitted.psnr > kept.psnr + 1
+
+
+# ------------------------------------------------------------------------------------------------------- refused
+
+
+def damaged(folder, change):
+    tree = json.loads((folder / "transforms.json").read_text())
+    change(tree)
+    (folder / "transforms.json").write_text(json.dumps(tree))
+
+
+def test_bad_input_is_one_line(folder, tmp_path):
+    def told(*arguments):
+        run = CliRunner().invoke(app, ["reconstruct", *map(str, arguments)])
+        assert run.exit_code == 1 and run.stderr.count("\n") == 1, run.stderr
+        return run.stderr
+
+    assert "none" in told(tmp_path / "none")
+    (tmp_path / "file").write_text("")
+    assert "is a file; expected a folder" in told(folder, "-o", tmp_path / "file")
+    out = ["-o", tmp_path / "out"]
+    assert "expected a whole number, at least 3" in told(folder, *out, "--steps", 0)
+    assert "expected three numbers, such as 1,1,1" in told(folder, *out, "--background", "red")
+    assert "no file none.obj" in told(folder, *out, "--start", "none.obj")
+    assert "at least 16 texels" in told(folder, *out, "--texture", 3)
+    assert "left to fit; expected at least two" in told(folder, *out, "--held-out", 1)
+    damaged(folder, lambda tree: tree.update(frames=tree["frames"][:1]))
+    assert "1 view in" in told(folder, *out)
+    assert not (tmp_path / "out").exists()
