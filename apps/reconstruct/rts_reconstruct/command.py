@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -33,6 +33,8 @@ def reconstruct(
     quick: Annotated[bool, typer.Option("--quick", help="A first look: small pictures, few steps and faces.")] = False,
     seed: Annotated[int, typer.Option(help="Of the order of pictures.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run was.")] = False,
+    watched: Annotated[bool, typer.Option("--watch", help="Show the fit in the browser, by apps/viewer.")] = False,
+    port: Annotated[int, typer.Option(help="The port of that page.")] = 8080,
 ) -> None:
     """Fit a textured mesh to photographs with cameras.
 
@@ -43,6 +45,7 @@ def reconstruct(
     from rts_reconstruct.job import first
     from rts_reconstruct.reconstruction import reconstruct as reconstructed
 
+    watch = _viewer(port) if watched and first() else None
     try:
         found = reconstructed(
             views,
@@ -58,6 +61,7 @@ def reconstruct(
             quick=quick,
             seed=seed,
             resume=resume,
+            watch=watch,
         )
     except KeyboardInterrupt:
         kept = f"{out / 'mesh.obj'} is of the last stage" if (out / "mesh.obj").is_file() else "no stage has ended"
@@ -65,7 +69,25 @@ def reconstruct(
         raise typer.Exit(130) from None
     if first():
         names = ", ".join(file.name for file in found.files)
-        Console(soft_wrap=True, highlight=False).print(escape(f"{found!r}: {names} in {out}"))
+        _say(f"{found!r}: {names} in {out}")
+    if watch is not None:
+        _say(f"{watch.url} shows the result until “close” is pressed there, or Ctrl-C here")
+        watch.wait()
+
+
+def _say(text: str) -> None:
+    Console(soft_wrap=True, highlight=False).print(escape(text))
+
+
+def _viewer(port: int) -> Any:
+    """A page in the browser, whose address is printed."""
+    try:
+        from rts_viewer import Watch
+    except ImportError:
+        raise rts.PluginError("--watch needs the distribution rts-viewer: pip install ./apps/viewer") from None
+    watch = Watch(port=port)
+    _say(f"{watch.url} shows the fit")
+    return watch
 
 
 def _colour(text: str) -> list[float]:

@@ -27,7 +27,7 @@ def write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
     colors = np.clip(model.colors, 0, 1)
     if model.atlas is None:
         files[0].write_text(_obj(vertices, model, colors), encoding="utf-8")
-        linear = _bytes(_decoded(colors))  # glTF's colours are linear, OBJ's are as pictures have them.
+        linear = _bytes(decoded(colors))  # glTF's colours are linear, OBJ's are as pictures have them.
         mesh = trimesh.Trimesh(vertices, model.faces, vertex_colors=linear, process=False)
         mesh.export(files[1])
         return files
@@ -79,7 +79,7 @@ def write_turntable(path: Path, model: Model, pictures: Pictures) -> None:
         eye = middle + 3.1 * radius * way / np.linalg.norm(way)
         camera = rts.Camera.look_at(eye, middle, up, fov_y=40)
         frame = np.asarray(rts.render(model.part, camera, (TURNTABLE, TURNTABLE), supersample=2, background=(1, 1, 1)))
-        frames.append(_decoded(np.clip(frame[..., :3], 0, 1)).astype(np.float32))
+        frames.append(decoded(np.clip(frame[..., :3], 0, 1)).astype(np.float32))
     rts.save_animation(path, frames, fps=FPS)
 
 
@@ -97,6 +97,6 @@ def _bytes(values: np.ndarray) -> np.ndarray:
     return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
 
 
-def _decoded(encoded: np.ndarray) -> np.ndarray:
+def decoded(encoded: np.ndarray) -> np.ndarray:
     """Linear values of sRGB-encoded ones (IEC 61966-2-1)."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

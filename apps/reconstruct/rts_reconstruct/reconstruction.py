@@ -30,7 +30,10 @@ class Watch(Protocol):
     """A viewer of a running reconstruction."""
 
     def begin(self, views: list[rts.View]) -> None:
-        """Called before the first step, with the views that are fitted, in the world of the vertices of `step`."""
+        """Called before the first step, with the views that are fitted, in the world of the vertices of `step`.
+
+        Their images are linear, as those of `rts.load_views` are by default.
+        """
 
     def step(self, number: int, loss: float, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> bool:
         """Called at most every half second, and may take its time; a true result ends the fit.
@@ -40,7 +43,7 @@ class Watch(Protocol):
             loss: its loss.
             vertices: (V, 3) float32.
             faces: (T, 3) int32; they change between stages.
-            colors: (V, 3) float32, sRGB-encoded.
+            colors: (V, 3) linear.
         """
         ...
 
@@ -160,6 +163,16 @@ def reconstruct(
     return run.finish()
 
 
+def _linear(view: rts.View) -> rts.View:
+    """The view with a linear image, read when it is needed."""
+
+    def image() -> np.ndarray:
+        encoded = view.image
+        return np.concatenate([files.decoded(encoded[..., :3]), encoded[..., 3:]], axis=-1)
+
+    return rts.View(view.camera, image, view.size, name=view.name)
+
+
 def _check(**given: tuple[Any, int]) -> None:
     for name, (value, least) in given.items():
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
@@ -194,7 +207,7 @@ class _Run:
             self.saved.forget()
         self._started = time.perf_counter() - self.seconds
         if self.watch is not None:
-            self.watch.begin(self.pictures.views)
+            self.watch.begin([_linear(view) for view in self.pictures.views])
 
     def shape(self, number: int, stage: stages.Stage, steps: int) -> None:
         """A stage of shape and colours, unless an earlier run made it."""
@@ -219,7 +232,8 @@ class _Run:
 
         def report(step: int, loss: float, now: Any) -> bool:
             if self.watch is not None and time.perf_counter() - self._looked >= PAUSE_S:
-                stop = self.watch.step(before + step, loss, *now())
+                vertices, faces, colors = now()
+                stop = self.watch.step(before + step, loss, vertices, faces, files.decoded(colors))
                 self._looked = time.perf_counter()
                 self.stopped = self.stopped or bool(stop)
             return self.stopped

@@ -3,6 +3,8 @@
 import csv
 import json
 import re
+import socket
+import sys
 
 import numpy as np
 import pytest
@@ -153,3 +155,35 @@ def test_bad_input_is_one_line(folder, tmp_path):
     damaged(folder, lambda tree: tree.update(frames=tree["frames"][:1]))
     assert "1 view in" in told(folder, *out)
     assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------------------------------------------- the browser
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.thorough
+def test_a_fit_may_be_watched(folder, tmp_path, monkeypatch):
+    viewer = pytest.importorskip("rts_viewer")
+    pytest.importorskip("viser")
+    steps = []
+    monkeypatch.setattr(viewer.Watch, "wait", lambda self: self.close())
+    step = viewer.Watch.step
+    monkeypatch.setattr(viewer.Watch, "step", lambda self, *a: (steps.append(a), step(self, *a))[1])
+    words = ["--watch", "--port", str(port := free_port()), "--steps", "6", "--size", str(SIZE), "--texture", "0"]
+    run = CliRunner().invoke(app, ["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--quick", *words])
+    assert run.exit_code == 0 and f"http://127.0.0.1:{port} shows the fit" in run.output
+    assert f"http://127.0.0.1:{port} shows the result" in run.output
+    number, loss, vertices, faces, colors = steps[0]
+    assert number == 0 and loss > 0 and faces.max() < len(vertices) == len(colors)
+    np.testing.assert_allclose(colors, ((0.5 + 0.055) / 1.055) ** 2.4, rtol=1e-5)  # Grey, made linear.
+
+
+def test_without_the_viewer_one_line_names_it(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rts_viewer", None)
+    run = CliRunner().invoke(app, ["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--watch"])
+    assert run.exit_code != 0 and "pip install ./apps/viewer" in str(run.exception) + run.output
