@@ -232,7 +232,7 @@ def test_a_fit_prints_three_lines(target):
         assert first.startswith(f"loss {fit.history[0]:.4g} → {fit.loss:.4g} in 40 steps and ") and first.endswith(" s")
         assert second == fit.reason == "all 40 steps made"
         assert third == "parameters: gain (), light.color (3,), pose (6,)"
-    assert fit._fields == ("parameters", "loss", "history", "steps", "reason", "seconds", "stages")
+    assert fit._fields == ("parameters", "loss", "history", "steps", "reason", "seconds", "stages", "validated")
     parameters, loss, history, steps, reason, *_ = fit
     assert (loss, steps, reason) == (fit.loss, 40, fit.reason) and parameters is fit.parameters and len(history) == 40
 

@@ -208,7 +208,7 @@ def test_rates_by_name(target):
         ({"learning_rate": {"p": -1}}, r"learning_rate\['p'\] is -1"),
         ({"learning_rate": {"p": 0.1}, "method": "lm"}, "no rates"),
         ({"method": "lbfgs"}, "expected one of adam, sgd, lm, or an optimiser"),
-        ({"method": object()}, "expected 'adam', 'sgd', 'lm' or a torch.optim"),
+        ({"method": object()}, "expected one of adam, sgd, lm, or a torch.optim"),
         ({"validate_every": 0}, "validate_every is 0"),
         ({"validation": 3}, "validation is 3"),
         ({"validation": Lines(), "method": "lm"}, "takes no validation"),

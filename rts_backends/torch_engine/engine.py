@@ -291,7 +291,7 @@ class TorchEngine(Engine):
 
         if not isinstance(method, (str, torch.optim.Optimizer)):
             raise InputError(
-                f"method is {quoted(method)}; expected 'adam', 'sgd', 'lm' or a torch.optim.Optimizer, such as "
+                f"method is {quoted(method)}; expected one of adam, sgd, lm, or a torch.optim.Optimizer, such as "
                 f"torch.optim.Adam([parameters], lr=0.01), for torch tensors"
             )
         return Optimizer(method, learning_rate, parameters, parameters if given is None else given)
