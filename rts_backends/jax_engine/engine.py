@@ -260,7 +260,7 @@ class JaxEngine(Engine):
 
         if not isinstance(method, str) and not (callable(getattr(method, "init", None)) and hasattr(method, "update")):
             raise InputError(
-                f"method is {quoted(method)}; expected one of adam, sgd, lm, or an optax.GradientTransformation, such as "
-                f"optax.adam(0.01), for jax arrays"
+                f"method is {quoted(method)}; expected one of adam, sgd, lm, or an optax.GradientTransformation, such "
+                f"as optax.adam(0.01), for jax arrays"
             )
         return Optimizer(method, learning_rate, parameters)
