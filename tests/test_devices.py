@@ -14,7 +14,7 @@ import elsewhere
 import numpy as np
 import pytest
 from example_surfaces import Torus
-from helpers import box, icosphere, relative_error, to_numpy
+from helpers import icosphere, relative_error, to_numpy
 
 import rts
 from rts.arrays.trees import leaves, map_leaves
@@ -87,7 +87,10 @@ def _places():
     return names
 
 
-@pytest.fixture(params=_places())
+PLACES = _places()
+
+
+@pytest.fixture(params=PLACES)
 def place(request):
     place = Place(request.param)
     with place.entered():
@@ -101,12 +104,10 @@ CPU = Place("torch-cpu")
 
 
 class Case(NamedTuple):
-    """A picture: parts of arrays, options of `rts.render`, and how far values and gradients may be apart."""
+    """A picture: parts of arrays, and options of `rts.render`."""
 
     parts: tuple
     options: dict = {}
-    atol: float = 1e-5
-    rtol: float = 1e-4
 
 
 def ball(shader="lambert", move=(0.0, 0.0, 0.0), **theta):
@@ -123,7 +124,9 @@ def example(name):
 
 def textured(shader="textured"):
     uv = (BALL[:, :2] + 1) / 2
-    return rts.Part(rts.Mesh(FACES), {"vertices": BALL, "uv": uv, "texture": np.random.default_rng(2).random((16, 16, 3))}, shader)
+    return rts.Part(
+        rts.Mesh(FACES), {"vertices": BALL, "uv": uv, "texture": np.random.default_rng(2).random((16, 16, 3))}, shader
+    )
 
 
 def glass(theta, gbuffer, camera):
@@ -161,7 +164,10 @@ CASES = {
     },
     "texture": lambda: Case((textured(),)),
     "lit texture": lambda: Case((textured("lambert"),)),
-    **{name: lambda name=name: Case((ball(),), {"sampler": name}) for name in ("raster", "reference", "embree", "opengl")},
+    **{
+        name: lambda name=name: Case((ball(),), {"sampler": name})
+        for name in ("raster", "reference", "embree", "opengl")
+    },
     "two parts": lambda: Case((ball(), ball("unlit", (0.7, 0.3, 0.4)))),
     "supersampled": lambda: Case((ball(),), {"supersample": 2}),
     "adaptive": lambda: Case((ball(), ball("unlit", (0.7, 0.3, 0.4))), {"supersample": rts.Adaptive(3)}),
@@ -216,13 +222,17 @@ def needed(name):
 
 # --------------------------------------------------------------------------------------------------------- images
 
-QUICK = ("mesh", "bezier", "sdf", "translucent", "lit texture", "adaptive")
-names = pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in CASES]
-)
+QUICK = ("mesh", "sdf", "lit texture", "adaptive")
+"""Cases for `make test`, and for jax on the CPU, which other files test."""
 
 
-@names
+def in_places(name):
+    """A case in every place where it is tested."""
+    marks = [pytest.mark.thorough] * (name not in QUICK)
+    return [pytest.param(p, name, marks=marks, id=f"{p}-{name}") for p in PLACES if p != "jax-cpu" or name in QUICK]
+
+
+@pytest.mark.parametrize("place, name", [pair for name in CASES for pair in in_places(name)], indirect=["place"])
 def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     case = needed(name)
     tree = place.put(arrays_of(case))
@@ -237,7 +247,7 @@ def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     assert np.linalg.norm(tangent) > 0 and relative_error(place.take(moved), tangent) < 1e-4
 
 
-@names
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in CASES])
 def test_the_host_gets_inputs_of_the_sampler_and_nothing_else(name):
     case = needed(name)
     with elsewhere.Device():
@@ -246,8 +256,9 @@ def test_the_host_gets_inputs_of_the_sampler_and_nothing_else(name):
         elsewhere.copies.clear(), elsewhere.waits.clear()
         place.gradient(loss_of(case, place.put(WEIGHTS)), tree)
     assert all(line.endswith(" _to_host") for line in elsewhere.copies), elsewhere.copies
-    assert not elsewhere.waits
-    print(name, elsewhere.copies)
+    # Loops along rays ask whether any ray is not done.
+    loops = ("_repeated", "_cast_some") if name in ("sdf", "rays") else ()
+    assert all(line.endswith(loops) for line in elsewhere.waits) if loops else not elsewhere.waits, elsewhere.waits
 
 
 def test_views_of_one_call(place):
@@ -303,7 +314,8 @@ def test_large_steps_and_energies(place):
         value, slope = place.take(place.gradient(f, place.put(bent)))
         expected, other = to_numpy(CPU.gradient(f, CPU.put(bent)))
         np.testing.assert_allclose(value, expected, rtol=1e-4)
-        assert relative_error(slope, other) < 1e-4
+        # The solution of `LargeSteps` is by array code in float32 there, not by a factorisation in float64.
+        assert relative_error(slope, other) < 1e-3
 
 
 # ---------------------------------------------------------------------------------------------------- other users
@@ -312,7 +324,11 @@ def test_large_steps_and_energies(place):
 def test_gradients_are_checked(place):
     pose = place.put(np.zeros(6))
     found = rts.check_gradient(
-        lambda p: (ball("silhouette").replace(transform=rts.rigid(p)), CAMERA), pose, SIZE, entries=2, samples=2,
+        lambda p: (ball("silhouette").replace(transform=rts.rigid(p)), CAMERA),
+        pose,
+        SIZE,
+        entries=2,
+        samples=2,
         progress=False,
     )
     assert found is not None
@@ -341,4 +357,12 @@ def test_arrays_on_two_devices_are_refused_in_one_line(place):
     ):
         with pytest.raises(rts.EngineError) as error:
             image_of(case, mixed)
-        assert "\n" not in str(error.value) and "cpu" in str(error.value) and "device" in str(error.value)
+        assert "\n" not in str(error.value) and "on the devices" in str(error.value) and "cpu" in str(error.value)
+
+
+def test_a_target_on_another_device_is_refused_in_one_line(place):
+    if place.device == "cpu":
+        pytest.skip("this is the CPU")
+    target = CPU.put(rts.render(ball("lambert"), CAMERA, SIZE)) if place.engine == "torch" else None
+    with pytest.raises(rts.EngineError, match="on the devices .*cpu"):
+        rts.fit(rts.ImageResiduals(posed, CAMERA, SIZE, target), place.put({"pose": POSE}), steps=2, progress=False)
