@@ -8,6 +8,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
 from typing import NamedTuple
 
 import elsewhere
@@ -17,11 +21,13 @@ from example_surfaces import Torus
 from helpers import icosphere, relative_error, to_numpy
 
 import rts
+from benchmarks.gpu.run import counts
 from rts.arrays.trees import leaves, map_leaves
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.devices
 
+ROOT = Path(__file__).resolve().parent.parent
 SIZE = (16, 20)
 CAMERA = rts.Camera.look_at((1.0, 1.5, 3.2), (0, 0, 0), fov_y=45, aspect=SIZE[1] / SIZE[0])
 BALL, FACES = icosphere(2)
@@ -222,7 +228,7 @@ def needed(name):
 
 # --------------------------------------------------------------------------------------------------------- images
 
-QUICK = ("mesh", "sdf", "lit texture", "adaptive")
+QUICK = ("mesh", "sdf", "lit texture")
 """Cases for `make test`, and for jax on the CPU, which other files test."""
 
 
@@ -366,3 +372,24 @@ def test_a_target_on_another_device_is_refused_in_one_line(place):
     target = CPU.put(rts.render(ball("lambert"), CAMERA, SIZE)) if place.engine == "torch" else None
     with pytest.raises(rts.EngineError, match="on the devices .*cpu"):
         rts.fit(rts.ImageResiduals(posed, CAMERA, SIZE, target), place.put({"pose": POSE}), steps=2, progress=False)
+
+
+# ---------------------------------------------------------------------------------- the command for machines with a GPU
+
+
+def test_the_command_says_what_it_left_out(tmp_path):
+    command = [sys.executable, str(ROOT / "benchmarks/gpu/run.py"), "--device", "cpu", "--minutes", "0.1"]
+    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True)
+    found = json.loads((tmp_path / "gpu.json").read_text())
+    assert done.returncode == 1 and found["versions"]["torch"] == torch.__version__
+    assert [(step["step"], step["result"]) for step in found["steps"]] == [("tree", "left out: no time")]
+
+
+def test_the_command_counts_tests(tmp_path):
+    file = tmp_path / "test_three.py"
+    file.write_text("def test_good(): pass\ndef test_bad(): assert False\ndef test_raw(): raise OSError\n")
+    run = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={tmp_path / 'tests.xml'}"]
+    subprocess.run([*run, str(file)], capture_output=True, cwd=tmp_path)
+    found = counts(tmp_path / "tests.xml")
+    assert (found["tests"], found["failures"], found["errors"], found["skipped"]) == (3, 2, 0, 0)
+    assert found["failed"] == ["test_three::test_bad", "test_three::test_raw"]
