@@ -133,7 +133,7 @@ def timed(stages: dict[str, Callable[[], Any]], wait: Callable[[], None]) -> dic
 
 
 def counted(stages: dict[str, Callable[[], Any]], device: str) -> dict[str, Any]:
-    """Of one iteration on a GPU: kernels launched, waits for the GPU by line, and the largest memory in MiB."""
+    """Counts of one iteration on a GPU: kernels launched, copies, waits by line, and the largest memory in MiB."""
     import torch
 
     if device != "cuda":

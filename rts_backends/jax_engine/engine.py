@@ -122,7 +122,7 @@ class JaxEngine(Engine):
         """True if all arrays are on CPUs. A tracer's device is not known yet, and taken to be a CPU."""
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
 
-    def devices(self, arrays: Iterable[Any]) -> set[jax.Device]:
+    def devices(self, arrays: Iterable[Any]) -> set[Any]:
         """The devices of arrays that `jax.device_put` bound to one; jax moves the others as need be."""
         bound = [x.devices() for x in arrays if isinstance(x, jax.Array) and not isinstance(x, Tracer) and x.committed]
         return set().union(*(found for found in bound if len(found) == 1))
