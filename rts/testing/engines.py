@@ -253,19 +253,24 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
 
     def test_rows_have_gradients(self, engine: Any) -> None:
-        """`gradient_of_rows` is right for k |x|², and has a gradient in the captured factor k."""
+        """`gradient_of_rows` is right for k |x|², and has a gradient in the factor k; within `checkpoint`, too."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, numbers(N, 3)
         at = chosen.constant(x)
 
-        def slopes(k: Any) -> Any:
-            return chosen.gradient_of_rows(lambda rows: k * xp.sum(rows**2, axis=1), at)
+        def slopes(k: Any, points: Any = at) -> Any:
+            return chosen.gradient_of_rows(lambda rows: k * xp.sum(rows**2, axis=1), points)
+
+        def kept(k: Any) -> Any:
+            return chosen.checkpoint(lambda: chosen.constant(x), lambda points: xp.sum(slopes(k, points)))
 
         with owning(chosen), no_error("the gradient of rows"):
             gradient = chosen.to_numpy(slopes(chosen.constant(np.float32(2))))
             second = chosen.value_and_grad(lambda k: xp.sum(slopes(k)))(chosen.constant(np.float32(2)))[1]
+            again = chosen.value_and_grad(kept)(chosen.constant(np.float32(2)))[1]
         claim_close(gradient, 4 * x, TOLERANCE, "the gradient of 2 |x|²")
         claim_close(chosen.to_numpy(second), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows")
+        claim_close(chosen.to_numpy(again), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows within checkpoint")
 
     def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
         """`jacobian` of a function with two results gives the Jacobian of each."""

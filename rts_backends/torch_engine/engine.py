@@ -270,8 +270,17 @@ class TorchEngine(Engine):
 
     def gradient_of_rows(self, f: Callable[[torch.Tensor], torch.Tensor], rows: torch.Tensor) -> torch.Tensor:
         """See `Engine.gradient_of_rows`: by reverse mode, which is faster here, and safe on several threads at once."""
-        value, pull = torch.func.vjp(f, rows)[:2]
-        return pull(torch.ones_like(value))[0]
+        if transformed() or torch_internals.forward_level() >= 0:
+            value, pull = torch.func.vjp(f, rows)[:2]
+            return pull(torch.ones_like(value))[0]
+        # `torch.func.vjp` does not work within `checkpoint`.
+        further = torch.is_grad_enabled()
+        with torch.enable_grad():
+            at = rows if rows.requires_grad else rows.detach().requires_grad_(True)
+            value = f(at).sum()
+            if not value.requires_grad:
+                return torch.zeros_like(rows)
+            return torch.autograd.grad(value, at, create_graph=further, materialize_grads=True)[0]
 
     def jacobian(self, f: Callable) -> Callable:
         """See `Engine.jacobian`: by forward-mode autodiff, all unknowns in one vectorised pass."""
