@@ -1,4 +1,4 @@
-"""What falls between samples: triangles that touch cells and cover no centre near them, and adaptive images of these."""
+"""Thin things: triangles that touch cells and cover no centre near them, and adaptive images of these."""
 
 import numpy as np
 import pytest
@@ -20,8 +20,8 @@ PIXELS = (40, 50)
 SAMPLERS = ("raster", "reference")
 
 
-def flat_camera(size=PIXELS, unit=1.0):
-    """An orthographic camera above the plane z = 0, four units away: one pixel is a unit, (0, 0) the upper left corner."""
+def flat_camera(size=PIXELS):
+    """An orthographic camera four units above the plane z = 0: a pixel is a unit, (0, 0) the upper left corner."""
     height, width = size
     camera = Camera.orthographic(
         (width / 2, -height / 2, 4), (width / 2, -height / 2, 0), height=height, aspect=width / height, near=1, far=9

@@ -90,7 +90,7 @@ def fine_samples(
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
     most, names = planned(layers), ("row", "depth", "settled", "between")
     given = {name: x for name in names if (x := getattr(coarse, name)) is not None}
-    find = partial(active, sizes=sizes, apron=coarse.apron, where=where)
+    find: Callable[..., np.ndarray] = partial(active, sizes=sizes, apron=coarse.apron, where=where)
     values = {name: array for name, x in given.items() if (array := engine.known(x)) is not None}
     if len(values) < len(given) or values["row"].ndim != 3:
         room = grid.room(capacity, most)

@@ -16,8 +16,8 @@ from rts.errors import InputError
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     """Interleave the layers of several parts by depth and keep the nearest `layers`; the earlier part is first at ties.
 
-    A single part keeps its cells as they are. Of pieces between the centres of cells the nearest stays. The result has fewer layers if all parts together have fewer, and no
-    settled cells if there are several parts.
+    A single part keeps its cells as they are. Of pieces between centres the nearest stays. The result has fewer layers
+    if all parts together have fewer, and no settled cells if there are several parts.
 
     Raises:
         InputError: known cells of one of several parts name a sample that does not exist.

@@ -383,7 +383,9 @@ class _Search:
         """Samples that the surface moves off its triangles, with `ran_out`."""
         layers = self.shape.layers
         # There is only one set of tables, so that no samples can be added later.
-        known, fragments, covered, *_, between = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
+        known, fragments, covered, *_, between = self._drawn(
+            layers if self.tables else max(layers + 1, LEAST_LAYERS), False
+        )
         samples = on_surface(
             self.surface,
             self.inputs,

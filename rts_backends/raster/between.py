@@ -46,13 +46,14 @@ def between(
         blocks, _, used = mesh.seen(matrix, size, keep, False)
     else:
         blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (faces, vertices))
-    limits, missed = np.empty(size, np.float32), np.zeros(size, np.float32)
+    limits, missed, pooled = np.empty(size, np.float32), np.zeros(size, np.float32), np.empty(size, np.float32)
     parallel(_limit, size[0], read_only(depth, np.float32), limits, work=20 * limits.size)
-    screen = np.empty((3, len(vertices)), np.float32)
+    parallel(_pool, size[0], limits, pooled, work=2 * limits.size)
+    screen = np.empty((len(vertices), 3), np.float32)
     parallel(_project, len(used), used, vertices, matrix, view_depth, screen, work=4 * SIZE * len(used))
     chunks = -(-len(blocks) // PER_CHUNK)
     listed, counts = np.empty((chunks, PER_CHUNK * SIZE), np.int32), np.zeros(chunks, np.int64)
-    parallel(_list, chunks, blocks, faces, screen, keep, limits, listed, counts, work=10 * SIZE * len(blocks))
+    parallel(_list, chunks, blocks, faces, screen, keep, limits, pooled, listed, counts, work=10 * SIZE * len(blocks))
     # One thread marks, so that the result does not depend on the order of threads; few triangles are left.
     _mark(listed, counts, faces, vertices, matrix, view_depth, limits, missed)
     return missed
@@ -84,33 +85,52 @@ def _limit(start, stop, depth, limits):
 
 @loop
 def _project(first, last, used, vertices, m, view_depth, screen):
-    """Fill `screen` (3, V) with column and row, in pixels, and depth; the depth is −1 outside of near and far plane.
+    """Fill `screen` (V, 3) with column and row, in pixels, and depth; the depth is −1 outside of near and far plane.
 
     Only the blocks `used[first:last]` of vertices are projected, by `m` (4, 4) to homogeneous pixels.
     """
+    points, seen = np.empty((3, SIZE), np.float32), np.empty((3, SIZE), np.float32)
     for n in used[first:last]:
-        for v in range(n * SIZE, min(len(vertices), (n + 1) * SIZE)):
-            x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
+        block = slice(n * SIZE, min(len(vertices), (n + 1) * SIZE))
+        read, written = vertices[block], screen[block]
+        for v in range(len(read)):
+            points[0, v], points[1, v], points[2, v] = read[v, 0], read[v, 1], read[v, 2]
+        for v in range(len(read)):
+            x, y, z = np.float64(points[0, v]), np.float64(points[1, v]), np.float64(points[2, v])
             depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
             w = m[3, 0] * x + m[3, 1] * y + m[3, 2] * z + m[3, 3]
             scale = 1 / w
-            screen[0, v] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * scale
-            screen[1, v] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * scale
+            seen[0, v] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * scale
+            seen[1, v] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * scale
             linear = view_depth[0] * x + view_depth[1] * y + view_depth[2] * z + view_depth[3]
-            screen[2, v] = linear if (w > 0) & (depth >= -w) & (depth <= w) else -1.0
+            seen[2, v] = linear if (w > 0) & (depth >= -w) & (depth <= w) else -1.0
+        for v in range(len(read)):
+            written[v, 0], written[v, 1], written[v, 2] = seen[0, v], seen[1, v], seen[2, v]
 
 
 @loop
-def _list(first, last, blocks, faces, screen, keep, limits, listed, counts):
+def _pool(start, stop, limits, pooled):
+    """Fill rows [start, stop) of `pooled` (H, W): the largest limit of a cell, and of those to the right and below."""
+    height, width = limits.shape
+    for y in range(start, stop):
+        level, below = limits[y], limits[min(y + 1, height - 1)]
+        for x in range(width - 1):
+            pooled[y, x] = max(max(level[x], level[x + 1]), max(below[x], below[x + 1]))
+        pooled[y, width - 1] = max(level[width - 1], below[width - 1])
+
+
+@loop
+def _list(first, last, blocks, faces, screen, keep, limits, pooled, listed, counts):
     """List the triangles that may be missed somewhere: in row c of `listed` those of chunk c, `counts` (chunks,) each.
 
     Chunks [first, last) of `blocks` are gone through. A triangle is left out if it faces the other way, and if in all
-    cells of its box its nearest corner is no nearer than the limit.
+    cells of its box it is surely no nearer than the limit.
     """
     height, width = limits.shape
-    corners, sign = np.empty((9, SIZE), np.float32), np.float32(keep)
-    box, near, seen = np.empty((4, SIZE), np.float32), np.empty(SIZE, np.float32), np.empty(SIZE, np.bool_)
-    zero, one = np.float32(0), np.float32(1)
+    corners, box, near = np.empty((9, SIZE), np.float32), np.empty((4, SIZE), np.int32), np.empty(SIZE, np.float32)
+    seen, large, place = np.empty(SIZE, np.bool_), np.empty(SIZE, np.bool_), np.empty(SIZE, np.int32)
+    chosen, highest = np.empty(SIZE, np.int32), pooled.ravel()
+    sign, zero, one = np.float32(keep), np.float32(0), np.float32(1)
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     for chunk in range(first, last):
         count = 0
@@ -119,34 +139,52 @@ def _list(first, last, blocks, faces, screen, keep, limits, listed, counts):
             block = faces[start : min(len(faces), start + SIZE)]
             for b in range(len(block)):
                 for c in range(3):
-                    v = block[b, c]
-                    corners[c, b], corners[3 + c, b], corners[6 + c, b] = screen[0, v], screen[1, v], screen[2, v]
+                    v = np.uint32(block[b, c])
+                    corners[c, b], corners[3 + c, b], corners[6 + c, b] = screen[v, 0], screen[v, 1], screen[v, 2]
             for b in range(len(block)):
                 xa, xb, xc = corners[0, b], corners[1, b], corners[2, b]
                 ya, yb, yc = corners[3, b], corners[4, b], corners[5, b]
-                area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-                x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
-                box[0, b], box[1, b] = max(np.floor(x0), zero), min(np.ceil(x1) - one, right)
-                box[2, b], box[3, b] = max(np.floor(y0), zero), min(np.ceil(y1) - one, bottom)
+                area = ((xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)) * (sign if sign != 0 else one)
+                x0, x1 = max(np.floor(min(xa, xb, xc)), zero), min(np.ceil(max(xa, xb, xc)) - one, right)
+                y0, y1 = max(np.floor(min(ya, yb, yc)), zero), min(np.ceil(max(ya, yb, yc)) - one, bottom)
                 near[b] = min(corners[6, b], corners[7, b], corners[8, b])
-                faces_us = (area * sign > 0) | ((sign == 0) & (area != 0))
-                seen[b] = faces_us & (near[b] > 0) & (box[0, b] <= box[1, b]) & (box[2, b] <= box[3, b])
+                shown = ((area > 0) | ((sign == 0) & (area < 0))) & (near[b] > 0) & (x0 <= x1) & (y0 <= y1)
+                x0, x1, y0, y1 = (x0, x1, y0, y1) if shown else (zero, zero, zero, zero)
+                box[0, b], box[1, b], box[2, b], box[3, b] = x0, x1, y0, y1
+                seen[b], large[b] = shown, (x1 - x0 > 1) | (y1 - y0 > 1)
             for b in range(len(block)):
-                if seen[b]:
-                    i0, i1, j0, j1 = int(box[0, b]), int(box[1, b]), int(box[2, b]), int(box[3, b])
-                    listed[chunk, count] = start + b
-                    count += _may_miss(limits, near[b], i0, i1, j0, j1)
+                place[b] = box[2, b] * width + box[0, b]
+            some = 0
+            for b in range(len(block)):  # A branch would be mispredicted.
+                chosen[some] = b
+                some += seen[b] & (large[b] | (near[b] < highest[np.uint32(place[b])]))
+            for b in chosen[:some]:
+                listed[chunk, count] = start + b
+                count += _may_miss(limits, corners[:, b], box[:, b])
         counts[chunk] = count
 
 
 @compiled
-def _may_miss(limits, near, i0, i1, j0, j1):
-    """True if depth `near` is before the limit in some cell of a box, ends included, or if the box is large."""
+def _may_miss(limits, corners, box):
+    """True if a triangle may be nearer than the limit in some cell of its box (4,), ends included, or if that is large.
+
+    `corners` (9,) are three columns, three rows and three depths.
+    """
+    i0, i1, j0, j1 = box[0], box[1], box[2], box[3]
     if (i1 - i0 + 1) * (j1 - j0 + 1) > BOX:
         return True
+    half = np.float32(0.5)
+    xa, ya, za = corners[0], corners[3], corners[6]
+    x, y, z = corners[1] - xa, corners[4] - ya, corners[7] - za
+    u, v, w = corners[2] - xa, corners[5] - ya, corners[8] - za
+    area, near, far = x * v - u * y, min(za, za + z, za + w), max(za, za + z, za + w)
+    along_x, along_y = (z * v - w * y) / area, (w * x - z * u) / area
+    # Half a cell aside, and the most by which depths seen in perspective bend off a plane.
+    reach = half * (abs(along_x) + abs(along_y)) + (far - near) * (far - near) / near
     for j in range(j0, j1 + 1):
         for i in range(i0, i1 + 1):
-            if near < limits[j, i]:
+            least = za + along_x * (i + half - xa) + along_y * (j + half - ya) - reach
+            if near < limits[j, i] and not least >= limits[j, i]:
                 return True
     return False
 
@@ -215,8 +253,9 @@ def _clip(points, low, high, ends):
             if ya != yb:
                 s = min(max(((high if side else low) - ya) / (yb - ya), 0.0), 1.0)
             x = points[a, 0] + s * (points[b, 0] - points[a, 0])
-            for end in range(2):
-                if (x < ends[0, 0]) if end == 0 else (x > ends[1, 0]):
-                    ends[end, 0] = x
-                    for r in range(2):
-                        ends[end, 1 + r] = points[a, 2 + r] + s * (points[b, 2 + r] - points[a, 2 + r])
+            over_w = points[a, 2] + s * (points[b, 2] - points[a, 2])
+            depth = points[a, 3] + s * (points[b, 3] - points[a, 3])
+            if x < ends[0, 0]:
+                ends[0, 0], ends[0, 1], ends[0, 2] = x, over_w, depth
+            if x > ends[1, 0]:
+                ends[1, 0], ends[1, 1], ends[1, 2] = x, over_w, depth
