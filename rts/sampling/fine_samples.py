@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal, NamedTuple
@@ -90,19 +90,23 @@ def fine_samples(
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
     most, names = planned(layers), ("row", "depth", "settled", "between")
     given = {name: x for name in names if (x := getattr(coarse, name)) is not None}
-    find: Callable[..., np.ndarray] = partial(active, sizes=sizes, apron=coarse.apron, where=where)
+
+    def find(known: Mapping[str, np.ndarray]) -> np.ndarray:
+        optional = known.get("settled"), known.get("between")
+        return active(known["row"], known["depth"], *optional, sizes=sizes, apron=coarse.apron, where=where)
+
     values = {name: array for name, x in given.items() if (array := engine.known(x)) is not None}
     if len(values) < len(given) or values["row"].ndim != 3:
         room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
         def laid_out(*values: np.ndarray) -> tuple[np.ndarray, ...]:
-            return tuple(lay_out(find(**dict(zip(given, values, strict=True))), grid, room))
+            return tuple(lay_out(find(dict(zip(given, values, strict=True))), grid, room))
 
         layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *given.values()))
         known, allotted, flat = None, most * room.cells, False
     else:
-        pixels, few = find(**values), engine.padded(coarse.row)
+        pixels, few = find(values), engine.padded(coarse.row)
         room = None if capacity is None else grid.room(capacity, most)
         if room is None:  # Aprons come on top; but to lay out what is far too large would take for ever.
             check_memory(1, int(pixels.sum()) * grid.side**2, most, None, gradient=engine.differentiates)
