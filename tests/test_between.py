@@ -122,6 +122,18 @@ def test_small_triangles_of_a_fine_mesh_are_not_told(detail, cull):
     assert not found.any() and (depth > 0).sum() > 300
 
 
+def test_clusters_of_a_mesh_that_stays_tell_the_same():
+    vertices, faces = soup(70000, 0, size=0.004)
+    camera = Camera.look_at((0.4, 0.5, 3.2), (0, 0, 0)).for_size(PIXELS).map(lambda x: np.asarray(x, np.float64))
+    sampler = rts.plugin("samplers", "raster")()
+    proxy = Proxy(np.asarray(vertices, np.float32), np.asarray(faces, np.int32))
+    for cull in ("none", "back"):
+        depth = np.zeros(PIXELS, np.float32)
+        found, expected = (sampler.between(x, camera, PIXELS, cull, depth) for x in (sampler.arrange(proxy), proxy))
+        assert (expected > 0).sum() > 500 and sampler.arrange(proxy) is not proxy
+        np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.thorough) for n in range(1, 8))])
 def test_raster_tells_what_the_reference_tells(seed):
     rng = np.random.default_rng(seed)
@@ -219,6 +231,28 @@ def test_the_gradient_of_a_wire_is_that_of_as_many_samples_everywhere(target):
         gradients.append(gradient(target, loss, arrays(target, part.theta["vertices"])))
     np.testing.assert_allclose(*gradients, rtol=1e-3, atol=1e-3)
     assert np.abs(gradients[0]).max() > 0.1
+
+
+def test_compiled_by_jax_a_wire_has_the_same_image():
+    jax = pytest.importorskip("jax")
+    part = wire_part()
+
+    def image(vertices):
+        moved = part.replace(theta={**part.theta, "vertices": vertices})
+        return rts.render(moved, flat_camera(), PIXELS, supersample=Adaptive(2, thin=True), capacity=4000)
+
+    vertices = arrays("jax", part.theta["vertices"])
+    np.testing.assert_allclose(jax.jit(image)(vertices), render(part, 2), atol=1e-6)
+
+
+def test_explain_counts_pixels_with_something_between_samples():
+    options = {"size": PIXELS, "supersample": Adaptive(4, thin=True)}
+    (choice,), (plain,) = (
+        rts.explain(wire_part(), flat_camera(), **{**options, **more}) for more in ({}, {"supersample": 1})
+    )
+    found, _ = between("raster", *strip(*WIRES["slanted"]))
+    assert choice.between == (found > 0).sum() > 0 and plain.between is None
+    assert rts.explain(scene(), CAMERA, SIZE, supersample=Adaptive(4, thin=True))[0].between == 0
 
 
 def test_samplers_that_do_not_tell_change_nothing():
