@@ -10,6 +10,13 @@ from rts.plugin_api.records import Fragments, Proxy
 CANDIDATES_AT_ONCE = 1 << 20
 """About how many pairs of a triangle and a pixel are tested at once, which bounds memory."""
 
+SLACK = 0.5
+"""How far in front of the nearest depth around a cell the surface may come, as a share of the range of these depths: at
+a ridge between two centres, half of it."""
+
+ROUNDING = 1e-4
+"""How far it may come in any case, as a share of the depth."""
+
 
 class Reference(TriangleSampler):
     """Sampler that tests each triangle against each pixel near it: slow and obvious.
@@ -42,6 +49,72 @@ class Reference(TriangleSampler):
             return _empty(size, layers)
         triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*hits, strict=True))
         return _nearest(triangle, pixel, barycentrics, depth, size, layers)
+
+    def between(
+        self, prepared: Proxy, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
+    ) -> np.ndarray:
+        """See `TriangleSampler.between`: each triangle cut to rows of cells; those that near or far plane cut are not.
+
+        A triangle counts in a cell if it touches it, does not cover its centre, and is nearer there than `limits`. Its
+        depth is that of the point below or above the centre on the line from the leftmost to the rightmost point of
+        its part in the row.
+        """
+        nearest, last = limits(depth), np.array(size[::-1]) - 1
+        homogeneous = np.concatenate([prepared.vertices.astype(np.float64), np.ones((len(prepared.vertices), 1))], 1)
+        in_camera = homogeneous @ camera.view.T
+        clip = (in_camera @ camera.projection.T)[prepared.faces]
+        w, kept = clip[..., 3], (np.abs(clip[..., 2]) <= clip[..., 3]).all(axis=1) & (clip[..., 3] > 0).all(axis=1)
+        if cull != "none":
+            kept &= _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
+        missed = np.full(size, np.inf)
+        for t in np.flatnonzero(kept):
+            xy = (clip[t, :, :2] / w[t, :, None] * [1, -1] + 1) / 2 * size[::-1]
+            corners = np.column_stack([xy, 1 / w[t], -in_camera[prepared.faces[t], 2] / w[t]])
+            if _cross(*(xy[1] - xy[0]), *(xy[2] - xy[0])) == 0:
+                continue
+            low, high = np.floor(xy.min(axis=0)).clip(0), (np.ceil(xy.max(axis=0)) - 1).clip(-1, last)
+            for y in range(int(low[1]), int(high[1]) + 1):
+                left, right = _ends(corners, y, y + 1)
+                x = np.arange(max(int(np.floor(left[0])), 0), min(int(np.ceil(right[0])) - 1, last[0]) + 1)
+                share = ((x + 0.5 - left[0]) / max(right[0] - left[0], 1e-300)).clip(0, 1)[:, None]
+                over_w, deep = ((1 - share) * left[2:] + share * right[2:]).T
+                level = _ends(corners, y + 0.5, y + 0.5)
+                covered = (level[0][0] <= x + 0.5) & (x + 0.5 <= level[1][0])
+                found = np.where((deep / over_w < nearest[y, x]) & ~covered, deep / over_w, np.inf)
+                missed[y, x] = np.minimum(missed[y, x], found)
+        return np.where(np.isfinite(missed), missed, 0).astype(np.float32)
+
+
+def limits(depth: np.ndarray) -> np.ndarray:
+    """The depth (H, W) from which on a triangle in a cell is no surprise; infinite amid empty cells.
+
+    It is the least depth of nine cells, less `SLACK` of the range of their depths, or `ROUNDING` if that is more.
+
+    Args:
+        depth: (H, W), what the cells show; 0 where they are empty.
+    """
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(np.where(depth > 0, depth, np.inf), 1, mode="edge"), (3, 3))
+    far = np.lib.stride_tricks.sliding_window_view(np.pad(depth, 1, mode="edge"), (3, 3))
+    least, most = near.min(axis=(2, 3)), far.max(axis=(2, 3))
+    known = np.where(most > 0, least, 0)
+    return np.where(most > 0, known - np.maximum(SLACK * (most - known), ROUNDING * known), np.inf)
+
+
+def _ends(corners: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """The leftmost and the rightmost point (4,) of a triangle (3, 4) in the rows from `low` to `high`.
+
+    Both are infinitely far to the wrong side if the triangle does not reach these rows.
+    """
+    points = [corners[(corners[:, 1] >= low) & (corners[:, 1] <= high)]]
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        for line in (low, high):
+            if min(corners[a, 1], corners[b, 1]) < line < max(corners[a, 1], corners[b, 1]):
+                share = (line - corners[a, 1]) / (corners[b, 1] - corners[a, 1])
+                points.append(((1 - share) * corners[a] + share * corners[b])[None])
+    inside = np.concatenate(points)
+    if not len(inside):
+        return np.full(4, np.inf), np.full(4, -np.inf)
+    return inside[inside[:, 0].argmin()], inside[inside[:, 0].argmax()]
 
 
 def _chunks(counts: np.ndarray) -> list[np.ndarray]:

@@ -62,7 +62,7 @@ def samples_of(supersample: int | str) -> int | Adaptive:
 
 def as_text(supersample: Adaptive) -> str:
     """`Setting.supersample` of an `rts.Adaptive`: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
-    given = {"dilated": supersample.dilated, "contrast": supersample.contrast}
+    given = {"dilated": supersample.dilated, "contrast": supersample.contrast, "thin": supersample.thin or None}
     return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
 
 

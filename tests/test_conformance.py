@@ -488,6 +488,16 @@ class OddExits(type(rts.plugin("samplers", "raster")())):
         return found if found.exit is None else found.replace(exit=self.alter(found))
 
 
+class OddBetween(type(rts.plugin("samplers", "raster")())):
+    """Tells what lies between centres from altered depths, or tells what is altered."""
+
+    def __init__(self, depth=lambda x: x, told=lambda x: x):
+        self.seen, self.told = depth, told
+
+    def between(self, prepared, camera, size, cull, depth):
+        return self.told(super().between(prepared, camera, size, cull, self.seen(depth)))
+
+
 def turned_about(x):
     """Numbers in the reverse order, where there are any."""
     found = x.copy()
@@ -512,6 +522,14 @@ SAMPLERS = {
         "nothing told": OddExits(lambda found: None),
         "others' exits": OddExits(lambda found: turned_about(found.exit)),
         "everywhere": OddExits(lambda found: np.maximum(found.exit, found.exit.max())),
+    },
+    "what_lies_between_centres_is_told_where_it_says_so": {
+        "nothing": OddBetween(told=np.zeros_like),
+        "everywhere": OddBetween(told=lambda x: np.full_like(x, 3.5)),
+        "what is seen, too": OddBetween(depth=np.zeros_like),
+        "what a fine mesh shows": OddBetween(depth=lambda x: x + np.float32(x.min() > 0)),
+        "rows upside down": OddBetween(told=lambda x: x[::-1].copy()),
+        "other depths": OddBetween(told=lambda x: 1.01 * x),
     },
     "listed_cells_are_those_of_the_whole_grid": {"those beside them": Misplaced()},
     "it_agrees_with_the_reference": {

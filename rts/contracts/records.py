@@ -109,6 +109,9 @@ class Cells:
             of this colour; −1 in others. Such a cell may lack a sample of its own, and so may cells around it that
             affect no others. Samples in it and in the eight cells around it have its colour. None if no cells are
             marked.
+        between: (H, W) float32, linear depth of a piece of the surface that lies in the cell's square, between the
+            centres: this cell and the eight around it show nothing as near, nor anything that it continues. 0 where
+            there is no such piece. None if none are looked for.
     """
 
     MORE_BEHIND: ClassVar[int] = 1 << 14
@@ -118,16 +121,17 @@ class Cells:
     facing: Array | None = None
     exit: Array | None = None
     settled: Array | None = None
+    between: Array | None = None
 
     def map(self, f: Callable[[Array], Array]) -> Cells:
         """The cells with `f` applied to each array; `f` sees axes (..., H, W), and None stays None."""
-        arrays = (self.row, self.depth, self.facing, self.exit, self.settled)
+        arrays = (self.row, self.depth, self.facing, self.exit, self.settled, self.between)
         return Cells(*(None if x is None else f(x) for x in arrays))  # pyright: ignore[reportArgumentType]
 
     def first(self, layers: int) -> Cells:
-        """The cells with only their first layers; `exit` and `settled`, which have no layers, stay."""
+        """The cells with only their first layers; `exit`, `settled` and `between`, which have no layers, stay."""
         own = (None if x is None else x[:layers, ...] for x in (self.row, self.depth, self.facing))
-        return Cells(*own, exit=self.exit, settled=self.settled)  # pyright: ignore[reportArgumentType]
+        return Cells(*own, exit=self.exit, settled=self.settled, between=self.between)  # pyright: ignore[reportArgumentType]
 
 
 class _OnCells:
@@ -140,6 +144,7 @@ class _OnCells:
     facing = property(attrgetter("cells.facing"), doc="See `Cells`.")
     exit = property(attrgetter("cells.exit"), doc="See `Cells`.")
     settled = property(attrgetter("cells.settled"), doc="See `Cells`.")
+    between = property(attrgetter("cells.between"), doc="See `Cells`.")
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed; fields of `cells` may be named directly."""
@@ -250,6 +255,7 @@ class Request:
         hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
         exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them.
+        between: whether to compute `Cells.between`, of all cells of the grid.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
@@ -258,6 +264,7 @@ class Request:
     hidden: Hidden | None = None
     facing: bool = False
     exits: bool = False
+    between: bool = False
     entry: Any = None
 
 

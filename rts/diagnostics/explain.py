@@ -9,10 +9,10 @@ import numpy as np
 
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import CheckedPart, check_scene
-from rts.contracts.records import Samples
+from rts.contracts.records import Sampled, Samples
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
-from rts.sampling.adaptive import Adaptive
+from rts.sampling.adaptive import Adaptive, missed
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import INSIDE_OUT, is_inside_out
@@ -46,7 +46,7 @@ def explain(
     Returns:
         For each part the name of the `sampler`, the `reason`, and `remarks` on likely mistakes. With a size also the
         number of `samples`, apron included. With `rts.Adaptive` also the number of `fine` ones among them, and of
-        `active` pixels.
+        `active` pixels; with `thin` also of pixels with something `between` samples.
 
     Raises:
         InputError: the scene cannot be sampled.
@@ -71,7 +71,8 @@ def explain(
     pixel = engine_of(sampled).to_numpy(sampled.fine.pixel)
     finer, active = map(_count, sampled.fine.samples), int(np.count_nonzero(pixel >= 0))
     counts = zip(choices, coarse, finer, strict=True)
-    return [choice._replace(samples=n + m, fine=m, active=active) for choice, n, m in counts]
+    between = _missed(sampled)
+    return [choice._replace(samples=n + m, fine=m, active=active, between=between) for choice, n, m in counts]
 
 
 def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int]) -> list[set[str]]:
@@ -91,6 +92,16 @@ def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) 
         yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
     if is_inside_out(part, camera):
         yield INSIDE_OUT
+
+
+def _missed(sampled: Sampled) -> int | None:
+    """The number of pixels of the image in which something lies between samples; None if no sampler told."""
+    if sampled.between is None:
+        return None
+    host = engine_of(sampled).to_numpy
+    settled = None if sampled.settled is None else host(sampled.settled)
+    found = missed(host(sampled.row)[0], host(sampled.depth)[0], host(sampled.between), settled)
+    return int(np.count_nonzero(found[sampled.apron : -sampled.apron, sampled.apron : -sampled.apron]))
 
 
 def _count(samples: Samples) -> int:

@@ -115,7 +115,8 @@ def _on_one_grid(
     gradient, capacity, reader = scene.context.engine.differentiates, settings.capacity, settings.reader
     check_memory(height, width, settings.most_layers, capacity, gradient=gradient)
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
-    request = Request(capacity, facing="facing" in reader.reads, exits=exits and "exit" in reader.reads and gradient)
+    exits = exits and "exit" in reader.reads and gradient
+    request = Request(capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin)
     taken = partial(_taken, scene, grid, request)
     if settings.layers == "auto":
         sampled = with_layers_that_count(taken, hidden, scene.opaque)

@@ -65,6 +65,11 @@ class RenderSettings:
         return self.supersample.contrast if isinstance(self.supersample, Adaptive) else None
 
     @property
+    def thin(self) -> bool:
+        """True if `Adaptive` looks for what falls between centres."""
+        return isinstance(self.supersample, Adaptive) and self.supersample.thin
+
+    @property
     def most_layers(self) -> int:
         """The number of layers to plan for; with "auto" an estimate."""
         return planned(self.layers)

@@ -26,6 +26,9 @@ class Adaptive:
     nothing or another surface, or a neighbour's front ends towards it; behind translucent layers, the next layer does.
     Active pixels look as with `supersample=samples`, the others as with `supersample=1`.
 
+    A wire, a hair or a far object that is thinner than pixels may lie between all samples, so that none tells of it.
+    With `thin` the triangles themselves are asked, by samplers that tell (`Cells.between`): "raster" does.
+
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
         dilated: True if the eight neighbours of active pixels are active too. Colours that change near outlines need
@@ -33,11 +36,13 @@ class Adaptive:
         contrast: threshold for the second difference of any colour channel along any of four directions, above which
             pixels are active too: at edges of colour on surfaces. Needs colours, which are missing in `rts.sample`,
             compiled programs and derivatives of several directions at once. None to ignore colours; 0.2 suits.
+        thin: True if pixels are active, too, where triangles lie between samples: once more through all triangles.
     """
 
     samples: int
     dilated: bool | None = None
     contrast: float | None = None
+    thin: bool = False
 
     def __post_init__(self):
         if not is_count(self.samples) or self.samples < 2:
@@ -56,6 +61,8 @@ class Adaptive:
                 f"contrast of Adaptive is {quoted(self.contrast)}; expected a positive finite number, such as 0.2, "
                 f"or None"
             )
+        if not isinstance(self.thin, bool):
+            raise InputError(f"thin of Adaptive is {quoted(self.thin)}; expected True or False")
         object.__setattr__(self, "samples", int(self.samples))
 
     def dilates(self, parts: Sequence[CheckedPart]) -> bool:
@@ -66,7 +73,7 @@ class Adaptive:
 
     @staticmethod
     def of_text(text: str) -> int | Adaptive:
-        """The `supersample` written as a text: "4", "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2".
+        """The `supersample` written as a text: "4", "adaptive:4:thin=True", or "adaptive:8:dilated=False:contrast=0.2".
 
         Raises:
             InputError: the text has none of these forms, or a number of `Adaptive` is out of range.
@@ -75,7 +82,7 @@ class Adaptive:
         number, *further = rest if rest and kind == "adaptive" else [kind]
         if not number.isdecimal() or (rest and kind != "adaptive"):
             raise InputError(f"{text!r} is no supersample; expected a number such as 4, or adaptive:4")
-        values = {"dilated=true": ("dilated", True), "dilated=false": ("dilated", False)}
+        values = {f"{name}={value}".lower(): (name, value) for name in ("dilated", "thin") for value in (True, False)}
         options: dict[str, Any] = {}
         for word in further:
             name, _, value = word.partition("=")
@@ -84,7 +91,7 @@ class Adaptive:
             elif name == "contrast" and (least := _number(value)) is not None:
                 options[name] = least
             else:
-                raise InputError(f"{word!r} of {text!r} is none of dilated=True, dilated=False and contrast=0.2")
+                raise InputError(f"{word!r} of {text!r} is none of dilated=True, contrast=0.2 and thin=True")
         return Adaptive(int(number), **options) if rest else int(number)
 
 
@@ -161,6 +168,19 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
     )
     parallel(adaptive_loops.mark, len(marks), *arguments, marks, work=4 * row.size)
     return marks.view(bool)
+
+
+def missed(row: np.ndarray, depth: np.ndarray, between: np.ndarray, settled: np.ndarray | None = None) -> np.ndarray:
+    """Cells (H, W) bool in which something lies between the centres, in front of what all parts show there.
+
+    Args:
+        row: (H, W), the front's row; −1 in empty cells.
+        depth: (H, W), its depth.
+        between: (H, W), see `Cells.between`.
+        settled: (H, W) int8, see `outlines`; cells that are settled keep their colour, whatever lies in them.
+    """
+    found = (between > 0) & ((row < 0) | (between < depth))
+    return found if settled is None else found & (settled < 0)
 
 
 def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:

@@ -31,6 +31,8 @@ class Choice(NamedTuple):
         samples: the number of samples in an image; None if no image was sampled.
         fine: the number of fine samples among them, of `rts.Adaptive`; None without it.
         active: the number of pixels of the image with fine samples, for all parts together; None without it.
+        between: the number of these in which something lies between samples, of `rts.Adaptive(…, thin=True)`; else
+            None, also where no sampler tells.
         remarks: likely mistakes, a line each: entries of θ that nothing reads, a mesh wound inside out.
     """
 
@@ -39,6 +41,7 @@ class Choice(NamedTuple):
     samples: int | None = None
     fine: int | None = None
     active: int | None = None
+    between: int | None = None
     remarks: tuple[str, ...] = ()
 
 

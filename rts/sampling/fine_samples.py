@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Fine, Sampled
-from rts.sampling.adaptive import Adaptive, contrasts, visible_outlines
+from rts.sampling.adaptive import Adaptive, contrasts, missed, visible_outlines
 from rts.sampling.hidden import HiddenRule, planned, with_layers_that_count
 from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
@@ -38,6 +38,7 @@ def active(
     row: np.ndarray,
     depth: np.ndarray,
     settled: np.ndarray | None = None,
+    between: np.ndarray | None = None,
     *,
     sizes: Sequence[int],
     apron: int,
@@ -49,11 +50,14 @@ def active(
         row: see `visible_outlines`.
         depth: see `visible_outlines`.
         settled: see `visible_outlines`.
+        between: see `missed`; None to ignore what lies between centres.
         sizes: the number of rows of each part.
         apron: cells around the image.
         where: the rule.
     """
     pixels = visible_outlines(row, depth, sizes, settled, where.opaque)
+    if between is not None:
+        pixels |= missed(row[0], depth[0], between, settled)
     if where.colors is not None and where.adaptive.contrast is not None:
         pixels |= contrasts(row[0], where.colors, where.adaptive.contrast)
     pixels = dilated(pixels) if where.dilates else pixels
@@ -84,23 +88,25 @@ def fine_samples(
             room, no coarse cell is settled, or coarse samples are traced.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
-    most, coarse_arrays = (
-        planned(layers),
-        [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])],
-    )
-    find = partial(active, sizes=sizes, apron=coarse.apron, where=where)
-    values = [array for x in coarse_arrays if (array := engine.known(x)) is not None]
-    if len(values) < len(coarse_arrays) or values[0].ndim != 3:
+    most, names = planned(layers), ("row", "depth", "settled", "between")
+    given = {name: x for name in names if (x := getattr(coarse, name)) is not None}
+
+    def find(known: Mapping[str, np.ndarray]) -> np.ndarray:
+        optional = known.get("settled"), known.get("between")
+        return active(known["row"], known["depth"], *optional, sizes=sizes, apron=coarse.apron, where=where)
+
+    values = {name: array for name, x in given.items() if (array := engine.known(x)) is not None}
+    if len(values) < len(given) or values["row"].ndim != 3:
         room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
         def laid_out(*values: np.ndarray) -> tuple[np.ndarray, ...]:
-            return tuple(lay_out(find(*values), grid, room))
+            return tuple(lay_out(find(dict(zip(given, values, strict=True))), grid, room))
 
-        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *coarse_arrays))
+        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *given.values()))
         known, allotted, flat = None, most * room.cells, False
     else:
-        pixels, few = find(*values), engine.padded(coarse.row)
+        pixels, few = find(values), engine.padded(coarse.row)
         room = None if capacity is None else grid.room(capacity, most)
         if room is None:  # Aprons come on top; but to lay out what is far too large would take for ever.
             check_memory(1, int(pixels.sum()) * grid.side**2, most, None, gradient=engine.differentiates)
@@ -108,7 +114,7 @@ def fine_samples(
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
         known = None if hidden is None else HiddenInStrips(hidden, host)
-        flat = flat and bool((values[-1] >= 0).any()) and not host.dropped
+        flat = flat and bool((values["settled"] >= 0).any()) and not host.dropped
     taken = partial(take, listed=layout.cells, capacity=allotted)
     sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known, where.opaque)
     return replace(arranged(sampled, layout, grid), flat=flat)

@@ -16,8 +16,8 @@ from rts.errors import InputError
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     """Interleave the layers of several parts by depth and keep the nearest `layers`; the earlier part is first at ties.
 
-    A single part keeps its cells as they are. The result has fewer layers if all parts together have fewer, and no
-    settled cells if there are several parts.
+    A single part keeps its cells as they are. Of pieces between centres the nearest stays. The result has fewer layers
+    if all parts together have fewer, and no settled cells if there are several parts.
 
     Raises:
         InputError: known cells of one of several parts name a sample that does not exist.
@@ -42,7 +42,19 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
             own, before = _as_many(s.exit, before)
             exits = xp.where((part[0] == i) & (own >= 0), own + start, before)
         start += s.ids.shape[0]
-    return Sampled(tuple(samples), Cells(row, depth, facing[0] if facing else None, exits), overflow)
+    cells = Cells(row, depth, facing[0] if facing else None, exits, between=_nearest([s.between for s in samples]))
+    return Sampled(tuple(samples), cells, overflow)
+
+
+def _nearest(depths: Sequence[Array | None]) -> Array | None:
+    """The least of depths (H, W), of those that are not 0; None if all are None."""
+    known = [depth for depth in depths if depth is not None]
+    if not known:
+        return None
+    least = known[0]
+    for depth in known[1:]:
+        least = namespace(depth).where((depth > 0) & ((least == 0) | (depth < least)), depth, least)
+    return least
 
 
 def _as_many(one: Array, other: Array) -> tuple[Array, Array]:

@@ -117,7 +117,7 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
         sampler: the sampler.
     """
     count, shape = samples.ids.shape[-2], tuple(samples.row.shape)
-    own = {"row": shape[:1] + tuple(grid), "depth": shape, "facing": shape, "settled": shape[1:]}
+    own = {"row": shape[:1] + tuple(grid), "depth": shape, "facing": shape, "settled": shape[1:], "between": shape[1:]}
     if samples.exit is not None:
         own["exit"] = (*samples.exit.shape[:1], *shape[1:])
     try:
@@ -127,9 +127,9 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
                 continue
             if tuple(array.shape) != expected:
                 raise InputError(f"{name} has shape {tuple(array.shape)}; expected {expected}")
-            if name != "depth" and not namespace(array).isdtype(array.dtype, "signed integer"):
+            if name not in ("depth", "between") and not namespace(array).isdtype(array.dtype, "signed integer"):
                 raise InputError(f"{name} is {array.dtype}; expected signed integers")
-            if name not in ("depth", "facing"):
+            if name not in ("depth", "facing", "between"):
                 check_rows(array, count, name)
     except InputError as error:
         raise InputError(f"sample of {sampler!r} gave samples that do not fit: {error}") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -155,6 +155,20 @@ class TriangleSampler(Sampler):
             backs = self.rasterize_cells(prepared, camera, size, 1, "front", cells)
         return fragments, cells, backs
 
+    def between(
+        self, prepared: Any, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
+    ) -> np.ndarray | None:
+        """`Cells.between` (H, W) float32 of a finished image; None, the default, for samplers that do not tell.
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            cull: see `rasterize`.
+            depth: (H, W) float32, the depth of the nearest triangle at each cell's centre; 0 where there is none.
+        """
+        return None
+
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """The proxy of a part, and the result of `prepare` for it; see `Sampler`.
 
@@ -213,7 +227,8 @@ class TriangleSampler(Sampler):
         If requested, `facing` is recorded for K > 1 layers of parts that are not culled, of surfaces with `pieces` that
         do not move their samples. Requested exits are of two kinds. Single ones are recorded for parts with
         cull="back", of centred surfaces without `refine`, but not for lists of cells. Pairs at outlines are recorded
-        for surfaces with `refine_outlines` that do not move their samples.
+        for surfaces with `refine_outlines` that do not move their samples. `between` goes by the triangles, whatever
+        the surface makes of them.
 
         Raises:
             InputError: the surface has no triangles, the camera makes no image, or a plugin broke its contract.
@@ -228,16 +243,18 @@ class TriangleSampler(Sampler):
         exits = request.exits and part.cull == "back" and listed is None and not refines and surface.centered
         pairs = request.exits and refines and not moves
         pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
+        thin = request.between and listed is None and overrides(self, "between", TriangleSampler)
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
             **({"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not refines else {}),
             **({"exit": ArraySpec((1 + pairs, *shape.size), np.int32)} if exits or pairs else {}),
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
+            **({"between": ArraySpec(shape.size, np.float32)} if thin else {}),
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(cells[0], np.int32) if cells else None
-            search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own)
+            search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own, thin)
             samples = search.moved() if moves else search.in_place(sides, exits, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
@@ -282,6 +299,26 @@ class TriangleSampler(Sampler):
         return overrides(self, "update", TriangleSampler)
 
 
+class _Drawn(NamedTuple):
+    """Drawn triangles.
+
+    Attributes:
+        known: the prepared entry.
+        fragments: (K, ·, ·).
+        covered: (K, ·, ·) bool, the cells of the fragments.
+        decision: a decision on them; None without exits, or if the part has no triangles.
+        exits: where rays leave the part; None if not asked for.
+        between: `Cells.between`; None if not asked for.
+    """
+
+    known: Entry
+    fragments: Fragments
+    covered: np.ndarray
+    decision: Decision | None
+    exits: Exits | None
+    between: np.ndarray | None
+
+
 @dataclass(frozen=True)
 class _Search:
     """The search for the samples of one view, on the host.
@@ -297,6 +334,7 @@ class _Search:
         hidden: the rule for hidden samples; None to keep all.
         entry: the surface's prepared entry; None to look it up, or to build it.
         cells: (L, C), the cells to sample; None for all.
+        thin: True to record `Cells.between`.
     """
 
     sampler: TriangleSampler
@@ -309,6 +347,7 @@ class _Search:
     hidden: Hidden | None
     entry: Entry | None
     cells: np.ndarray | None
+    thin: bool = False
 
     def in_place(self, sides: bool, exits: bool, pairs: bool) -> Samples:
         """Samples on the triangles, or refined by a surface that does not move them.
@@ -318,7 +357,7 @@ class _Search:
             exits: True to record, at outlines, the sample where the ray leaves the part.
             pairs: True to record, at outlines, the surface's pairs of samples.
         """
-        known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
+        known, fragments, covered, decision, behind, between = self._drawn(self.shape.layers, exits)
         decision = decision or self._decided(covered, fragments, known)
         # All refined samples stay, also those amid one colour.
         kept, facing = decision.needed if self.surface.refines else decision.kept, None
@@ -328,7 +367,7 @@ class _Search:
             facing = facing_of(fragments, kept, known.proxy, pieces, self.camera, listed=self.cells is not None)
         if not self.surface.refines:
             lifted = lift(fragments, known.proxy, self.shape.capacity, kept, behind)
-            return lifted.replace(facing=facing, settled=decision.settled)
+            return lifted.replace(facing=facing, settled=decision.settled, between=between)
         lifted = lift(fragments, known.proxy, None, kept)
         samples, rays = refined(
             self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells
@@ -337,13 +376,16 @@ class _Search:
         if pairs:
             given = self.cells, self.shape.view, self.tables
             samples, further = with_pairs(samples, self.surface, self.inputs, rays, *given)
-        return repack(samples, samples.row >= 0, self.shape.capacity, further).replace(facing=facing)
+        repacked = repack(samples, samples.row >= 0, self.shape.capacity, further)
+        return repacked.replace(facing=facing, between=between)
 
     def moved(self) -> Samples:
         """Samples that the surface moves off its triangles, with `ran_out`."""
         layers = self.shape.layers
         # There is only one set of tables, so that no samples can be added later.
-        known, fragments, covered, *_ = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
+        known, fragments, covered, *_, between = self._drawn(
+            layers if self.tables else max(layers + 1, LEAST_LAYERS), False
+        )
         samples = on_surface(
             self.surface,
             self.inputs,
@@ -359,27 +401,30 @@ class _Search:
         if self.hidden is not None:  # The rule comes last, since it goes by the final depths.
             kept = self.hidden.decide(Question(covers, samples.depth)).needed
         ran_out = np.count_nonzero(covered[-1] & ~covers[-1])
-        return repack(samples, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
+        repacked = repack(samples, kept, self.shape.capacity)
+        return repacked.replace(ran_out=np.asarray(ran_out, np.int32), between=between)
 
-    def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
-        """The prepared entry, fragments (K, ·, ·), their covered cells (bool), a decision on them, and exits.
-
-        Decision and exits are None unless `exits` is True. The decision is None, too, if the part has no triangles.
-        """
+    def _drawn(self, layers: int, exits: bool) -> _Drawn:
+        """The triangles drawn into `layers` layers; with `exits`, also what lies behind outlines."""
         sampler, (camera, view) = self.sampler, (self.camera, self.shape.view)
         grid = layers, *self.shape.size
 
-        def draw(known: Entry) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
+        def between(known: Entry, fragments: Fragments) -> np.ndarray | None:
+            return sampler.between(known.prepared, camera, view, self.cull, fragments.depth[0]) if self.thin else None
+
+        def draw(known: Entry) -> _Drawn:
             if not (count := len(known.proxy.faces)):
                 nowhere = Exits(np.empty((1, 0), np.int32), *_nothing((1, 1, 0))) if exits else None
-                return known, *_nothing(grid), None, nowhere
+                none = np.zeros(self.shape.size, np.float32) if self.thin else None
+                return _Drawn(known, *_nothing(grid), None, nowhere, none)
             arguments = known.prepared, camera, view, layers
             if not exits:
                 if self.cells is None:
                     fragments = sampler.rasterize(*arguments, self.cull)
                 else:
                     fragments = sampler.rasterize_cells(*arguments, self.cull, self.cells)
-                return known, fragments, check_fragments(fragments, grid, count, sampler), None, None
+                covered = check_fragments(fragments, grid, count, sampler)
+                return _Drawn(known, fragments, covered, None, None, between(known, fragments))
             seen: list[tuple[Fragments, np.ndarray, Decision]] = []
 
             def beside(fragments: Fragments) -> np.ndarray:
@@ -393,7 +438,7 @@ class _Search:
                 seen[:] = [(fragments, covered, self._decided(covered, fragments, known))]
             if asked.size:
                 check_fragments(backs, (1, *asked.shape), count, sampler)
-            return known, *seen[0], Exits.of(fragments, asked, backs)
+            return _Drawn(known, *seen[0], Exits.of(fragments, asked, backs), between(known, fragments))
 
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
 

@@ -21,6 +21,7 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.testing.between_claims import claim_fine_meshes_are_not_told, claim_wires_are_told
 from rts.testing.claims import claim, claim_close, no_error, refusal
 from rts.testing.compatibility import APRON
 from rts.testing.conformance import Conformance
@@ -265,6 +266,13 @@ class SamplerConformance(Conformance):
         if not told:
             pytest.skip("the sampler tells no exits")
         claim(any(told), "no cell has an exit")
+
+    def test_what_lies_between_centres_is_told_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
+        """A sampler that records `Cells.between` finds thin wires that no cell shows, and nothing in a fine mesh."""
+        chosen = check_sampler(sampler)
+        if not is_of_triangles(parts[0]) or not claim_wires_are_told(chosen):
+            pytest.skip("the sampler does not tell what lies between centres")
+        claim_fine_meshes_are_not_told(chosen)
 
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
         """A surface with neither triangles nor `intersect` raises an `rts.RtsError` of one line."""

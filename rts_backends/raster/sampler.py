@@ -25,6 +25,7 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
+from rts_backends.raster.between import between
 from rts_backends.raster.cells import EVERYTHING, Blocks, touching
 from rts_backends.raster.clusters import BACKS, FRONTS, SIZE, Clusters
 from rts_backends.raster.drawing import BAND_ROWS, LISTED, clear, draw, draw_cells
@@ -114,6 +115,12 @@ class Raster(TriangleSampler):
             fragments = mesh.draw(fronts, layers)
             cells = beside(fragments)
             return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
+
+    def between(
+        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
+    ) -> np.ndarray:
+        """See `TriangleSampler.between`; triangles that the near or the far plane cuts are left out."""
+        return between(prepared, camera, size, facing(camera, cull), depth)
 
     @property
     def _draws(self) -> bool:

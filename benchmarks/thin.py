@@ -1,0 +1,199 @@
+"""Things thinner than pixels: errors of derivatives by what is sampled, and what it costs to look between samples.
+
+Errors are of `rts_compare.stability` (low-passed relative L2 of the derivative image), against derivatives of 24 × 24
+points a pixel, since 8 × 8 of that table are themselves off by 0.08, 0.14 and 0.23 for wires. Times are processor time
+of a render and its derivative. Costs are processor time of pose iterations, with `thin` and without, in turns.
+
+    python -m benchmarks.thin
+    python -m benchmarks.thin --mitsuba 4 16 64
+    python -m benchmarks.thin --cost
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import rts
+from benchmarks.camera import camera
+from benchmarks.meshes import kept_mesh
+from benchmarks.report import table
+from rts_compare import scene_shapes
+from rts_compare.failures import failure_scenes
+from rts_compare.failures.method_renderers import renderer
+from rts_compare.failures.row_measures import Derivative
+from rts_compare.failures.table_cells import Context
+from rts_compare.failures.table_columns import Method
+from rts_compare.moving_scenes import Scene
+
+SAMPLES = {
+    "1": 1,
+    "2 × 2": 2,
+    "4 × 4": 4,
+    "8 × 8": 8,
+    "Adaptive(4)": rts.Adaptive(4),
+    "Adaptive(4, thin)": rts.Adaptive(4, thin=True),
+    "Adaptive(8, thin)": rts.Adaptive(8, thin=True),
+}
+POINTS = 24
+"""The square root of the number of points a pixel of true derivatives, on each of two grids."""
+PIXEL = scene_shapes.pixel(scene_shapes.DISTANCE, failure_scenes.SIZE[0])
+"""The width of a pixel in the plane through the origin."""
+
+
+def tube(points: np.ndarray, radius: float, sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a tube around a line of points (N, 3)."""
+    along = np.gradient(points, axis=0)
+    across = np.cross(along, [0, 0, 1.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    other = np.cross(along / np.linalg.norm(along, axis=1, keepdims=True), across)
+    angle = np.arange(sides) * 2 * np.pi / sides
+    ring = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None]
+    first = (np.arange(len(points) - 1)[:, None] * sides + np.arange(sides)).reshape(-1)
+    second = (np.arange(len(points) - 1)[:, None] * sides + np.roll(np.arange(sides), -1)).reshape(-1)
+    faces = [np.stack([first, second, second + sides], 1), np.stack([first, second + sides, first + sides], 1)]
+    return (points[:, None] + radius * ring).reshape(-1, 3), np.concatenate(faces)
+
+
+def together(pieces: list[tuple[np.ndarray, np.ndarray]], color: tuple[float, float, float]) -> rts.Part:
+    """One part of several pieces."""
+    firsts = np.cumsum([0, *(len(v) for v, _ in pieces)])
+    faces = np.concatenate([f + n for (_, f), n in zip(pieces, firsts, strict=False)])
+    return scene_shapes.unlit(np.concatenate([v for v, _ in pieces]), faces, color)
+
+
+def cones() -> rts.Part:
+    """Six slanted cones of twelve sides, four pixels wide at the base."""
+    angle, pieces = np.arange(12) * np.pi / 6, []
+    sides = [(k, 12, (k + 1) % 12) for k in range(12)] + [((k + 1) % 12, 13, k) for k in range(12)]
+    for i in range(6):
+        base = np.column_stack([0.06 * np.cos(angle), np.full(12, -0.6), 0.06 * np.sin(angle)])
+        turn = np.radians(15 * (i - 2.5))
+        matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        corners = np.vstack([base, [0, 0.6, 0], [0, -0.6, 0]]) @ matrix.T + [0.3 * i - 0.75, 0, 0]
+        pieces.append((corners, np.array(sides)))
+    return together(pieces, (0.3, 0.8, 1.0))
+
+
+def hair() -> rts.Part:
+    """Five hundred bent tubes, a fifth of a pixel wide."""
+    rng, s, pieces = np.random.default_rng(0), np.linspace(0, 1, 9), []
+    for _ in range(500):
+        x, y, bend, depth = rng.uniform(-0.7, 0.7), rng.uniform(-0.2, 0.75), rng.normal(0, 0.25), 0.2 * rng.random()
+        line = np.column_stack([x + bend * s**2 + 0.03 * np.sin(9 * s + 5 * x), y - 0.55 * s, depth + 0 * s])
+        pieces.append(tube(line, 0.1 * PIXEL, 5))
+    return together(pieces, (0.9, 0.7, 0.4))
+
+
+def fence() -> rts.Part:
+    """A chain-link fence of wires a quarter of a pixel wide."""
+    along, pieces = np.linspace(-0.7, 0.7, 29), []
+    turns = np.arange(29)
+    for i in range(-8, 9):
+        for side in (1, -1):
+            x = 0.1 * i + 0.05 * side * np.where(turns % 2, 1, -1)
+            depth = 0.01 * side * np.cos(np.pi * turns / 2)
+            pieces.append(tube(np.column_stack([x, along, depth]), 0.125 * PIXEL, 4))
+    return together(pieces, (0.8, 0.8, 0.85))
+
+
+def posed(make: Callable[[], rts.Part]) -> Scene:
+    """A part that is moved to the right."""
+    return failure_scenes.posed(make.__name__, make(), ("tx",))
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    **{f"wires of {width:g} px": partial(failure_scenes.wires, width) for width in (1.0, 0.5, 0.25)},
+    **{make.__name__: partial(posed, make) for make in (cones, hair, fence)},
+}
+
+
+def cell(scene: Scene, method: Method, context: Context) -> str:
+    """The error of a method, and its time."""
+    numbers, drawn, times = Derivative(lambda: scene).numbers(method, context), renderer(scene, method), []
+    for _ in range(5):
+        start = time.process_time()
+        drawn.derivative(next(iter(scene.directions)))
+        times.append(time.process_time() - start)
+    return f"{numbers['error']:.3f}, {1e3 * statistics.median(times):.0f} ms"
+
+
+def errors(output: Path, spp: list[int]) -> str:
+    """The table of errors; `spp` are Mitsuba's samples a pixel."""
+    context = Context(samples=POINTS, folder=output / "truths")
+    ours = {"splatter": "visible", "layers": 2}
+    methods = {name: Method(name, {**ours, "supersample": s}) for name, s in SAMPLES.items()}
+    methods |= {f"Mitsuba, {n} spp": Method("Mitsuba", {"spp": n}, "Mitsuba") for n in spp}
+    made = {name: make() for name, make in SCENES.items()}
+    rows = [[name, *(cell(scene, m, context) for scene in made.values())] for name, m in methods.items()]
+    return table(["samples", *made], rows)
+
+
+def draw(path: Path) -> None:
+    """The scenes as pictures, by what is sampled."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shown = ["1", "Adaptive(4)", "Adaptive(4, thin)", "8 × 8"]
+    parts = [scene_shapes.wires(failure_scenes.SIZE[0], [0.25] * 7), cones(), hair(), fence()]
+    figure, axes = plt.subplots(len(parts), len(shown), figsize=(12, 12))
+    for row, part in zip(axes, parts, strict=True):
+        for place, name in zip(row, shown, strict=True):
+            image = np.asarray(rts.render(part, scene_shapes.camera(), failure_scenes.SIZE, supersample=SAMPLES[name]))
+            place.imshow(image[..., :3].clip(0, 1) ** (1 / 2.2), interpolation="nearest")
+            place.set(title=name, xticks=[], yticks=[])
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def cost(output: Path, rounds: int) -> str:
+    """The table of what `thin` costs a pose iteration of a mesh, with and without back faces."""
+    rows = []
+    for name in ("bunny", "nefertiti"):
+        vertices, faces = kept_mesh(name, output)
+        theta = {"vertices": torch.tensor(vertices), "color": torch.tensor([1.0, 0.5, 0.2])}
+        for side in (256, 512):
+            for cull in ("none", "back"):
+                pose = torch.zeros(6, requires_grad=True)
+                mesh, times = rts.Mesh(faces), {False: [], True: []}
+                for n in range(2 * rounds + 4):
+                    thin = bool(n % 2)
+                    start = time.process_time()
+                    part = rts.Part(mesh, theta, "unlit", cull=cull, transform=rts.rigid(pose))
+                    image = rts.render(part, camera(), (side, side), supersample=rts.Adaptive(4, thin=thin))
+                    image.square().mean().backward()
+                    if n >= 4:
+                        times[thin].append(time.process_time() - start)
+                without, told = (1e3 * statistics.median(times[thin]) for thin in (False, True))
+                rows.append([f"{len(faces):,}", str(side), cull, f"{without:.1f}", f"{told - without:+.1f}"])
+                rows[-1].append(f"{100 * (told / without - 1):+.0f} %")
+    return table(["faces", "image", "cull", "Adaptive(4), ms", "thin, ms", "thin"], rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/thin"))
+    parser.add_argument("--mitsuba", type=int, nargs="*", default=[], metavar="SPP")
+    parser.add_argument("--cost", action="store_true")
+    parser.add_argument("--rounds", type=int, default=9)
+    given = parser.parse_args()
+    (given.output / "truths").mkdir(parents=True, exist_ok=True)
+    if given.cost:
+        print(cost(given.output, given.rounds))
+        return
+    print(errors(given.output, given.mitsuba))
+    draw(given.output / "thin.png")
+
+
+if __name__ == "__main__":
+    main()
