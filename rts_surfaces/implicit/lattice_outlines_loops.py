@@ -1,0 +1,343 @@
+"""Pairs of samples that tell how outlines of a lattice's surface move, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.plugin_api.loops import compiled, loop
+from rts_surfaces.implicit.casting import APART, FIRST, GROWTH, HALVINGS, MARCH, REACH
+from rts_surfaces.implicit.lattice_samples_loops import LARGEST, corner
+from rts_surfaces.implicit.narrow_band_loops import row_at
+
+BENT = 0.7
+"""Least rise of the level over the step beyond the one across an outline, as a share of the rise over that step."""
+
+DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 7
+"""Steps along a ray towards a least level, the first as a share of a cell, their growth; and halvings of its bracket."""
+
+
+@compiled
+def _level(values, band, isovalue, sign, capped, shape, low, step, at, near, slope):
+    """The level at a point, interpolated along each axis.
+
+    Fills `near`, the point's places in its cell, 0 to 1 along each axis, and the gradient `slope`. Beyond the bounds,
+    and where a band has no cell, the level is infinite and the gradient NaN; if `capped`, the level beyond the bounds
+    is at least the distance beyond them.
+
+    Returns:
+        The level, the number of the cell's lowest corner, the cell's row in a band, and True if a cap decides.
+    """
+    side, beyond, base, cell = 0, -np.inf, 0, 0
+    for i in range(3):
+        place = (at[i] - low[i]) / step[i]
+        over = max(-place, place - (shape[i] - 1)) * step[i]
+        if over > beyond:
+            side, beyond = i, over
+        lowest = min(max(int(np.floor(place)), 0), shape[i] - 2)
+        base, near[i] = base * shape[i] + lowest, min(max(place - lowest, 0.0), 1.0)
+    if band is not None:
+        across = base // shape[2]
+        cell = row_at(across // shape[1], across % shape[1], base % shape[2], shape, band[1], band[2])
+    if (beyond > 0 and not capped) or cell < 0:
+        slope[:] = np.nan
+        return np.inf, 0, 0, True
+    # Along x, then along y, then along z.
+    x, y, z = near
+    f00, f01 = corner(values, band, base, cell, 0, shape), corner(values, band, base, cell, 4, shape)
+    f10, f11 = corner(values, band, base, cell, 2, shape), corner(values, band, base, cell, 6, shape)
+    d00, d01 = corner(values, band, base, cell, 1, shape) - f00, corner(values, band, base, cell, 5, shape) - f01
+    d10, d11 = corner(values, band, base, cell, 3, shape) - f10, corner(values, band, base, cell, 7, shape) - f11
+    f0, f1 = f00 + x * d00, f01 + x * d01
+    e0, e1 = f10 + x * d10 - f0, f11 + x * d11 - f1
+    f0, f1 = f0 + y * e0, f1 + y * e1
+    level = sign * (f0 + z * (f1 - f0) - isovalue)
+    d0, d1 = d00 + y * (d10 - d00), d01 + y * (d11 - d01)
+    slope[0] = sign * (d0 + z * (d1 - d0)) / step[0]
+    slope[1] = sign * (e0 + z * (e1 - e0)) / step[1]
+    slope[2] = sign * (f1 - f0) / step[2]
+    if capped and beyond > level:
+        upper = at[side] > low[side]
+        slope[0], slope[1], slope[2] = 0.0, 0.0, 0.0
+        slope[side] = 1.0 if upper else -1.0
+        return beyond, base, cell, True
+    return level, base, cell, False
+
+
+@compiled
+def _along(start, direction, t, out):
+    for i in range(3):
+        out[i] = start[i] + t * direction[i]
+
+
+@compiled
+def _rate(slope, unit):
+    return slope[0] * unit[0] + slope[1] * unit[1] + slope[2] * unit[2]
+
+
+@compiled
+def _bracket(field, first, unit, move, at, near, slope):
+    """Places along a ray from `first`, between which the level is least, by steps that grow; zeros if it only falls."""
+    before, t, value = 0.0, 0.0, _level(*field, first, near, slope)[0]
+    for _ in range(MARCH):
+        _along(first, unit, t + move, at)
+        after = _level(*field, at, near, slope)[0]
+        if after > value:
+            return before, t + move
+        before, t, move, value = t, t + move, GROWTH * move, after
+    return 0.0, 0.0
+
+
+@compiled
+def _halved(field, first, unit, a, b, count, at, near, slope):
+    """The middle of a bracket of a least level, after halvings."""
+    for _ in range(count):
+        middle = (a + b) / 2
+        _along(first, unit, middle, at)
+        _level(*field, at, near, slope)
+        if _rate(slope, unit) < 0:
+            a = middle
+        else:
+            b = middle
+    return (a + b) / 2
+
+
+@compiled
+def _downhill(field, first, unit, t, move, at, near, slope):
+    """The place of the least level along a ray that is nearest downhill from place t; NaN without one."""
+    _along(first, unit, t, at)
+    value = _level(*field, at, near, slope)[0]
+    move = -move if _rate(slope, unit) > 0 else move
+    before = t
+    for _ in range(DOWNHILL):
+        _along(first, unit, t + move, at)
+        after = _level(*field, at, near, slope)[0]
+        if after > value:
+            ends = before, t + move
+            return _halved(field, first, unit, min(ends), max(ends), HALVINGS_DOWN, at, near, slope)
+        before, t, move, value = t, t + move, GROWTH_DOWN * move, after
+    return np.nan
+
+
+@compiled
+def _mixed(field, first, unit, ends, at, near, slopes, levels, mixed):
+    """Fill the levels (2,) and slopes (2, 3) at both ends of a kink, and their mean (3,) perpendicular to the ray.
+
+    Returns:
+        The share of the first end, as `casting.deepest` has it, and the square of the mean slope.
+    """
+    for k in range(2):
+        _along(first, unit, ends[k], at)
+        levels[k] = _level(*field, at, near, slopes[k])[0]
+    falls, rises = max(-_rate(slopes[0], unit), 0.0), max(_rate(slopes[1], unit), 0.0)
+    share = rises / (falls + rises) if falls + rises > 0 else 0.5
+    for i in range(3):
+        mixed[i] = share * slopes[0, i] + (1 - share) * slopes[1, i]
+    along, square = _rate(mixed, unit), 0.0
+    for i in range(3):
+        mixed[i] -= along * unit[i]
+        square += mixed[i] * mixed[i]
+    return share, square
+
+
+@compiled
+def _towards(z, origin, direction, origins, directions, slope):
+    """The neighbour, of rays (8, 3), that lies most along a slope (3,) at camera depth z; −1 if none does."""
+    best, found = 0.0, -1
+    for k in range(len(origins)):
+        along, square = 0.0, 0.0
+        for i in range(3):
+            step = origins[k, i] - origin[i] + z * (directions[k, i] - direction[i])
+            along += step * slope[i]
+            square += step * step
+        if along > best * np.sqrt(square):  # False for NaN.
+            best, found = along / np.sqrt(square), k
+    return found
+
+
+@compiled
+def _write(field, at, near, slope, place, along, part, points, params):
+    """Fill a sample that follows the level at `at`, from `place` (3,), by a part of the motion `along` (3,)."""
+    values, band, isovalue, _, _, shape, _, _ = field
+    _, base, cell, cap = _level(*field, at, near, slope)
+    _tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params)
+    for i in range(3):
+        params[9 + i] = place[i]
+        moved = 0.0 if cap else part * along[i]
+        params[12 + i] = moved if abs(moved) < LARGEST else 0.0
+    if cap:
+        params[15] = 0.0
+
+
+@compiled
+def _crossing(field, z, place, rays, slope, at, near, work, points, params):
+    """Fill a pair of samples at the least levels of two rays, between which an outline passes.
+
+    The outline is where the least level, linear between both rays, is zero. Where pixels are narrower than cells, the
+    rays stand a cell apart, around the middle between a pixel and its neighbour.
+
+    Args:
+        field: the first arguments of `_level`.
+        z: camera depth of the first ray's least level.
+        place: (3,), the place there.
+        rays: origins and directions (3,) of the ray, and of its neighbour.
+        slope: (3,), across the ray, of any length.
+        at: (3,), for work.
+        near: (3,), for work.
+        work: (5, 3), for work.
+        points: (2, 6) int32, to be filled as in `lattice_samples_loops.fill`.
+        params: (2, 16), to be filled.
+
+    Returns:
+        1 for a pair; 0 where the outline does not pass between the rays; −1 where it does, but levels bend so much
+        that they say little about how it moves.
+    """
+    step, slopes, least = field[7], work[4], np.empty(2)
+    size, square = 0.0, 0.0
+    for i in range(3):
+        across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
+        size, square = size + across * across, square + slope[i] * slope[i]
+    apart = max(1.0, min(step) / np.sqrt(size))
+    for k in range(2):
+        start, unit, length, share = work[2], work[3], 0.0, (1 + apart) / 2 if k else (1 - apart) / 2
+        for i in range(3):
+            start[i] = rays[0][i] + share * (rays[2][i] - rays[0][i])
+            unit[i] = rays[1][i] + share * (rays[3][i] - rays[1][i])
+            length += unit[i] * unit[i]
+        length = np.sqrt(length)
+        for i in range(3):
+            unit[i] /= length
+        t = _downhill(field, start, unit, z * length, FIRST_DOWN * min(step), at, near, slopes)
+        if np.isnan(t):
+            return 0
+        _along(start, unit, t, work[k])
+        least[k] = _level(*field, work[k], near, slopes)[0]
+    rise = least[1] - least[0]
+    if not (least[0] <= 0 < least[1] < np.inf):
+        return 0
+    along = 0.0
+    for i in range(3):
+        across = apart * (rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i]))
+        at[i] = work[1, i] + across
+        along += across * slope[i] / square
+    if _level(*field, at, near, slopes)[0] - least[1] < BENT * rise:
+        return -1
+    share = -least[0] / rise
+    for i in range(3):
+        slope[i] *= along / rise
+    for k in range(2):
+        part = 2 * share if k else 2 - 2 * share
+        _write(field, work[k], near, slopes, place, slope, part, points[k], params[k])
+    return 1
+
+
+@loop
+def outlines(
+    start,
+    stop,
+    values,
+    band,
+    isovalue,
+    sign,
+    capped,
+    shape,
+    low,
+    step,
+    origins,
+    directions,
+    other_origins,
+    other_directions,
+    depth,
+    spread,
+    points,
+    params,
+    there,
+):
+    """Fill pairs of samples that tell how the outlines beside rays [start, stop) move.
+
+    They stand at the least levels of the ray and of a neighbour that misses the surface, see `_crossing`; where there
+    is no such neighbour, beside the ray's deepest point, see `casting.deepest`.
+
+    Args:
+        start: the first ray.
+        stop: the ray after the last.
+        values: see `lattice_samples_loops.fill`.
+        band: rows (C, 8) of the corners of a band's cells; and the rows of these cells, by the places of their lowest
+            corners, see `narrow_band.rows_by_place`. None without a band.
+        isovalue: see `fill`.
+        sign: see `fill`.
+        capped: True if the surface is closed at the bounds.
+        shape: see `fill`.
+        low: see `fill`.
+        step: see `fill`.
+        origins: (R, 3), of `rts.plugin_api.records.Rays`.
+        directions: (R, 3), also of `Rays`.
+        other_origins: (R, 8, 3), see `rts.TriangleSurface.refine_outlines`.
+        other_directions: (R, 8, 3), also.
+        depth: (R,), depths of the surface's points on the rays.
+        spread: (2,), of `Rays`.
+        points: (R, 2, 6) int32, to be filled with the numbers of lattice points.
+        params: (R, 2, 16), zeros, to be filled as in `fill`, with barycentrics of zero.
+        there: (R,) bool, to be filled: rays that have a pair.
+    """
+    field = values, band, isovalue, sign, capped, shape, low, step
+    first, unit, at, near, place = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    slope, slopes, levels, ends, work = np.empty(3), np.empty((2, 3)), np.empty(2), np.empty(2), np.empty((5, 3))
+    for n in range(start, stop):
+        there[n] = False
+        length = np.sqrt(directions[n, 0] ** 2 + directions[n, 1] ** 2 + directions[n, 2] ** 2)
+        for i in range(3):
+            first[i], unit[i] = origins[n, i] + depth[n] * directions[n, i], directions[n, i] / length
+        reach = REACH * (spread[0] + spread[1] * depth[n])
+        a, b = _bracket(field, first, unit, FIRST * reach, at, near, slope)
+        if b > 0:
+            t = _halved(field, first, unit, a, b, HALVINGS // 2, at, near, slope)
+        else:  # It falls all along; there may be a valley within a step.
+            t = _downhill(field, first, unit, 0.0, FIRST_DOWN * min(step), at, near, slope)
+        if np.isnan(t):
+            continue
+        # A kink of the field spreads over a cell; where cells are wider than pixels it is a face.
+        apart = max(APART * reach, min(0.5 * min(step), reach / 6))
+        ends[0], ends[1] = max(t - apart, 0.0), t + apart
+        share, square = _mixed(field, first, unit, ends, at, near, slopes, levels, slope)
+        _along(first, unit, t, place)
+        z = depth[n] + t / length
+        k = _towards(z, origins[n], directions[n], other_origins[n], other_directions[n], slope)
+        found = 0
+        if k >= 0:
+            rays = origins[n], directions[n], other_origins[n, k], other_directions[n, k]
+            found = _crossing(field, z, place, rays, slope, at, near, work, points[n], params[n])
+        level = (levels[0] + levels[1]) / 2
+        if found == 0 and b > 0 and level <= 0 and level * level < reach * reach * square:
+            found = 1
+            for i in range(3):
+                slope[i] /= square
+            for k in range(2):
+                part = 2 - 2 * share if k else 2 * share
+                _along(first, unit, ends[k], at)
+                place[:] = at
+                _write(field, at, near, slopes[k], place, slope, part, points[n, k], params[n, k])
+        there[n] = found > 0
+
+
+@compiled
+def _tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params):
+    """Fill the four lattice points that interpolate at a point, their weights, the point, and its level.
+
+    Changes `near`, the point's places in its cell.
+    """
+    number, last, left, level = base, 0, 1.0, 0.0
+    for k in range(6):
+        points[k], params[3 + k] = number, 0
+        if k > 3:
+            continue
+        # The next corner lies along the axis with the largest place of those that remain.
+        axis = 0 if near[0] >= near[1] and near[0] >= near[2] else 1 if near[1] >= near[2] else 2
+        own = near[axis] if k < 3 else 0.0
+        params[3 + k] = left - own
+        level += (left - own) * (corner(values, band, base, cell, last, shape) - isovalue)
+        if k < 3:
+            number += shape[1] * shape[2] if axis == 0 else shape[2] if axis == 1 else 1
+            last, left, near[axis] = last | 1 << axis, own, -1.0
+    for i in range(3):
+        params[9 + i] = at[i]
+    params[15] = level
