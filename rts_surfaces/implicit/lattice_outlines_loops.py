@@ -12,6 +12,9 @@ from rts_surfaces.implicit.narrow_band_loops import row_at
 BENT = 0.7
 """Least rise of the level over the step beyond the one across an outline, as a share of the rise over that step."""
 
+NARROW = 0.5
+"""Least distance of two rays, as a share of a cell: nearer ones tell no more than one."""
+
 DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 7
 """Steps along a ray towards a least level, the first as a share of a cell, their growth; and halvings of its bracket."""
 
@@ -172,8 +175,7 @@ def _write(field, at, near, slope, place, along, part, points, params):
 def _crossing(field, z, place, rays, slope, at, near, work, points, params):
     """Fill a pair of samples at the least levels of two rays, between which an outline passes.
 
-    The outline is where the least level, linear between both rays, is zero. Where pixels are narrower than cells, the
-    rays stand a cell apart, around the middle between a pixel and its neighbour.
+    The outline is where the least level, linear between both rays, is zero.
 
     Args:
         field: the first arguments of `_level`.
@@ -183,40 +185,36 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
         slope: (3,), across the ray, of any length.
         at: (3,), for work.
         near: (3,), for work.
-        work: (5, 3), for work.
+        work: (4, 3), for work.
         points: (2, 6) int32, to be filled as in `lattice_samples_loops.fill`.
         params: (2, 16), to be filled.
 
     Returns:
-        1 for a pair; 0 where the outline does not pass between the rays; −1 where it does, but levels bend so much
+        1 for a pair; 0 where the outline does not pass between the rays, or these are `NARROW`; −1 where it does, but levels bend so much
         that they say little about how it moves.
     """
-    step, slopes, least = field[7], work[4], np.empty(2)
+    step, slopes, least = field[7], work[3], np.empty(2)
     size, square = 0.0, 0.0
     for i in range(3):
         across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
         size, square = size + across * across, square + slope[i] * slope[i]
-    apart = max(1.0, min(step) / np.sqrt(size))
+    if size < (NARROW * min(step)) ** 2:
+        return 0
     for k in range(2):
-        start, unit, length, share = work[2], work[3], 0.0, (1 + apart) / 2 if k else (1 - apart) / 2
+        unit, length = work[2], np.sqrt(_rate(rays[2 * k + 1], rays[2 * k + 1]))
         for i in range(3):
-            start[i] = rays[0][i] + share * (rays[2][i] - rays[0][i])
-            unit[i] = rays[1][i] + share * (rays[3][i] - rays[1][i])
-            length += unit[i] * unit[i]
-        length = np.sqrt(length)
-        for i in range(3):
-            unit[i] /= length
-        t = _downhill(field, start, unit, z * length, FIRST_DOWN * min(step), at, near, slopes)
+            unit[i] = rays[2 * k + 1][i] / length
+        t = _downhill(field, rays[2 * k], unit, z * length, FIRST_DOWN * min(step), at, near, slopes)
         if np.isnan(t):
             return 0
-        _along(start, unit, t, work[k])
+        _along(rays[2 * k], unit, t, work[k])
         least[k] = _level(*field, work[k], near, slopes)[0]
     rise = least[1] - least[0]
     if not (least[0] <= 0 < least[1] < np.inf):
         return 0
     along = 0.0
     for i in range(3):
-        across = apart * (rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i]))
+        across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
         at[i] = work[1, i] + across
         along += across * slope[i] / square
     if _level(*field, at, near, slopes)[0] - least[1] < BENT * rise:
@@ -281,7 +279,7 @@ def outlines(
     """
     field = values, band, isovalue, sign, capped, shape, low, step
     first, unit, at, near, place = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    slope, slopes, levels, ends, work = np.empty(3), np.empty((2, 3)), np.empty(2), np.empty(2), np.empty((5, 3))
+    slope, slopes, levels, ends, work = np.empty(3), np.empty((2, 3)), np.empty(2), np.empty(2), np.empty((4, 3))
     for n in range(start, stop):
         there[n] = False
         length = np.sqrt(directions[n, 0] ** 2 + directions[n, 1] ** 2 + directions[n, 2] ** 2)
