@@ -9,13 +9,13 @@ from rts_surfaces.implicit.casting import APART, FIRST, GROWTH, HALVINGS, MARCH,
 from rts_surfaces.implicit.lattice_samples_loops import LARGEST, corner
 from rts_surfaces.implicit.narrow_band_loops import row_at
 
-BENT = 0.7
-"""Least rise of the level over the step beyond the one across an outline, as a share of the rise over that step."""
+BENT = 0.75
+"""Least slope of the level over the two steps beyond the one across an outline, as a share of the slope there."""
 
 NARROW = 0.5
 """Least distance of two rays, as a share of a cell: nearer ones tell no more than one."""
 
-DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 7
+DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 4
 """Steps along a ray towards a least level, the first as a share of a cell, their growth; and halvings of its bracket."""
 
 
@@ -180,51 +180,50 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
     Args:
         field: the first arguments of `_level`.
         z: camera depth of the first ray's least level.
-        place: (3,), the place there.
+        place: (3,), the place there, which both samples have.
         rays: origins and directions (3,) of the ray, and of its neighbour.
         slope: (3,), across the ray, of any length.
         at: (3,), for work.
         near: (3,), for work.
-        work: (4, 3), for work.
+        work: (2, 3), for work.
         points: (2, 6) int32, to be filled as in `lattice_samples_loops.fill`.
         params: (2, 16), to be filled.
 
     Returns:
-        1 for a pair; 0 where the outline does not pass between the rays, or these are `NARROW`; −1 where it does, but levels bend so much
-        that they say little about how it moves.
+        1 for a pair; 0 where the outline does not pass between the rays, or these are nearer than `NARROW`; −1 where
+        it does, but levels bend so much that they say little about how it moves.
     """
-    step, slopes, least = field[7], work[3], np.empty(2)
-    size, square = 0.0, 0.0
+    step, unit, least, size, square, length = field[7], work[0], work[1], 0.0, 0.0, 0.0
     for i in range(3):
         across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
         size, square = size + across * across, square + slope[i] * slope[i]
+        length += rays[3][i] * rays[3][i]
     if size < (NARROW * min(step)) ** 2:
         return 0
-    for k in range(2):
-        unit, length = work[2], np.sqrt(_rate(rays[2 * k + 1], rays[2 * k + 1]))
-        for i in range(3):
-            unit[i] = rays[2 * k + 1][i] / length
-        t = _downhill(field, rays[2 * k], unit, z * length, FIRST_DOWN * min(step), at, near, slopes)
-        if np.isnan(t):
-            return 0
-        _along(rays[2 * k], unit, t, work[k])
-        least[k] = _level(*field, work[k], near, slopes)[0]
-    rise = least[1] - least[0]
-    if not (least[0] <= 0 < least[1] < np.inf):
+    length = np.sqrt(length)
+    for i in range(3):
+        unit[i] = rays[3][i] / length
+    t = _downhill(field, rays[2], unit, z * length, FIRST_DOWN * min(step), at, near, least)
+    if np.isnan(t):
+        return 0
+    _along(rays[2], unit, t, least)
+    inner, outer = _level(*field, place, near, unit)[0], _level(*field, least, near, unit)[0]
+    rise = outer - inner
+    if not (inner <= 0 < outer < np.inf):
         return 0
     along = 0.0
     for i in range(3):
         across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
-        at[i] = work[1, i] + across
+        at[i] = least[i] + 2 * across
         along += across * slope[i] / square
-    if _level(*field, at, near, slopes)[0] - least[1] < BENT * rise:
+    if _level(*field, at, near, unit)[0] - outer < 2 * BENT * rise:
         return -1
-    share = -least[0] / rise
+    share = -inner / rise
     for i in range(3):
         slope[i] *= along / rise
     for k in range(2):
         part = 2 * share if k else 2 - 2 * share
-        _write(field, work[k], near, slopes, place, slope, part, points[k], params[k])
+        _write(field, least if k else place, near, unit, place, slope, part, points[k], params[k])
     return 1
 
 
@@ -279,7 +278,7 @@ def outlines(
     """
     field = values, band, isovalue, sign, capped, shape, low, step
     first, unit, at, near, place = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    slope, slopes, levels, ends, work = np.empty(3), np.empty((2, 3)), np.empty(2), np.empty(2), np.empty((4, 3))
+    slope, slopes, levels, ends, work = np.empty(3), np.empty((2, 3)), np.empty(2), np.empty(2), np.empty((2, 3))
     for n in range(start, stop):
         there[n] = False
         length = np.sqrt(directions[n, 0] ** 2 + directions[n, 1] ** 2 + directions[n, 2] ** 2)
