@@ -13,7 +13,6 @@ from rts.contracts.records import ArraySpec, Fragments, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.scene.rays import Rays
 
-
 NEIGHBOURS = [(u, v) for v in (-1, 0, 1) for u in (-1, 0, 1) if (u, v) != (0, 0)]
 """Steps (x, y) from a cell to those around it, line by line."""
 

@@ -258,7 +258,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def refine_outlines(
-        self, inputs: Mapping[str, np.ndarray], rays: Rays, beside: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
+        self,
+        inputs: Mapping[str, np.ndarray],
+        rays: Rays,
+        beside: Rays,
+        depth: np.ndarray,
+        tables: Mapping[str, np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
         """See `rts.TriangleSurface`; in a band none where the search leaves its cells and those one further inside."""
         from rts_surfaces.implicit import lattice_outlines_loops

@@ -6,8 +6,8 @@ import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
 from rts_surfaces.implicit.casting import APART, FIRST, GROWTH, HALVINGS, MARCH, REACH
-from rts_surfaces.implicit.lattice_samples_loops import LARGEST, corner
-from rts_surfaces.implicit.narrow_band_loops import row_at
+from rts_surfaces.implicit.lattice_levels_loops import level_at, step_along, tetrahedron
+from rts_surfaces.implicit.lattice_samples_loops import LARGEST
 
 BENT = 0.75
 """Least slope of the level over the two steps beyond the one across an outline, as a share of the slope there."""
@@ -16,60 +16,7 @@ NARROW = 0.5
 """Least distance of two rays, as a share of a cell: nearer ones tell no more than one."""
 
 DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 4
-"""Steps along a ray towards a least level, the first as a share of a cell, their growth; and halvings of its bracket."""
-
-
-@compiled
-def _level(values, band, isovalue, sign, capped, shape, low, step, at, near, slope):
-    """The level at a point, interpolated along each axis.
-
-    Fills `near`, the point's places in its cell, 0 to 1 along each axis, and the gradient `slope`. Beyond the bounds,
-    and where a band has no cell, the level is infinite and the gradient NaN; if `capped`, the level beyond the bounds
-    is at least the distance beyond them.
-
-    Returns:
-        The level, the number of the cell's lowest corner, the cell's row in a band, and True if a cap decides.
-    """
-    side, beyond, base, cell = 0, -np.inf, 0, 0
-    for i in range(3):
-        place = (at[i] - low[i]) / step[i]
-        over = max(-place, place - (shape[i] - 1)) * step[i]
-        if over > beyond:
-            side, beyond = i, over
-        lowest = min(max(int(np.floor(place)), 0), shape[i] - 2)
-        base, near[i] = base * shape[i] + lowest, min(max(place - lowest, 0.0), 1.0)
-    if band is not None:
-        across = base // shape[2]
-        cell = row_at(across // shape[1], across % shape[1], base % shape[2], shape, band[1], band[2])
-    if (beyond > 0 and not capped) or cell < 0:
-        slope[:] = np.nan
-        return np.inf, 0, 0, True
-    # Along x, then along y, then along z.
-    x, y, z = near
-    f00, f01 = corner(values, band, base, cell, 0, shape), corner(values, band, base, cell, 4, shape)
-    f10, f11 = corner(values, band, base, cell, 2, shape), corner(values, band, base, cell, 6, shape)
-    d00, d01 = corner(values, band, base, cell, 1, shape) - f00, corner(values, band, base, cell, 5, shape) - f01
-    d10, d11 = corner(values, band, base, cell, 3, shape) - f10, corner(values, band, base, cell, 7, shape) - f11
-    f0, f1 = f00 + x * d00, f01 + x * d01
-    e0, e1 = f10 + x * d10 - f0, f11 + x * d11 - f1
-    f0, f1 = f0 + y * e0, f1 + y * e1
-    level = sign * (f0 + z * (f1 - f0) - isovalue)
-    d0, d1 = d00 + y * (d10 - d00), d01 + y * (d11 - d01)
-    slope[0] = sign * (d0 + z * (d1 - d0)) / step[0]
-    slope[1] = sign * (e0 + z * (e1 - e0)) / step[1]
-    slope[2] = sign * (f1 - f0) / step[2]
-    if capped and beyond > level:
-        upper = at[side] > low[side]
-        slope[0], slope[1], slope[2] = 0.0, 0.0, 0.0
-        slope[side] = 1.0 if upper else -1.0
-        return beyond, base, cell, True
-    return level, base, cell, False
-
-
-@compiled
-def _along(start, direction, t, out):
-    for i in range(3):
-        out[i] = start[i] + t * direction[i]
+"""Steps along a ray towards a least level; the first, as a share of a cell; their growth; halvings of its bracket."""
 
 
 @compiled
@@ -80,10 +27,10 @@ def _rate(slope, unit):
 @compiled
 def _bracket(field, first, unit, move, at, near, slope):
     """Places along a ray from `first`, between which the level is least, by steps that grow; zeros if it only falls."""
-    before, t, value = 0.0, 0.0, _level(*field, first, near, slope)[0]
+    before, t, value = 0.0, 0.0, level_at(*field, first, near, slope)[0]
     for _ in range(MARCH):
-        _along(first, unit, t + move, at)
-        after = _level(*field, at, near, slope)[0]
+        step_along(first, unit, t + move, at)
+        after = level_at(*field, at, near, slope)[0]
         if after > value:
             return before, t + move
         before, t, move, value = t, t + move, GROWTH * move, after
@@ -95,8 +42,8 @@ def _halved(field, first, unit, a, b, count, at, near, slope):
     """The middle of a bracket of a least level, after halvings."""
     for _ in range(count):
         middle = (a + b) / 2
-        _along(first, unit, middle, at)
-        _level(*field, at, near, slope)
+        step_along(first, unit, middle, at)
+        level_at(*field, at, near, slope)
         if _rate(slope, unit) < 0:
             a = middle
         else:
@@ -107,13 +54,13 @@ def _halved(field, first, unit, a, b, count, at, near, slope):
 @compiled
 def _downhill(field, first, unit, t, move, at, near, slope):
     """The place of the least level along a ray that is nearest downhill from place t; NaN without one."""
-    _along(first, unit, t, at)
-    value = _level(*field, at, near, slope)[0]
+    step_along(first, unit, t, at)
+    value = level_at(*field, at, near, slope)[0]
     move = -move if _rate(slope, unit) > 0 else move
     before = t
     for _ in range(DOWNHILL):
-        _along(first, unit, t + move, at)
-        after = _level(*field, at, near, slope)[0]
+        step_along(first, unit, t + move, at)
+        after = level_at(*field, at, near, slope)[0]
         if after > value:
             ends = before, t + move
             return _halved(field, first, unit, min(ends), max(ends), HALVINGS_DOWN, at, near, slope)
@@ -129,8 +76,8 @@ def _mixed(field, first, unit, ends, at, near, slopes, levels, mixed):
         The share of the first end, as `casting.deepest` has it, and the square of the mean slope.
     """
     for k in range(2):
-        _along(first, unit, ends[k], at)
-        levels[k] = _level(*field, at, near, slopes[k])[0]
+        step_along(first, unit, ends[k], at)
+        levels[k] = level_at(*field, at, near, slopes[k])[0]
     falls, rises = max(-_rate(slopes[0], unit), 0.0), max(_rate(slopes[1], unit), 0.0)
     share = rises / (falls + rises) if falls + rises > 0 else 0.5
     for i in range(3):
@@ -161,8 +108,8 @@ def _towards(z, origin, direction, origins, directions, slope):
 def _write(field, at, near, slope, place, along, part, points, params):
     """Fill a sample that follows the level at `at`, from `place` (3,), by a part of the motion `along` (3,)."""
     values, band, isovalue, _, _, shape, _, _ = field
-    _, base, cell, cap = _level(*field, at, near, slope)
-    _tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params)
+    _, base, cell, cap = level_at(*field, at, near, slope)
+    tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params)
     for i in range(3):
         params[9 + i] = place[i]
         moved = 0.0 if cap else part * along[i]
@@ -178,7 +125,7 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
     The outline is where the least level, linear between both rays, is zero.
 
     Args:
-        field: the first arguments of `_level`.
+        field: the first arguments of `level_at`.
         z: camera depth of the first ray's least level.
         place: (3,), the place there, which both samples have.
         rays: origins and directions (3,) of the ray, and of its neighbour.
@@ -190,8 +137,8 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
         params: (2, 16), to be filled.
 
     Returns:
-        1 for a pair; 0 where the outline does not pass between the rays, or these are nearer than `NARROW`; −1 where
-        it does, but levels bend so much that they say little about how it moves.
+        1 for a pair; 0 where the outline does not pass between the rays, they are nearer than `NARROW`, or the levels
+        beyond are unknown; −1 where levels bend so much that they say little about how the outline moves.
     """
     step, unit, least, size, square, length = field[7], work[0], work[1], 0.0, 0.0, 0.0
     for i in range(3):
@@ -206,8 +153,8 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
     t = _downhill(field, rays[2], unit, z * length, FIRST_DOWN * min(step), at, near, least)
     if np.isnan(t):
         return 0
-    _along(rays[2], unit, t, least)
-    inner, outer = _level(*field, place, near, unit)[0], _level(*field, least, near, unit)[0]
+    step_along(rays[2], unit, t, least)
+    inner, outer = level_at(*field, place, near, unit)[0], level_at(*field, least, near, unit)[0]
     rise = outer - inner
     if not (inner <= 0 < outer < np.inf):
         return 0
@@ -216,7 +163,10 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
         across = rays[2][i] - rays[0][i] + z * (rays[3][i] - rays[1][i])
         at[i] = least[i] + 2 * across
         along += across * slope[i] / square
-    if _level(*field, at, near, unit)[0] - outer < 2 * BENT * rise:
+    beyond = level_at(*field, at, near, unit)[0]
+    if beyond == np.inf:
+        return 0
+    if beyond - outer < 2 * BENT * rise:
         return -1
     share = -inner / rise
     for i in range(3):
@@ -296,7 +246,7 @@ def outlines(
         apart = max(APART * reach, min(0.5 * min(step), reach / 6))
         ends[0], ends[1] = max(t - apart, 0.0), t + apart
         share, square = _mixed(field, first, unit, ends, at, near, slopes, levels, slope)
-        _along(first, unit, t, place)
+        step_along(first, unit, t, place)
         z = depth[n] + t / length
         k = _towards(z, origins[n], directions[n], other_origins[n], other_directions[n], slope)
         found = 0
@@ -310,31 +260,7 @@ def outlines(
                 slope[i] /= square
             for k in range(2):
                 part = 2 - 2 * share if k else 2 * share
-                _along(first, unit, ends[k], at)
+                step_along(first, unit, ends[k], at)
                 place[:] = at
                 _write(field, at, near, slopes[k], place, slope, part, points[n, k], params[n, k])
         there[n] = found > 0
-
-
-@compiled
-def _tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, params):
-    """Fill the four lattice points that interpolate at a point, their weights, the point, and its level.
-
-    Changes `near`, the point's places in its cell.
-    """
-    number, last, left, level = base, 0, 1.0, 0.0
-    for k in range(6):
-        points[k], params[3 + k] = number, 0
-        if k > 3:
-            continue
-        # The next corner lies along the axis with the largest place of those that remain.
-        axis = 0 if near[0] >= near[1] and near[0] >= near[2] else 1 if near[1] >= near[2] else 2
-        own = near[axis] if k < 3 else 0.0
-        params[3 + k] = left - own
-        level += (left - own) * (corner(values, band, base, cell, last, shape) - isovalue)
-        if k < 3:
-            number += shape[1] * shape[2] if axis == 0 else shape[2] if axis == 1 else 1
-            last, left, near[axis] = last | 1 << axis, own, -1.0
-    for i in range(3):
-        params[9 + i] = at[i]
-    params[15] = level
