@@ -41,7 +41,7 @@ def ball(q, p):
 
 
 def shell(q, p):
-    """Of a ball, hollow: its wall is four cells of the lattice thick."""
+    """A hollow ball, whose wall is four cells of the lattice thick."""
     return rts.namespace(p).abs(length(p) - q[0]) - WALL
 
 

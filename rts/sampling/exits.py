@@ -111,7 +111,8 @@ def with_pairs(
     cells, ends = outline_ends(samples.row >= 0, samples.depth, listed, size)
     fronts = samples.row[0].reshape(-1)[cells]
     own = Rays(rays.origins[fronts], rays.directions[fronts], rays.spread)
-    beside = Rays(*(_beside(x, step, ends) for x, step in zip(own[:2], steps[:2], strict=True)), rays.spread)
+    changed = [_beside(x, step, ends) for x, step in zip(own[:2], steps[:2], strict=True)]
+    beside = Rays(changed[0], changed[1], rays.spread)
     depth = samples.depth[0].reshape(-1)[cells]
     result = surface.refine_outlines(inputs, own, beside, depth, samples.tables) if len(cells) else None
     if result is None or any(len(x) > specs[name].shape[0] for name, x in result[3].items()):

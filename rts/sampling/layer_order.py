@@ -134,7 +134,8 @@ def steps_of(camera: Camera, size: tuple[int, int]) -> Rays:
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
     ends, rows = (np.empty((3, 3)), np.empty((3, 3))), np.arange(3, dtype=np.int32)[None]
     layer_order_loops.rays_of_cells(rows, np.array([0, 0, 1]), np.array([0, 1, 0]), size, *matrices, *ends)
-    return Rays(*(x[1:] - x[0] for x in ends), camera.spread(size))
+    origins, directions = (x[1:] - x[0] for x in ends)
+    return Rays(origins, directions, camera.spread(size))
 
 
 def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
