@@ -21,6 +21,8 @@ PIXEL = HEIGHT / SIZE[0]
 BOUNDS, SHAPE = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), (121, 121, 121)
 SHIFT = 0.013
 """Keeps outlines off the symmetry of the pixels."""
+WALL = 0.05
+"""Half the thickness of a wall."""
 
 
 # -------------------------------------------------------------------------------------------------------- fields
@@ -36,6 +38,11 @@ def stack(*columns):
 
 def ball(q, p):
     return length(p) - q[0]
+
+
+def shell(q, p):
+    """A hollow ball, whose wall is four cells of the lattice thick."""
+    return rts.namespace(p).abs(length(p) - q[0]) - WALL
 
 
 def torus(q, p):
@@ -67,6 +74,7 @@ def shadow(q):
 ALONG, ACROSS = (0, 4, 0), (0, 0, 4)
 SHAPES = {
     "ball": (ball, (0.9,), ACROSS, lambda q: [2 * math.pi * q[0]]),
+    "shell": (shell, (0.9,), ACROSS, lambda q: [2 * math.pi * (q[0] + WALL)]),
     "torus along its axis": (torus, (0.9, 0.3), ALONG, lambda q: [4 * math.pi * q[1], 4 * math.pi * q[0]]),
     "torus across": (torus, (0.9, 0.3), ACROSS, lambda q: [4 * q[1], 4 * q[0] + 2 * math.pi * q[1]]),
     "cylinder across": (cylinder, (0.7, 0.6), ACROSS, lambda q: [4 * q[1], 4 * q[0]]),
@@ -108,8 +116,8 @@ def test_areas_of_outlines_grow_as_closed_forms_say(name, way):
     f, q, eye, expected = SHAPES[name]
     image, shift = coverage(f, eye, way), torch.tensor([SHIFT, SHIFT, SHIFT])
     found = torch.func.jacrev(lambda q: image(q, shift).sum() * PIXEL**2)(torch.tensor(q)).numpy()
-    # On a lattice the cylinder's sharp edges spread over a cell.
-    rounding = 0.06 if f is cylinder and way in ("lattice", "edge", "band") else 0.02
+    # On a lattice sharp edges, and the middle of a wall, spread over a cell.
+    rounding = 0.06 if f in (cylinder, shell) and way in ("lattice", "edge", "band") else 0.02
     np.testing.assert_allclose(found, expected(q), rtol=rounding, atol=rounding * max(map(abs, expected(q))))
 
 
@@ -247,13 +255,18 @@ def pairs(name, size, **options):
 @pytest.mark.parametrize("table", quick([True, False]))
 @pytest.mark.parametrize("name", quick(["box, turned", "ball", "torus across"]))
 def test_a_band_has_pairs_of_the_lattice(name, table):
-    """All where pixels are narrower than cells. Where they are wider, rays that leave the band have none."""
-    for width, least, most in ((160, 1, 1), (20, 0.05, 0.7)):
+    """Nearly all where pixels are narrower than cells. Where they are wider, rays that leave the band have none.
+
+    Where the ray of a neighbour leaves the band, a pair stands on one ray, and tells nearly the same motion.
+    """
+    for width, least, most in ((160, 0.95, 1), (20, 0.05, 0.7)):
         there, params, points = pairs(name, (width, width))
         own, own_params, own_points = pairs(name, (width, width), band=NarrowBand(), table=table)
         assert least * there.sum() <= own.sum() <= most * there.sum() and there[own].all()
-        np.testing.assert_allclose(own_params, params[own[there]], atol=2e-3)
-        np.testing.assert_array_equal(own_points, points[own[there]])
+        params, same = params[own[there]], (own_points == points[own[there]]).all(axis=(1, 2))
+        np.testing.assert_allclose(own_params[same], params[same], atol=2e-3)
+        off = np.abs(own_params[:, :, 3:].mean(axis=1) - params[:, :, 3:].mean(axis=1)).max(axis=1)
+        assert off.max() < 0.2 and np.quantile(off, 0.9) < 0.02
 
 
 def test_listed_cells_have_the_pairs_of_the_whole_grid():

@@ -210,15 +210,16 @@ class TriangleSurface(Surface):
         return samples
 
     def refine_outlines(
-        self, inputs: Tree, rays: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
+        self, inputs: Tree, rays: Rays, beside: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
-        """Pairs of samples beside the deepest points of rays, on the host; see `RaySurface.deepest`.
+        """Pairs of samples that tell how outlines move, on the host; see `RaySurface.deepest`.
 
         Called for cells at outlines of surfaces with a `refine` that does not move samples.
 
         Args:
             inputs: the result of `proxy_inputs`, on the host.
             rays: the rays (R, 3), local space.
+            beside: the rays (R, 8, 3) of the eight cells around each, NaN for those towards which its front goes on.
             depth: (R,), the depth of each ray's front.
             tables: the tables that `refine` filled. None may be `by_sample`.
 

@@ -13,6 +13,9 @@ from rts.contracts.records import ArraySpec, Fragments, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.scene.rays import Rays
 
+NEIGHBOURS = [(u, v) for v in (-1, 0, 1) for u in (-1, 0, 1) if (u, v) != (0, 0)]
+"""Steps (x, y) from a cell to those around it, line by line."""
+
 
 class Exits(NamedTuple):
     """The exits of rays through some cells.
@@ -48,6 +51,16 @@ def outline_cells(
         cells: (L, C), the listed cells, as flat indices in the grid, −1 for none; None for all. Others count as empty.
         size: (height, width) of the grid, for listed cells.
     """
+    return outline_ends(covered, depth, cells, size)[0]
+
+
+def outline_ends(
+    covered: np.ndarray, depth: np.ndarray, cells: np.ndarray | None, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The cells (M,) of `outline_cells`, and bits (M,) uint8 of the neighbours of each towards which its front ends.
+
+    Bit i stands for the i-th of `NEIGHBOURS`.
+    """
     from rts.sampling import exits_loops
 
     if cells is not None:
@@ -55,13 +68,15 @@ def outline_cells(
         own = cells.reshape(-1)[listed]
         whole, deep = (np.zeros((layers, size[0] * size[1]), x.dtype) for x in (covered, depth))
         whole[:, own], deep[:, own] = (x.reshape(layers, -1)[:, listed] for x in (covered, depth))
-        marks = np.zeros(size[0] * size[1], np.bool_)
-        marks[outline_cells(whole.reshape(layers, *size), deep.reshape(layers, *size))] = True
-        return listed[marks[own]].astype(np.int32)
+        bits = np.zeros(size[0] * size[1], np.uint8)
+        marked, ends = outline_ends(whole.reshape(layers, *size), deep.reshape(layers, *size), None, size)
+        bits[marked] = ends
+        there = bits[own] > 0
+        return listed[there].astype(np.int32), bits[own][there]
     near = beside_outlines(covered)[0]
-    ends = np.empty(len(near), np.bool_)
-    parallel(exits_loops.mark_ends, len(near), near, read_only(covered), read_only(depth), ends, work=40 * len(near))
-    return near[ends]
+    ends = np.empty(len(near), np.uint8)
+    parallel(exits_loops.mark_ends, len(near), near, read_only(covered), read_only(depth), ends, work=80 * len(near))
+    return near[ends > 0], ends[ends > 0]
 
 
 def with_pairs(
@@ -69,6 +84,7 @@ def with_pairs(
     surface: TriangleSurface,
     inputs: Tree,
     rays: Rays,
+    steps: Rays,
     listed: np.ndarray | None,
     size: tuple[int, int],
     specs: Mapping[str, ArraySpec],
@@ -82,6 +98,7 @@ def with_pairs(
         surface: the surface.
         inputs: the result of its `proxy_inputs`, on the host.
         rays: the rays of the samples' rows.
+        steps: (2, 3), changes of rays from a cell to the next one, along x and along y; see `layer_order.steps_of`.
         listed: (L, C), the cells of the samples; None for all. See `outline_cells`.
         size: (height, width) of the grid.
         specs: the result of the surface's `table_specs`.
@@ -91,11 +108,13 @@ def with_pairs(
         params if no cell is at an outline, the surface has no pairs, or its tables exceed their specs.
     """
     exits = np.full((2, *samples.row.shape[1:]), -1, np.int32)
-    cells = outline_cells(samples.row >= 0, samples.depth, listed, size)
+    cells, ends = outline_ends(samples.row >= 0, samples.depth, listed, size)
     fronts = samples.row[0].reshape(-1)[cells]
     own = Rays(rays.origins[fronts], rays.directions[fronts], rays.spread)
+    changed = [_beside(x, step, ends) for x, step in zip(own[:2], steps[:2], strict=True)]
+    beside = Rays(changed[0], changed[1], rays.spread)
     depth = samples.depth[0].reshape(-1)[cells]
-    result = surface.refine_outlines(inputs, own, depth, samples.tables) if len(cells) else None
+    result = surface.refine_outlines(inputs, own, beside, depth, samples.tables) if len(cells) else None
     if result is None or any(len(x) > specs[name].shape[0] for name, x in result[3].items()):
         return samples.replace(exit=exits), None
     ids, params, there, tables = result
@@ -103,6 +122,12 @@ def with_pairs(
     exits.reshape(2, -1)[:, cells[there]] = np.arange(count, dtype=np.int32).reshape(-1, 2).T
     ids, params = (x[there].reshape(count, x.shape[2]) for x in (ids, params))
     return samples.replace(exit=exits, tables=tables), (ids, params)
+
+
+def _beside(own: np.ndarray, step: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Vectors (M, 8, 3) of the neighbours towards which fronts end, NaN for others, from those of the cells (M, 3)."""
+    changes = np.where((ends[:, None] >> np.arange(8) & 1)[..., None], np.array(NEIGHBOURS) @ step, np.nan)
+    return own[:, None] + changes
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:

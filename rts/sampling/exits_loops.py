@@ -41,32 +41,34 @@ def find(kept, cells):
 
 @loop
 def mark_ends(start, stop, cells, covered, depth, ends):
-    """Fill `ends` (M,) for cells [start, stop) of a list: True where the front ends towards one of eight neighbours.
+    """Fill `ends` (M,) for cells [start, stop) of a list: bits of the neighbours towards which the front ends.
 
-    Neighbours outside of the grid do not count. `cells` (M,) are flat indices of covered cells. For `covered` and
-    `depth` (K, H, W) see `exits.outline_cells`.
+    Bit i stands for the i-th of the eight cells around, line by line. Neighbours outside of the grid do not count.
+    `cells` (M,) are flat indices of covered cells. For `covered` and `depth` (K, H, W) see `exits.outline_cells`.
     """
     layers, height, width = covered.shape
     for i in range(start, stop):
-        ends[i] = _ends(covered, depth, cells[i] // width, cells[i] % width, layers, height, width)
+        y, x = cells[i] // width, cells[i] % width
+        bits = 0
+        for n in range(9):
+            v, u = y + n // 3 - 1, x + n % 3 - 1
+            if n != 4 and 0 <= v < height and 0 <= u < width and _ends(covered, depth, y, x, v, u, layers):
+                bits |= 1 << (n - (n > 4))
+        ends[i] = bits
 
 
 @compiled
-def _ends(covered, depth, y, x, layers, height, width):
-    """True if the front of a covered cell ends towards one of the eight cells around it."""
+def _ends(covered, depth, y, x, v, u, layers):
+    """True if the front of a covered cell (y, x) ends towards its neighbour (v, u)."""
+    if not covered[0, v, u]:
+        return True
     z = depth[0, y, x]
-    for n in range(9):
-        v, u = y + n // 3 - 1, x + n % 3 - 1
-        if n == 4 or not (0 <= v < height and 0 <= u < width):
-            continue
-        if not covered[0, v, u]:
+    gap = abs(depth[0, v, u] - z)
+    for k in range(1, layers):
+        if covered[k, v, u] and abs(depth[k, v, u] - z) < gap:
             return True
-        gap = abs(depth[0, v, u] - z)
-        for k in range(1, layers):
-            if covered[k, v, u] and abs(depth[k, v, u] - z) < gap:
-                return True
-            if covered[k, y, x] and abs(depth[k, y, x] - depth[0, v, u]) < gap:
-                return True
+        if covered[k, y, x] and abs(depth[k, y, x] - depth[0, v, u]) < gap:
+            return True
     return False
 
 

@@ -127,6 +127,17 @@ def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.n
     return Rays(*ends, camera.spread((height, width)))
 
 
+def steps_of(camera: Camera, size: tuple[int, int]) -> Rays:
+    """Changes (2, 3) of rays from a cell to the next one, along x and along y: all over a grid of cells the same."""
+    from rts.sampling import layer_order_loops
+
+    matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
+    ends, rows = (np.empty((3, 3)), np.empty((3, 3))), np.arange(3, dtype=np.int32)[None]
+    layer_order_loops.rays_of_cells(rows, np.array([0, 0, 1]), np.array([0, 1, 0]), size, *matrices, *ends)
+    origins, directions = (x[1:] - x[0] for x in ends)
+    return Rays(origins, directions, camera.spread(size))
+
+
 def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     """The samples with the layers of each cell in order, equal roots merged and gaps closed; packed rows stay.
 

@@ -22,7 +22,7 @@ from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines, with_pairs
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
-from rts.sampling.layer_order import on_surface, refined
+from rts.sampling.layer_order import on_surface, refined, steps_of
 from rts.sampling.packing import lift, repack
 from rts.sampling.sample_checks import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.scene.camera import Camera
@@ -374,8 +374,8 @@ class _Search:
         )
         further = None
         if pairs:
-            given = self.cells, self.shape.view, self.tables
-            samples, further = with_pairs(samples, self.surface, self.inputs, rays, *given)
+            given = rays, steps_of(self.camera, self.shape.view), self.cells, self.shape.view, self.tables
+            samples, further = with_pairs(samples, self.surface, self.inputs, *given)
         repacked = repack(samples, samples.row >= 0, self.shape.capacity, further)
         return repacked.replace(facing=facing, between=between)
 

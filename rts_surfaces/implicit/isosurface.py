@@ -258,10 +258,15 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def refine_outlines(
-        self, inputs: Mapping[str, np.ndarray], rays: Rays, depth: np.ndarray, tables: Mapping[str, np.ndarray]
+        self,
+        inputs: Mapping[str, np.ndarray],
+        rays: Rays,
+        beside: Rays,
+        depth: np.ndarray,
+        tables: Mapping[str, np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
         """See `rts.TriangleSurface`; in a band none where the search leaves its cells and those one further inside."""
-        from rts_surfaces.implicit import lattice_samples_loops
+        from rts_surfaces.implicit import lattice_outlines_loops
 
         lattice, count = self.field.lattice(inputs), len(depth)
         isovalue, sign = self.field.level_of_values
@@ -272,8 +277,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             corners = np.concatenate([inputs["corners"], inputs["inner"]])
             band = corners, *rows_by_place(inputs["numbers"][corners[:, 0]], lattice.shape)
         given = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
-        given = *given, *rays[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
-        parallel(lattice_samples_loops.deepest, count, *given, *results, work=2000 * count)
+        given = *given, *rays[:2], *beside[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
+        parallel(lattice_outlines_loops.outlines, count, *given, *results, work=4000 * count)
         points, params, there = results
         ids, tables = self.field.in_tables(points, tables)
         return ids, params, there, tables
