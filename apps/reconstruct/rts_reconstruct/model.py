@@ -28,7 +28,7 @@ class Atlas(NamedTuple):
 class Model(NamedTuple):
     """A mesh (V, 3), (T, 3) with colours (V, 3) or an atlas; poses (B, 6) of the world before each camera.
 
-    Vertices are in the world of `Pictures`, colours sRGB-encoded.
+    Vertices are in the world of `Pictures`, colours sRGB-encoded, poses in the order of `Pictures.numbers`.
     """
 
     vertices: np.ndarray

@@ -10,11 +10,12 @@ import numpy as np
 
 import rts
 from rts.diagnostics.command_tools import output_folder, writing
-from rts_reconstruct import files, job, measures, pictures, stages, texturing
+from rts_reconstruct import files, job, measures, pictures, posing, stages, texturing
 from rts_reconstruct.model import Model
 from rts_reconstruct.report import write_report
 from rts_reconstruct.saved import Saved
 from rts_reconstruct.starts import start as starting_mesh
+from rts_reconstruct.untangling import untangled
 
 STEPS, SIZE, TEXTURE = 1300, 256, 1024
 QUICK = {"steps": 240, "size": 128, "texture": 512, "faces": 0.25}
@@ -72,6 +73,7 @@ class Reconstruction(NamedTuple):
 
     def __repr__(self) -> str:
         kind = "held-out views" if self.pictures.held_out else "fitted views"
+        kind += ", their cameras fitted" if any(m.held_out and m.camera == "fitted" for m in self.measures) else ""
         faces = f"{len(self.model.faces)} faces"
         return f"PSNR {self.psnr:.1f} dB ({kind}), {faces}, {self.seconds:.0f} s"
 
@@ -96,7 +98,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Fit a mesh with colours to photographs with cameras, and write it.
 
-    Three stages fit vertices and their colours, each on a finer mesh; a last one fits a texture. Colours have the light
+    Three stages fit vertices and their colours, each on a finer mesh, which is moved apart where it passes through
+    itself; a last one fits a texture. Colours have the light
     of the pictures in them. The mesh is written after each stage, so that an interruption leaves the last one.
 
     Where pictures have alpha, it tells where the object is. Where they have masks alone, these do. Pictures that have
@@ -113,7 +116,8 @@ def reconstruct(
         batch: the number of pictures in a step.
         texture: texels a side, by default 1024; 0 for vertex colours.
         held_out: every so many views, one is held out and only measured; 0 for none.
-        fit_cameras: True to fit the poses of cameras, too.
+        fit_cameras: True to fit the poses of cameras, too, and write them; those of views held out are fitted to the
+            finished mesh, since fitted cameras and mesh may have moved together.
         background: (3,) encoded colour of pictures without alpha and masks; None for that of their borders.
         quick: True for a first look: smaller defaults, and a quarter of the faces.
         seed: of the order of pictures.
@@ -142,7 +146,7 @@ def reconstruct(
     shots = pictures.read(views, size, held_out, background)
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
-    poses = np.zeros((len(shots.views), 6), np.float32)
+    poses = np.zeros((len(shots.numbers), 6), np.float32)
     model = Model(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), grey, poses)
     settings = stages.Settings(batch, seed, fit_cameras, progress)
     plan = [(s._replace(faces=int(defaults["faces"] * s.faces)), max(1, round(s.share * steps))) for s in stages.STAGES]
@@ -214,7 +218,8 @@ class _Run:
         if number < len(self.losses) or self.stopped:
             return
         model = stages.remeshed(self.model, stage.faces)
-        self._keep(*stages.fitted(model, self.pictures, stage, steps, self.settings, *self._reporting(number)))
+        fit, losses = stages.fitted(model, self.pictures, stage, steps, self.settings, *self._reporting(number))
+        self._keep(fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces))), losses)
 
     def texture(self, number: int, size: int, steps: int) -> None:
         """The stage of the texture, unless an earlier run made it; one that was stopped is baked alone."""
@@ -252,6 +257,8 @@ class _Run:
 
     def finish(self) -> Reconstruction:
         """Measure all views, and write the rest."""
+        if self.settings.cameras and self.pictures.held_out:
+            self.model = posing.posed(self.model, self.pictures, self.settings)
         rows = measures.measured(self.model, self.pictures)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None
@@ -260,6 +267,8 @@ class _Run:
             return found
         with writing(self.folder):
             self.files = files.write_mesh(self.folder, self.model, self.pictures)
+            if self.settings.cameras:
+                self.files += files.write_cameras(self.folder, self.model, self.pictures)
             table, turning, report = (self.folder / name for name in ("views.csv", "turntable.gif", "report.html"))
             files.write_table(table, rows)
             files.write_turntable(turning, self.model, self.pictures)
