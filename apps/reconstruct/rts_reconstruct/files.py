@@ -65,7 +65,8 @@ def _write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[str]:
 def _lit_already(tree: dict[str, Any]) -> None:
     """Say in a glTF document that its colours have the light in them (KHR_materials_unlit)."""
     if not tree.get("materials"):
-        tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
+        plain: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+        tree["materials"] = [plain]
         for mesh in tree["meshes"]:
             for primitive in mesh["primitives"]:
                 primitive["material"] = 0

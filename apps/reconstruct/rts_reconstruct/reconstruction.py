@@ -83,6 +83,7 @@ def reconstruct(
     out: Any,
     *,
     start: Any = "ball",
+    surface: str = "mesh",
     steps: int | None = None,
     size: int | None = None,
     batch: int = 4,
@@ -111,6 +112,8 @@ def reconstruct(
         views: file or folder, as `rts.load_views` takes it; or a list of views with sRGB-encoded images.
         out: the folder to write into.
         start: "ball"; "hull", the visual hull of alpha or masks; or the path of a mesh in the world of the cameras.
+        surface: "mesh"; or "subdivision", for stages that fit the cage of a Loop subdivision surface, which is smooth
+            between its fewer control points. The files hold a fine mesh of it.
         steps: the steps of all stages of the shape, by default 1300; the texture takes a fifth as many on top.
         size: pixels; longer sides of pictures are made at most so long, by default 256.
         batch: the number of pictures in a step.
@@ -139,6 +142,10 @@ def reconstruct(
     _check(
         steps=(steps, 3), size=(size, 8), batch=(batch, 1), texture=(texture, 0), held_out=(held_out, 0), seed=(seed, 0)
     )
+    if surface not in ("mesh", "subdivision"):
+        raise rts.InputError(f"surface is {surface!r:.60}; expected 'mesh' or 'subdivision'")
+    if surface == "subdivision":
+        rts.plugin("surfaces", "subdivision")  # Refused now where OpenSubdiv is missing.
     if 0 < texture < 16:
         raise rts.InputError(f"texture is {texture}; expected at least 16 texels a side, or 0 for vertex colours")
     folder = output_folder(out)
@@ -148,12 +155,13 @@ def reconstruct(
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
     poses = np.zeros((len(shots.numbers), 6), np.float32)
     model = Model(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), grey, poses)
-    settings = stages.Settings(batch, seed, fit_cameras, progress)
+    settings = stages.Settings(batch, seed, fit_cameras, surface == "subdivision", progress)
     plan = [(s._replace(faces=int(defaults["faces"] * s.faces)), max(1, round(s.share * steps))) for s in stages.STAGES]
     with writing(folder):
         (folder / "checkpoint").mkdir(parents=True, exist_ok=True)
     identity = {"steps": steps, "size": size, "batch": batch, "seed": seed, "start": str(start), "views": shots.numbers}
-    saved = Saved(folder / "checkpoint", identity | {"texture": texture, "cameras": fit_cameras, "quick": quick})
+    identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
+    saved = Saved(folder / "checkpoint", identity)
     run = _Run(shots, settings, saved, watch if first else None, model, folder, first)
     run.begin(resume)
     try:
@@ -217,8 +225,7 @@ class _Run:
         """A stage of shape and colours, unless an earlier run made it."""
         if number < len(self.losses) or self.stopped:
             return
-        model = stages.remeshed(self.model, stage.faces)
-        fit, losses = stages.fitted(model, self.pictures, stage, steps, self.settings, *self._reporting(number))
+        fit, losses = stages.fitted(self.model, self.pictures, stage, steps, self.settings, *self._reporting(number))
         self._keep(fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces))), losses)
 
     def texture(self, number: int, size: int, steps: int) -> None:

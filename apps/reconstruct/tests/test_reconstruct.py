@@ -126,6 +126,17 @@ def test_a_plain_background_is_enough(tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_subdivision_surface_is_fitted_in_place_of_a_mesh(tmp_path):
+    options = TINY | {"steps": 90, "texture": 0, "surface": "subdivision"}
+    found = rts_reconstruct.reconstruct(views(), tmp_path, **options)
+    mesh = trimesh.Trimesh(found.pictures.world.outside(found.model.vertices), found.model.faces)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi * RADII.prod(), rel=0.1)
+    assert found.psnr > 25
+    # Smooth: neighbours of faces lean by little, as on a fine mesh of an ellipsoid.
+    assert np.percentile(mesh.face_adjacency_angles, 99) < 0.5
+
+
+@pytest.mark.thorough
 def test_cameras_that_are_off_are_fitted(tmp_path):
     rng = np.random.default_rng(0)
     off = []
@@ -183,9 +194,23 @@ def test_bad_input_is_one_line(folder, tmp_path):
     out = ["-o", tmp_path / "out"]
     assert "expected a whole number, at least 3" in told(folder, *out, "--steps", 0)
     assert "expected three numbers, such as 1,1,1" in told(folder, *out, "--background", "red")
+    assert "expected 'mesh' or 'subdivision'" in told(folder, *out, "--surface", "isosurface")
     assert "no file none.obj" in told(folder, *out, "--start", "none.obj")
     assert "at least 16 texels" in told(folder, *out, "--texture", 3)
     assert "left to fit; expected at least two" in told(folder, *out, "--held-out", 1)
+    assert "has none of" in told(tmp_path, *out)  # No cameras.
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        pytest.importorskip("viser")
+        assert f"port {port} of 127.0.0.1 is in use" in told(folder, *out, "--watch", "--port", port)
+    noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    (tmp_path / "busy").mkdir()
+    for i in range(len(images())):
+        rts.save_image(tmp_path / f"busy/{i}.png", noise)
+    rts.save_views(tmp_path / "busy/transforms.json", views())
+    assert "neither alpha nor masks" in told(tmp_path / "busy", *out)
     damaged(folder, lambda tree: tree.update(frames=tree["frames"][:1]))
     assert "1 view in" in told(folder, *out)
     assert not (tmp_path / "out").exists()
