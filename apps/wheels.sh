@@ -9,7 +9,10 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
 "${PYTHON:-python3}" -m venv venv
-PYTHONWARNINGS=ignore venv/bin/python -m pip install --quiet -c "$constraints" --find-links "$dist" "rts-reconstruct[viewer]"
+export PYTHONWARNINGS=ignore
+venv/bin/python -m pip install --quiet --upgrade pip
+venv/bin/python -m pip install --quiet -c "$constraints" --find-links "$dist" rts-reconstruct rts-viewer
+unset PYTHONWARNINGS
 venv/bin/python - <<'PYTHON'
 import numpy as np
 import trimesh
