@@ -9,6 +9,7 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
 "${PYTHON:-python3}" -m venv venv
+unset PYTHONPATH
 export PYTHONWARNINGS=ignore
 venv/bin/python -m pip install --quiet --upgrade pip
 venv/bin/python -m pip install --quiet -c "$constraints" --find-links "$dist" rts-reconstruct rts-viewer
