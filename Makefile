@@ -54,14 +54,17 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(VENV)/.test $(VENV)/.dev
+types: $(VENV)/.apps $(VENV)/.dev
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
 
-# Build both distributions; then, elsewhere and from the wheel alone, the demo and the tests of the example plugin.
+# Build both distributions, and the applications; then, elsewhere and from wheels alone, the demo, the tests of the
+# example plugin, and a folder of COLMAP made a mesh.
 wheel: $(VENV)/.dev
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
+	for app in $(APPS); do $(BIN)/python -m build --wheel --outdir dist $$app || exit 1; done
 	PYTHON=$(PYTHON) tests/wheel.sh dist $(EXAMPLE) constraints.txt
+	PYTHON=$(PYTHON) apps/wheels.sh dist constraints.txt
 
 # The oldest versions that pyproject.toml allows, and the tests that would notice.
 oldest: system $(OLDEST)/.installed

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,29 +21,69 @@ from rts_reconstruct.model import Model
 from rts_reconstruct.pictures import Pictures
 
 FRAMES, FPS, TURNTABLE = 36, 12, 256
+TEXTURE_FILES = ("mesh.mtl", "texture.png")
 
 
 def write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
-    """Write `mesh.obj`, with `mesh.mtl` and `texture.png` if there is one, and `mesh.glb`, in the data set's world."""
+    """Write `mesh.obj`, with `mesh.mtl` and `texture.png` if there is one, and `mesh.glb`, in the data set's world.
+
+    Earlier files of these names stay until all new ones are whole, so that a full disk leaves the last mesh.
+    """
+    with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as beside:
+        names = _write_mesh(Path(beside), model, pictures)
+        for name in names:
+            os.replace(Path(beside) / name, folder / name)
+    for name in TEXTURE_FILES:
+        if name not in names:  # Of an earlier run, whose mesh had a texture.
+            (folder / name).unlink(missing_ok=True)
+    return [folder / name for name in names]
+
+
+def _write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[str]:
+    """Write the files into an empty folder. Returns their names."""
     vertices = pictures.world.outside(model.vertices)
-    files = [folder / "mesh.obj", folder / "mesh.glb"]
     colors = np.clip(model.colors, 0, 1)
     if model.atlas is None:
-        files[0].write_text(_obj(vertices, model, colors), encoding="utf-8")
+        (folder / "mesh.obj").write_text(_obj(vertices, model, colors), encoding="utf-8")
         linear = _bytes(decoded(colors))  # glTF's colours are linear, OBJ's are as pictures have them.
         mesh = trimesh.Trimesh(vertices, model.faces, vertex_colors=linear, process=False)
-        mesh.export(files[1])
-        return files
+        mesh.export(folder / "mesh.glb", tree_postprocessor=_lit_already)
+        return ["mesh.obj", "mesh.glb"]
     picture = Image.fromarray(_bytes(model.atlas.texture))
     picture.save(folder / "texture.png")
     (folder / "mesh.mtl").write_text("newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd texture.png\n")
-    files[0].write_text(_obj(vertices, model, None), encoding="utf-8")
+    (folder / "mesh.obj").write_text(_obj(vertices, model, None), encoding="utf-8")
     # glTF has one row a vertex for both positions and map.
     rows, corners = _rows(model)
     material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
     visual = TextureVisuals(uv=model.atlas.uv[rows[:, 1]], material=material)
-    trimesh.Trimesh(vertices[rows[:, 0]], corners, visual=visual, process=False).export(files[1])
-    return [*files, folder / "mesh.mtl", folder / "texture.png"]
+    mesh = trimesh.Trimesh(vertices[rows[:, 0]], corners, visual=visual, process=False)
+    mesh.export(folder / "mesh.glb", tree_postprocessor=_lit_already)
+    return ["mesh.obj", "mesh.glb", *TEXTURE_FILES]
+
+
+def _lit_already(tree: dict[str, Any]) -> None:
+    """Say in a glTF document that its colours have the light in them (KHR_materials_unlit)."""
+    if not tree.get("materials"):
+        plain: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+        tree["materials"] = [plain]
+        for mesh in tree["meshes"]:
+            for primitive in mesh["primitives"]:
+                primitive["material"] = 0
+    for material in tree["materials"]:
+        material.setdefault("extensions", {})["KHR_materials_unlit"] = {}
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
+
+
+def write_cameras(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
+    """Write fitted cameras, in the data set's world, as a model of COLMAP: `cameras/cameras.txt` and others."""
+    moved = []
+    for number, view, pose in zip(pictures.numbers, pictures.given, model.poses, strict=True):
+        camera = view.camera.within(pictures.world.motion(np.asarray(rts.rigid(pose.astype(np.float64)))))
+        name = view.name or f"{number}.png"
+        moved.append(rts.View(camera, lambda: np.zeros(0), view.size, name=name, path=view.path, lens=view.lens))
+    rts.save_views(folder / "cameras", moved)
+    return sorted((folder / "cameras").glob("*.txt"))
 
 
 def _rows(model: Model) -> tuple[np.ndarray, np.ndarray]:
@@ -87,10 +130,11 @@ def write_table(path: Path, rows: Sequence[Measured]) -> None:
     """Write the measures of views as CSV, in the order of the data set."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["view", "name", "held_out", "psnr_db", "ssim", "iou"])
+        writer.writerow(["view", "name", "held_out", "psnr_db", "ssim", "iou", "camera"])
         for row in sorted(rows, key=lambda row: row.number):
             iou = "" if row.iou is None else f"{row.iou:.4f}"
-            writer.writerow([row.number, row.name, int(row.held_out), f"{row.psnr:.2f}", f"{row.ssim:.4f}", iou])
+            shares = f"{row.psnr:.2f}", f"{row.ssim:.4f}", iou
+            writer.writerow([row.number, row.name, int(row.held_out), *shares, row.camera])
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ class Measured(NamedTuple):
         psnr: dB, of encoded colours.
         ssim: structural similarity (Wang et al. 2004), the mean over pixels of grey values.
         iou: the overlap of outlines, intersection over union; None where pictures do not tell the object.
+        camera: "given", or "fitted" if its pose was fitted to the picture.
     """
 
     number: int
@@ -36,15 +37,14 @@ class Measured(NamedTuple):
     psnr: float
     ssim: float
     iou: float | None
+    camera: str = "given"
 
 
 def shown(model: Model, pictures: Pictures, place: int) -> np.ndarray:
     """A render (H, W, 4) of a model as a view has it; `place` counts the views to fit, then those held out."""
     view = (pictures.views + pictures.held_out)[place]
-    camera = view.camera
-    if place < len(pictures.views):
-        moved = moved_camera({"poses": torch.tensor(model.poses)}, camera, place)
-        camera = moved.map(lambda matrix: np.asarray(matrix))
+    moved = moved_camera({"poses": torch.tensor(model.poses)}, view.camera, place)
+    camera = moved.map(lambda matrix: np.asarray(matrix))
     background = None if pictures.outlined else pictures.background
     return np.clip(np.asarray(rts.render(model.part, camera, view.size, supersample=2, background=background)), 0, 1)
 
@@ -63,11 +63,12 @@ def measured(model: Model, pictures: Pictures) -> list[Measured]:
         error = float((weights[..., None] * (pair[0] - pair[1]) ** 2).sum() / (3 * max(weights.sum(), 1)))
         iou = None
         if pictures.outlined:
-            a, b = image[..., 3] > 0.5, render[..., 3] > 0.5
+            a, b = (weights > 0.5) & (image[..., 3] > 0.5), (weights > 0.5) & (render[..., 3] > 0.5)
             iou = float((a & b).sum() / max((a | b).sum(), 1))
         psnr = -10 * float(np.log10(max(error, SMALL)))
         held_out = place >= len(pictures.views)
-        rows.append(Measured(pictures.numbers[place], str(where(view)), held_out, psnr, ssim(*pair), iou))
+        camera = "fitted" if model.poses[place].any() else "given"
+        rows.append(Measured(pictures.numbers[place], str(where(view)), held_out, psnr, ssim(*pair), iou, camera))
     return rows
 
 

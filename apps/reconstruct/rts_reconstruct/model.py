@@ -5,8 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 import rts
+
+NEAREST = 3
+"""The old vertices from which a new one has its colour."""
 
 
 class Atlas(NamedTuple):
@@ -28,7 +32,7 @@ class Atlas(NamedTuple):
 class Model(NamedTuple):
     """A mesh (V, 3), (T, 3) with colours (V, 3) or an atlas; poses (B, 6) of the world before each camera.
 
-    Vertices are in the world of `Pictures`, colours sRGB-encoded.
+    Vertices are in the world of `Pictures`, colours sRGB-encoded, poses in the order of `Pictures.numbers`.
     """
 
     vertices: np.ndarray
@@ -43,6 +47,16 @@ class Model(NamedTuple):
         if self.atlas is None:
             return colored(rts.Mesh(self.faces), self.vertices, self.colors)
         return textured(surface_of(self), self.vertices, self.atlas.uv, self.atlas.texture)
+
+
+def carried(model: Model, vertices: np.ndarray, faces: np.ndarray) -> Model:
+    """The model on another mesh (V, 3), (T, 3) of its surface, with colours of the nearest vertices."""
+    away, near = KDTree(model.vertices).query(vertices, k=NEAREST)
+    weights = 1 / (away + 1e-6)
+    colors = np.einsum("vk,vkc->vc", weights / weights.sum(axis=1, keepdims=True), model.colors[near])
+    return model._replace(
+        vertices=vertices.astype(np.float32), faces=faces.astype(np.int32), colors=colors.astype(np.float32)
+    )
 
 
 def colored(surface: Any, vertices: Any, colors: Any) -> rts.Part:

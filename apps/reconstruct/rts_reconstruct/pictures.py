@@ -14,6 +14,8 @@ import numpy as np
 import rts
 from rts_reconstruct.world import World, around
 
+Part = Callable[[rts.View], np.ndarray]
+"""A view's image or mask, made from another view."""
 LOOKED_AT = 12
 """The most views whose pixels say what kind of pictures these are."""
 OUTSIDE = 0.01
@@ -30,6 +32,7 @@ class Pictures:
         views: views to fit, with images (H, W, 4) premultiplied, or (H, W, 3), sRGB-encoded as in the files.
         held_out: views that are only measured.
         numbers: for each of `views` and then of `held_out`, its number in the data set.
+        given: these views as the data set has them, in the same order.
         outlined: True if the pictures' alpha tells where the object is.
         background: (3,) colour, encoded: of the pictures where they have no alpha, else the one to measure on.
         world: the place and size of this world in that of the data set.
@@ -38,6 +41,7 @@ class Pictures:
     views: list[rts.View]
     held_out: list[rts.View]
     numbers: list[int]
+    given: list[rts.View]
     outlined: bool
     background: np.ndarray
     world: World
@@ -62,11 +66,12 @@ def read(path: Any, size: int, held_out: int, background: Any = None) -> Picture
         raise rts.InputError(
             f"{len(views)} view{'s'[: len(views) != 1]} in {_named(path)}, and {one} left to fit; expected at least two"
         )
-    world = around([view.camera.for_size(view.size) for view in views])
-    views = [_smaller(view, size, world) for view in views]
-    views, outlined, behind = _outlined(views, _named(path), background)
+    given, world = views, around([view.camera.for_size(view.size) for view in views])
+    views, outlined, behind = _outlined([_smaller(view, size, world) for view in views], _named(path), background)
     others = [i for i in range(len(views)) if i not in set(kept)]
-    return Pictures([views[i] for i in kept], [views[i] for i in others], kept + others, outlined, behind, world)
+    numbers = kept + others
+    fitted, held = [views[i] for i in kept], [views[i] for i in others]
+    return Pictures(fitted, held, numbers, [given[i] for i in numbers], outlined, behind, world)
 
 
 def _named(path: Any) -> str:
@@ -102,13 +107,14 @@ def _smaller(view: rts.View, size: int, world: World) -> rts.View:
         name=view.name,
         mask=None if view.mask is None else functools.cache(lambda: means(np.asarray(view.mask))),
         path=view.path,
+        lens=None if view.lens is None else view.lens.scaled(1 / n, 1 / n),
     )
 
 
 def _outlined(views: list[rts.View], named: str, background: Any) -> tuple[list[rts.View], bool, np.ndarray]:
     """The views with images that tell the object, True if their alpha does, and the background."""
     looked_at = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).astype(int))]
-    masks = [np.ones(view.size, np.float32) if view.mask is None else view.mask for view in looked_at]
+    masks = [_mask(view) for view in looked_at]
     images = [view.image for view in looked_at]
     given = None if background is None else _checked(background)
     behind = np.ones(3, np.float32) if given is None else given
@@ -116,23 +122,45 @@ def _outlined(views: list[rts.View], named: str, background: Any) -> tuple[list[
         clear = np.mean([((i[..., 3] < 0.5) & (m > 0.5)).mean() for i, m in zip(images, masks, strict=True)])
         if clear > OUTSIDE:
             return views, True, behind
-    if np.mean([(mask < 0.5).mean() for mask in masks]) > OUTSIDE:
-        return [_with(view, _cut_out) for view in views], True, behind
+    shown = [_shown(view) for view in looked_at]
+    if np.mean([((mask < 0.5) & (s > 0.5)).mean() for mask, s in zip(masks, shown, strict=True)]) > OUTSIDE:
+        return [_with(view, _cut_out, None if view.lens is None else _shown) for view in views], True, behind
     if given is None:
         behind = _border(images, named)
-    return [_with(view, lambda view: view.image[..., :3], keep_mask=True) for view in views], False, behind
+    return [_with(view, _opaque, None if view.mask is None else _mask) for view in views], False, behind
 
 
-def _with(view: rts.View, image: Callable[[rts.View], np.ndarray], keep_mask: bool = False) -> rts.View:
-    """A view with another image, which is made from it once."""
-    mask = view.mask if keep_mask else None
+def _with(view: rts.View, image: Part, mask: Part | None) -> rts.View:
+    """A view with another image and mask, which are made from it once."""
     made = functools.cache(lambda: image(view))
-    return rts.View(view.camera, made, view.size, name=view.name, mask=mask, path=view.path)
+    counted = None if mask is None else functools.cache(lambda: mask(view))
+    return rts.View(view.camera, made, view.size, name=view.name, mask=counted, path=view.path)
+
+
+def _opaque(view: rts.View) -> np.ndarray:
+    return view.image[..., :3]
+
+
+def _mask(view: rts.View) -> np.ndarray:
+    """The view's mask, ones if it has none."""
+    return np.ones(view.size, np.float32) if view.mask is None else view.mask
+
+
+def _shown(view: rts.View) -> np.ndarray:
+    """1 at pixels (H, W) that the view's lens leaves a picture, but for its border; 0 elsewhere.
+
+    Masks of data sets are 0 elsewhere, whether they tell the object or not.
+    """
+    height, width = view.size
+    if view.lens is None:
+        return np.ones((height, width), np.float32)
+    x, y = view.lens.distorted(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
+    return ((x > 1) & (x < width - 1) & (y > 1) & (y < height - 1)).astype(np.float32)
 
 
 def _cut_out(view: rts.View) -> np.ndarray:
     """The picture (H, W, 4) where the view's mask is."""
-    mask = np.ones(view.size, np.float32) if view.mask is None else view.mask
+    mask = _mask(view)
     return np.concatenate([view.image[..., :3] * mask[..., None], mask[..., None]], axis=2)
 
 

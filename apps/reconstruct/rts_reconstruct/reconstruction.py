@@ -10,11 +10,12 @@ import numpy as np
 
 import rts
 from rts.diagnostics.command_tools import output_folder, writing
-from rts_reconstruct import files, job, measures, pictures, stages, texturing
+from rts_reconstruct import files, job, measures, pictures, posing, stages, texturing
 from rts_reconstruct.model import Model
 from rts_reconstruct.report import write_report
 from rts_reconstruct.saved import Saved
 from rts_reconstruct.starts import start as starting_mesh
+from rts_reconstruct.untangling import untangled
 
 STEPS, SIZE, TEXTURE = 1300, 256, 1024
 QUICK = {"steps": 240, "size": 128, "texture": 512, "faces": 0.25}
@@ -72,6 +73,7 @@ class Reconstruction(NamedTuple):
 
     def __repr__(self) -> str:
         kind = "held-out views" if self.pictures.held_out else "fitted views"
+        kind += ", their cameras fitted" if any(m.held_out and m.camera == "fitted" for m in self.measures) else ""
         faces = f"{len(self.model.faces)} faces"
         return f"PSNR {self.psnr:.1f} dB ({kind}), {faces}, {self.seconds:.0f} s"
 
@@ -81,6 +83,7 @@ def reconstruct(
     out: Any,
     *,
     start: Any = "ball",
+    surface: str = "mesh",
     steps: int | None = None,
     size: int | None = None,
     batch: int = 4,
@@ -96,7 +99,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Fit a mesh with colours to photographs with cameras, and write it.
 
-    Three stages fit vertices and their colours, each on a finer mesh; a last one fits a texture. Colours have the light
+    Three stages fit vertices and their colours, each on a finer mesh, which is moved apart where it passes through
+    itself; a last one fits a texture. Colours have the light
     of the pictures in them. The mesh is written after each stage, so that an interruption leaves the last one.
 
     Where pictures have alpha, it tells where the object is. Where they have masks alone, these do. Pictures that have
@@ -108,12 +112,15 @@ def reconstruct(
         views: file or folder, as `rts.load_views` takes it; or a list of views with sRGB-encoded images.
         out: the folder to write into.
         start: "ball"; "hull", the visual hull of alpha or masks; or the path of a mesh in the world of the cameras.
+        surface: "mesh"; or "subdivision", for stages that fit the cage of a Loop subdivision surface, which is smooth
+            between its fewer control points. The files hold a fine mesh of it.
         steps: the steps of all stages of the shape, by default 1300; the texture takes a fifth as many on top.
         size: pixels; longer sides of pictures are made at most so long, by default 256.
         batch: the number of pictures in a step.
         texture: texels a side, by default 1024; 0 for vertex colours.
         held_out: every so many views, one is held out and only measured; 0 for none.
-        fit_cameras: True to fit the poses of cameras, too.
+        fit_cameras: True to fit the poses of cameras, too, and write them; those of views held out are fitted to the
+            finished mesh, since fitted cameras and mesh may have moved together.
         background: (3,) encoded colour of pictures without alpha and masks; None for that of their borders.
         quick: True for a first look: smaller defaults, and a quarter of the faces.
         seed: of the order of pictures.
@@ -135,6 +142,10 @@ def reconstruct(
     _check(
         steps=(steps, 3), size=(size, 8), batch=(batch, 1), texture=(texture, 0), held_out=(held_out, 0), seed=(seed, 0)
     )
+    if surface not in ("mesh", "subdivision"):
+        raise rts.InputError(f"surface is {surface!r:.60}; expected 'mesh' or 'subdivision'")
+    if surface == "subdivision":
+        rts.plugin("surfaces", "subdivision")  # Refused now where OpenSubdiv is missing.
     if 0 < texture < 16:
         raise rts.InputError(f"texture is {texture}; expected at least 16 texels a side, or 0 for vertex colours")
     folder = output_folder(out)
@@ -142,14 +153,15 @@ def reconstruct(
     shots = pictures.read(views, size, held_out, background)
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
-    poses = np.zeros((len(shots.views), 6), np.float32)
+    poses = np.zeros((len(shots.numbers), 6), np.float32)
     model = Model(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), grey, poses)
-    settings = stages.Settings(batch, seed, fit_cameras, progress)
+    settings = stages.Settings(batch, seed, fit_cameras, surface == "subdivision", progress)
     plan = [(s._replace(faces=int(defaults["faces"] * s.faces)), max(1, round(s.share * steps))) for s in stages.STAGES]
     with writing(folder):
         (folder / "checkpoint").mkdir(parents=True, exist_ok=True)
     identity = {"steps": steps, "size": size, "batch": batch, "seed": seed, "start": str(start), "views": shots.numbers}
-    saved = Saved(folder / "checkpoint", identity | {"texture": texture, "cameras": fit_cameras, "quick": quick})
+    identity |= {"texture": texture, "cameras": fit_cameras, "quick": quick, "surface": surface}
+    saved = Saved(folder / "checkpoint", identity)
     run = _Run(shots, settings, saved, watch if first else None, model, folder, first)
     run.begin(resume)
     try:
@@ -213,8 +225,8 @@ class _Run:
         """A stage of shape and colours, unless an earlier run made it."""
         if number < len(self.losses) or self.stopped:
             return
-        model = stages.remeshed(self.model, stage.faces)
-        self._keep(*stages.fitted(model, self.pictures, stage, steps, self.settings, *self._reporting(number)))
+        fit, losses = stages.fitted(self.model, self.pictures, stage, steps, self.settings, *self._reporting(number))
+        self._keep(fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces))), losses)
 
     def texture(self, number: int, size: int, steps: int) -> None:
         """The stage of the texture, unless an earlier run made it; one that was stopped is baked alone."""
@@ -252,6 +264,8 @@ class _Run:
 
     def finish(self) -> Reconstruction:
         """Measure all views, and write the rest."""
+        if self.settings.cameras and self.pictures.held_out:
+            self.model = posing.posed(self.model, self.pictures, self.settings)
         rows = measures.measured(self.model, self.pictures)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None
@@ -260,6 +274,8 @@ class _Run:
             return found
         with writing(self.folder):
             self.files = files.write_mesh(self.folder, self.model, self.pictures)
+            if self.settings.cameras:
+                self.files += files.write_cameras(self.folder, self.model, self.pictures)
             table, turning, report = (self.folder / name for name in ("views.csv", "turntable.gif", "report.html"))
             files.write_table(table, rows)
             files.write_turntable(turning, self.model, self.pictures)

@@ -126,4 +126,7 @@ def _table(rows: Sequence[Measured]) -> str:
         kind = ' class="held"' if row.held_out else ""
         lines.append(f"<tr{kind}>{cells(row.name or str(row.number), row.psnr, row.ssim, row.iou)}</tr>")
     head = "<tr><th>view</th><th>PSNR, dB</th><th>SSIM</th><th>IoU</th></tr>"
-    return f"<table>{head}{''.join(lines)}</table><p>Rows of views that were held out are blue.</p>"
+    note = "Rows of views that were held out are blue."
+    if any(row.held_out and row.camera == "fitted" for row in rows):
+        note += " Their cameras were fitted to these pictures in the end, while the mesh stayed."
+    return f"<table>{head}{''.join(lines)}</table><p>{note}</p>"

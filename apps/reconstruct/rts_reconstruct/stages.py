@@ -10,17 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import KDTree
 
 import rts
 from rts_reconstruct.job import shared
-from rts_reconstruct.model import Model, colored, moved_camera
+from rts_reconstruct.model import Model, carried, colored, moved_camera
 from rts_reconstruct.pictures import Pictures
+from rts_reconstruct.subdivision import FACES, limit_of, tessellated
 
 ROUNDS = 5
 """Rounds of remeshing."""
-NEAREST = 3
-"""The old vertices from which a new one has its colour."""
 
 
 class Stage(NamedTuple):
@@ -51,18 +49,27 @@ STAGES = (
 
 
 class Settings(NamedTuple):
-    """How all stages fit: views a step, the seed, True to fit cameras, True to show progress (None: on a terminal)."""
+    """How all stages fit.
+
+    Attributes:
+        batch: the number of views in a step.
+        seed: of the order of views.
+        cameras: True to fit cameras.
+        smooth: True for subdivision surfaces, False for meshes.
+        progress: True to show progress; None for only on a terminal.
+    """
 
     batch: int
     seed: int
     cameras: bool
+    smooth: bool
     progress: bool | None
 
 
 def fitted(
     model: Model, pictures: Pictures, stage: Stage, steps: int, settings: Settings, checkpoint: Path | None, report: Any
 ) -> tuple[Model, list[float]]:
-    """The model after a stage, on its own mesh; and the losses of its steps.
+    """The model after a stage, remeshed before it; and the losses of its steps.
 
     Args:
         model: the model before.
@@ -73,8 +80,9 @@ def fitted(
         checkpoint: the file of the fit's state, or None.
         report: called as (step, loss, vertices, faces, colors); a true result stops the fit.
     """
+    model = remeshed(model, stage.faces // FACES if settings.smooth else stage.faces)
     steps_of = rts.LargeSteps(model.faces, len(model.vertices), stage.smoothness)
-    surface = rts.Mesh(model.faces)
+    surface = limit_of(model.faces) if settings.smooth else rts.Mesh(model.faces)
     start = {"shape": torch.tensor(steps_of.encode(model.vertices)), "colors": torch.tensor(model.colors)}
     rates = {"shape": stage.shape, "colors": stage.colors}
     if settings.cameras:
@@ -105,7 +113,8 @@ def fitted(
     )
     best = fit.parameters
     poses = best["poses"].numpy() if settings.cameras else model.poses
-    return Model(vertices_of(best), model.faces, best["colors"].numpy(), poses), fit.history
+    found = Model(vertices_of(best), model.faces, best["colors"].numpy(), poses)
+    return tessellated(found) if settings.smooth else found, fit.history
 
 
 def remeshed(model: Model, faces: int) -> Model:
@@ -130,12 +139,7 @@ def _remeshed(model: Model, faces: int) -> Model:
         vertices, corners = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         while 2 * len(corners) < faces:
             vertices, corners = trimesh.remesh.subdivide(vertices, corners)[:2]
-    away, near = KDTree(model.vertices).query(vertices, k=NEAREST)
-    weights = 1 / (away + 1e-6)
-    colors = np.einsum("vk,vkc->vc", weights / weights.sum(axis=1, keepdims=True), model.colors[near])
-    return model._replace(
-        vertices=vertices.astype(np.float32), faces=corners.astype(np.int32), colors=colors.astype(np.float32)
-    )
+    return carried(model, vertices, corners)
 
 
 def _is_manifold(mesh: trimesh.Trimesh) -> bool:

@@ -31,6 +31,12 @@ class World(NamedTuple):
         """Points (V, 3) of the data set's world in this one, float64."""
         return (np.asarray(points, np.float64) - self.center) / self.unit
 
+    def motion(self, matrix: np.ndarray) -> np.ndarray:
+        """A rigid motion (4, 4) of this world, as one of the data set's."""
+        moved = np.array(matrix, np.float64)
+        moved[:3, 3] = self.unit * moved[:3, 3] + self.center - moved[:3, :3] @ self.center
+        return moved
+
 
 def around(cameras: Sequence[rts.Camera]) -> World:
     """The world about the point nearest to all optical axes, with the radius of a ball that all cameras see.

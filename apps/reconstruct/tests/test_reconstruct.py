@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import socket
+import struct
 import sys
 
 import numpy as np
@@ -67,6 +68,12 @@ def test_a_viewer_sees_steps_and_can_stop_them(tmp_path, no_pause):
     assert found.model.atlas is None and (tmp_path / "mesh.obj").is_file()
 
 
+def gltf(path):
+    """The tables of a binary glTF file."""
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+
+
 @pytest.mark.thorough
 def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
     out = tmp_path / "out"
@@ -86,6 +93,9 @@ def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
     rows = list(csv.DictReader((out / "views.csv").read_text().splitlines()))
     assert [row["held_out"] for row in rows] == list("00010001")
     assert all(float(row["psnr_db"]) > 20 and float(row["iou"]) > 0.9 for row in rows)
+    tables = gltf(out / "mesh.glb")
+    assert "KHR_materials_unlit" in tables["extensionsUsed"]
+    assert all("KHR_materials_unlit" in material["extensions"] for material in tables["materials"])
     page = (out / "report.html").read_text()
     assert page.count("data:image/png") == 6 and "<polyline" in page and "http" not in page
     with Image.open(out / "turntable.gif") as turning:
@@ -116,16 +126,51 @@ def test_a_plain_background_is_enough(tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_subdivision_surface_is_fitted_in_place_of_a_mesh(tmp_path):
+    options = TINY | {"steps": 90, "texture": 0, "surface": "subdivision"}
+    found = rts_reconstruct.reconstruct(views(), tmp_path, **options)
+    mesh = trimesh.Trimesh(found.pictures.world.outside(found.model.vertices), found.model.faces)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi * RADII.prod(), rel=0.1)
+    assert found.psnr > 25
+    # Smooth: neighbours of faces lean by little, as on a fine mesh of an ellipsoid.
+    assert np.percentile(mesh.face_adjacency_angles, 99) < 0.5
+
+
+@pytest.mark.thorough
 def test_cameras_that_are_off_are_fitted(tmp_path):
     rng = np.random.default_rng(0)
     off = []
     for view in views():
         change = np.asarray(rts.rigid(np.concatenate([0.04 * rng.normal(size=3), 0.04 * rng.normal(size=3)])))
-        off.append(rts.View(view.camera.replace(view=change @ view.camera.view), view.image))
+        off.append(rts.View(view.camera.replace(view=change @ view.camera.view), view.image, name=view.name))
     options = TINY | {"steps": 150, "held_out": 0, "texture": 0}
     kept = rts_reconstruct.reconstruct(off, tmp_path / "kept", **options)
     fitted = rts_reconstruct.reconstruct(off, tmp_path / "fitted", fit_cameras=True, **options)
     assert fitted.psnr > kept.psnr + 1
+    # The cameras that were written see the mesh as those that were fitted.
+    (tmp_path / "fitted/cameras/images").mkdir()
+    for view in off:
+        rts.save_image(tmp_path / f"fitted/cameras/images/{view.name}", view.image)
+    again = rts.load_views(tmp_path / "fitted/cameras", split="all")
+    mesh = rts.load(tmp_path / "fitted/mesh.obj")[0].replace(shader="unlit")
+    for place, view in enumerate(again):
+        seen = np.asarray(rts.render(mesh, view.camera, (SIZE, SIZE), supersample=2))
+        expected = rts_reconstruct.measures.shown(fitted.model, fitted.pictures, place)
+        np.testing.assert_allclose(seen[..., 3], expected[..., 3], atol=0.02)
+
+
+@pytest.mark.thorough
+def test_cameras_of_views_held_out_are_fitted_to_the_finished_mesh(tmp_path):
+    shift = np.asarray(rts.rigid(np.array([0.03, -0.02, 0.03, 0.1, -0.05, 0.08])))
+    off = views()
+    off[3] = rts.View(off[3].camera.within(shift), off[3].image, name="3.png")  # One that is held out.
+    options = TINY | {"steps": 150, "texture": 0}
+    kept = rts_reconstruct.reconstruct(off, tmp_path / "kept", **options)
+    fitted = rts_reconstruct.reconstruct(off, tmp_path / "fitted", fit_cameras=True, **options)
+    by_number = [{row.number: row for row in found.measures} for found in (kept, fitted)]
+    assert by_number[1][3].psnr > by_number[0][3].psnr + 5
+    assert [rows[3].camera for rows in by_number] == ["given", "fitted"]
+    assert "their cameras fitted" in repr(fitted) and "while the mesh stayed" in (fitted.files[-1]).read_text()
 
 
 # ------------------------------------------------------------------------------------------------------- refused
@@ -149,9 +194,23 @@ def test_bad_input_is_one_line(folder, tmp_path):
     out = ["-o", tmp_path / "out"]
     assert "expected a whole number, at least 3" in told(folder, *out, "--steps", 0)
     assert "expected three numbers, such as 1,1,1" in told(folder, *out, "--background", "red")
+    assert "expected 'mesh' or 'subdivision'" in told(folder, *out, "--surface", "isosurface")
     assert "no file none.obj" in told(folder, *out, "--start", "none.obj")
     assert "at least 16 texels" in told(folder, *out, "--texture", 3)
     assert "left to fit; expected at least two" in told(folder, *out, "--held-out", 1)
+    assert "has none of" in told(tmp_path, *out)  # No cameras.
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        pytest.importorskip("viser")
+        assert f"port {port} of 127.0.0.1 is in use" in told(folder, *out, "--watch", "--port", port)
+    noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    (tmp_path / "busy").mkdir()
+    for i in range(len(images())):
+        rts.save_image(tmp_path / f"busy/{i}.png", noise)
+    rts.save_views(tmp_path / "busy/transforms.json", views())
+    assert "neither alpha nor masks" in told(tmp_path / "busy", *out)
     damaged(folder, lambda tree: tree.update(frames=tree["frames"][:1]))
     assert "1 view in" in told(folder, *out)
     assert not (tmp_path / "out").exists()

@@ -1,14 +1,17 @@
 """Each part of a reconstruction, by closed forms."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
-from rts_reconstruct import measures, pictures, stages, starts, texturing, world
+from rts_reconstruct import files, measures, pictures, stages, starts, texturing, world
 from rts_reconstruct.model import Model
 from rts_reconstruct.saved import Saved
 from seen_ellipsoid import CENTER, DISTANCE, RADII, SIZE, cameras, ellipsoid, images, on_white, views
 
 import rts
+from rts.diagnostics.command_tools import writing
 
 
 def test_the_world_lies_where_the_cameras_look_and_they_see_the_same():
@@ -67,6 +70,28 @@ def test_pictures_without_alpha_need_a_plain_background():
         pictures.read(views(lambda image: noise), SIZE, 0)
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_pixels_that_a_lens_leaves_no_picture_are_no_object_mask(tmp_path, masked):
+    for i, image in enumerate(images()):
+        rts.save_image(tmp_path / f"{i}.png", on_white(image))
+        rts.save_image(tmp_path / f"mask_{i}.png", np.repeat(image[..., 3:] > 0.5, 3, axis=2).astype(np.float32))
+    rts.save_views(tmp_path / "transforms.json", views())
+    tree = json.loads((tmp_path / "transforms.json").read_text())
+    for i, frame in enumerate(tree["frames"]):
+        frame["k1"] = 0.5  # A pincushion: the corners of undistorted pictures are outside of those taken.
+        if masked:
+            frame["mask_path"] = f"mask_{i}.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+    loaded = rts.load_views(tmp_path, linear=False)
+    assert (loaded[0].mask < 0.5).mean() > 2 * pictures.OUTSIDE
+    found = pictures.read(tmp_path, SIZE, 0)
+    assert found.outlined == masked
+    corner, middle = found.views[0].mask[0, 0], found.views[0].mask[SIZE // 2, SIZE // 2]
+    assert (corner, middle) == (0, 1)  # Corners do not count, whatever the object's mask is.
+    if masked:
+        assert found.views[0].image[SIZE // 2, SIZE // 2, 3] == 1 and found.views[0].image[8, 0, 3] == 0
+
+
 def test_the_hull_of_pictures_encloses_the_object():
     found = pictures.read(views(), SIZE, 0)
     hull = starts.start("hull", found)
@@ -118,6 +143,44 @@ def test_a_baked_texture_looks_like_the_colours():
     np.testing.assert_allclose(baked.atlas.colors(model.faces, len(model.vertices)), model.colors, atol=0.03)
 
 
+def written(folder, model):
+    return files.write_mesh(folder, model, pictures.read(views(), SIZE, 0))
+
+
+def test_a_mesh_without_a_texture_leaves_no_texture_of_an_earlier_run(tmp_path):
+    model = ball(1)
+    names = {"mesh.obj", "mesh.glb", "mesh.mtl", "texture.png"}
+    assert {file.name for file in written(tmp_path, texturing.baked(model, 64))} == names
+    assert {file.name for file in tmp_path.iterdir()} == names
+    assert {file.name for file in written(tmp_path, model)} == {"mesh.obj", "mesh.glb"}
+    assert {file.name for file in tmp_path.iterdir()} == {"mesh.obj", "mesh.glb"}
+
+
+def test_a_full_disk_leaves_the_last_mesh_as_it_was(tmp_path):
+    resource = pytest.importorskip("resource")
+    written(tmp_path, ball(1))
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(rts.InputError, match=r"cannot be written \(File too large\)") as caught:
+            with writing(tmp_path):
+                written(tmp_path, ball(4))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(caught.value)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_motions_of_a_world_are_motions_of_the_data_set():
+    found = world.around(cameras())
+    matrix = np.asarray(rts.rigid(np.array([0.2, -0.1, 0.3, 0.5, 0.1, -0.4])))
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    moved = points @ matrix[:3, :3].T + matrix[:3, 3]
+    outer = found.motion(matrix)
+    np.testing.assert_allclose(found.outside(points) @ outer[:3, :3].T + outer[:3, 3], found.outside(moved), atol=1e-6)
+
+
 def test_ssim_of_plain_pictures_is_its_closed_form():
     a, b = np.full((20, 20, 3), 0.25), np.full((20, 20, 3), 0.5)
     assert measures.ssim(a, a) == pytest.approx(1)
@@ -130,7 +193,7 @@ def test_measures_of_the_truth_are_best():
     found = pictures.read(views(), SIZE, 4)
     theta = ellipsoid().theta
     inside = found.world.inside(theta["vertices"]).astype(np.float32)
-    poses = np.zeros((6, 6), np.float32)
+    poses = np.zeros((8, 6), np.float32)
     model = Model(inside, ellipsoid().surface.faces, theta["colors"], poses)
     rows = measures.measured(model, found)
     assert [row.held_out for row in rows] == [False] * 6 + [True] * 2

@@ -1,0 +1,45 @@
+"""Reconstructions whose pictures several processes share, as torchrun starts them."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from seen_ellipsoid import SIZE, images, views
+
+import rts
+
+pytestmark = pytest.mark.thorough
+WORDS = f"--quick --steps 30 --size {SIZE} --texture 32 --held-out 4 --batch 4 --fit-cameras".split()
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Processes may hang without, see docs/many_views.md.
+}
+
+
+def ran(photos, out, *launcher):
+    """The arrays of a reconstruction, which runs in processes of its own."""
+    words = [sys.executable, *launcher, "-m", "rts", "reconstruct", str(photos), "-o", str(out), *WORDS]
+    run = subprocess.run(words, env={**os.environ, **ENVIRONMENT}, capture_output=True, text=True, timeout=540)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.count("PSNR") == 1, run.stdout  # The first process alone speaks.
+    with np.load(out / "checkpoint/stages.npz") as data:
+        return {name: data[name] for name in data.files if name != "about"}, (out / "views.csv").read_text()
+
+
+def test_two_processes_give_the_mesh_of_one(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i, image in enumerate(images()):
+        rts.save_image(photos / f"{i}.png", image)
+    rts.save_views(photos / "transforms.json", views())
+    one, table = ran(photos, tmp_path / "one")
+    two, again = ran(photos, tmp_path / "two", "-m", "torch.distributed.run", "--nproc-per-node", "2")
+    assert set(one) == set(two) and "atlas_texture" in one
+    for name in one:
+        print(name, np.abs(one[name].astype(float) - two[name]).max())
+    for name in one:
+        np.testing.assert_allclose(two[name], one[name], atol=1e-5, err_msg=name)
+    assert table == again
