@@ -60,6 +60,25 @@ def run(page, **names):
     return document.namespace, first
 
 
+GUIDES = [page for page in PAGES if page.startswith(("docs/guides/", "docs/start/")) and "many_views" not in page]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("page", [page for page in GUIDES if blocks(page, "python")])
+def test_the_python_of_a_guide_runs(page, tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    names, _ = run(page)
+    for path in tmp_path.glob("*.png"):
+        assert np.ptp(rts.load_image(path)) > 0.1, path.name
+    if page.endswith("first_gradient.md"):
+        assert names["vertices"].grad.abs().max() > 0
+        np.testing.assert_allclose(names["fit"].parameters, names["truth"], atol=0.03)
+    if page.endswith("guides/gradients.md"):
+        assert {reason.kind for reason in names["check"].reasons} == {"constant"}
+        assert str(names["check"]).splitlines()[1] in "".join(blocks(page, "text"))
+
+
 @pytest.mark.thorough
 def test_the_python_of_the_readme_does_what_it_says(model):
     pytest.importorskip("torch")
@@ -124,7 +143,7 @@ def test_the_python_of_the_guide_to_plugins_does_what_it_says(tmp_path, monkeypa
 def test_the_python_of_the_guide_to_many_views_does_what_it_says(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
-    names, first = run("docs/many_views.md")
+    names, first = run("docs/guides/many_views.md")
     shape, cameras = first["fit"], names["fit"]
     assert shape.loss < 0.3 * shape.validated[0][1] and (tmp_path / "fit.npz").is_file()
     assert [step for step, _ in shape.validated] == [0, 10, 20, 30, 40, 50, 59]

@@ -1,8 +1,7 @@
-"""The scripts in examples/ run, at their smallest, and write the picture that they say."""
+"""The tutorials run as scripts, with small pictures, and write the picture that they end in."""
 
 import re
 import runpy
-import sys
 import warnings
 from pathlib import Path
 
@@ -14,12 +13,12 @@ import rts
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
-SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
+SCRIPTS = sorted((ROOT / "docs/tutorials").glob("*.py"))
 FRAMEWORKS = ("torch", "jax")
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.stem)
-def test_an_example_runs_and_writes_its_picture(script, tmp_path, monkeypatch, capsys):
+def test_a_tutorial_runs_and_writes_its_picture(script, tmp_path, monkeypatch, capsys):
     text = script.read_text()
     for package in FRAMEWORKS:
         if re.search(rf"^import {package}$", text, re.MULTILINE):
@@ -32,7 +31,7 @@ def test_an_example_runs_and_writes_its_picture(script, tmp_path, monkeypatch, c
     if "rts.Isosurface" in text:
         pytest.importorskip("mcubes")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [str(script), "--quick"])
+    monkeypatch.setenv("RTS_QUICK", "1")
     with warnings.catch_warnings():
         warnings.simplefilter("error", rts.RtsWarning)
         runpy.run_path(str(script), run_name="__main__")
@@ -44,10 +43,14 @@ def test_an_example_runs_and_writes_its_picture(script, tmp_path, monkeypatch, c
     assert capsys.readouterr().out.strip()
 
 
-def test_the_examples_are_short_and_told_in_the_readme():
-    readme = (ROOT / "README.md").read_text()
-    assert len(SCRIPTS) == 8
-    for script in SCRIPTS:
-        text = script.read_text()
-        assert len(text.splitlines()) < 60 and text.startswith('"""') and f"{script.stem}.png" in text
-        assert f"(examples/{script.name})" in readme, f"{script.name} is not in README.md"
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.stem)
+def test_a_tutorial_is_short_and_ends_in_its_picture(script):
+    text = script.read_text()
+    cells = [cell.strip().splitlines() for cell in text.split("# %%") if cell.strip()]
+    words = " ".join(line for cell in cells if cell[0] == "[markdown]" for line in cell[1:]).replace("#", "").split()
+    code = [line for cell in cells if cell[0] != "[markdown]" for line in cell]
+    # A reader takes 200 words, or 20 lines of code, a minute.
+    assert len(words) / 200 + len(code) / 20 < 10
+    [last] = [cell for cell in cells if "rts.save_image(" in "".join(cell)]
+    assert last[-1].startswith(f'Image.open("{script.stem}.png")')
+    assert f"({script.name})" in (ROOT / "docs/tutorials/index.md").read_text()
