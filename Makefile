@@ -47,6 +47,7 @@ apps: warmup $(VENV)/.apps
 # the pictures of tutorials small. Tutorials write pictures into the folder that they run in.
 docs: warmup $(VENV)/.docs
 	mkdir -p build/pictures
+	echo '{"KernelManager": {"transport": "ipc"}}' > build/pictures/jupyter_nbconvert_config.json
 	cd build/pictures && PATH=$(abspath $(BIN)):$$PATH NO_MKDOCS_2_WARNING=1 mkdocs build --strict -f $(CURDIR)/mkdocs.yml
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
