@@ -66,6 +66,8 @@ def on_page_markdown(markdown, page, config, files):
     uri = page.file.src_uri
     if not uri.endswith(".md"):
         return markdown
+    if uri.startswith(("benchmarks/", "architecture", "CHANGELOG", "CONTRIBUTING")):
+        page.meta["search"] = {"boost": 0.2}  # Below pages for users, whatever they hold.
     shows = "```python" in markdown or "](../images/" in markdown
     if re.match(r"guides/(?!index)|coming-from/", uri) and not shows:
         log.warning("%s has neither a picture nor code that runs", uri)
@@ -75,31 +77,49 @@ def on_page_markdown(markdown, page, config, files):
     return LINK.sub(lambda link: relocated(link[1], source, uri), markdown)
 
 
+def place(target, source):
+    """The path on the site of a file that a page links to; None if it is not in the repository."""
+    path = (source.parent / target).resolve()
+    if urlsplit(target).scheme or not path.is_relative_to(ROOT):
+        return None
+    return path.relative_to(ROOT / "docs" if path.is_relative_to(ROOT / "docs") else ROOT).as_posix()
+
+
 def relocated(target, source, uri):
     """The link of a page, from its place on the site to that of the target."""
-    if urlsplit(target).scheme:
-        return target
-    path = (source.parent / target).resolve()
-    if not path.is_relative_to(ROOT):
-        return target
-    place = path.relative_to(ROOT / "docs" if path.is_relative_to(ROOT / "docs") else ROOT).as_posix()
-    return posixpath.relpath(place, posixpath.dirname(uri) or ".")
+    found = place(target, source)
+    return posixpath.relpath(found, posixpath.dirname(uri) or ".") if found else target
 
 
 def on_page_content(html, page, config, files):
-    """Free an executed tutorial of scripts, some of which load others from elsewhere, and mend its links to pages."""
+    """Give an executed tutorial the theme's looks, and mend its links to pages."""
     if not page.file.src_uri.endswith(".py"):
         return html
     if "<img" not in html:
         log.warning("%s shows no picture", page.file.src_uri)
 
     def address(link):
-        folder = posixpath.dirname(page.file.src_uri)
-        target = files.get_file_from_path(posixpath.normpath(posixpath.join(folder, link[1])))
+        target = files.get_file_from_path(place(link[1], Path(page.file.abs_src_path)) or "")
         return f'href="{target.url_relative_to(page.file)}' if target else link[0]
 
-    html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
-    return re.sub(r'href="([^"#:]+\.(?:md|py))(?=["#])', address, html)
+    return re.sub(r'href="([^"#:]+\.(?:md|py))(?=["#])', address, in_the_theme(html))
+
+
+def in_the_theme(html):
+    """The cells of a notebook without Jupyter's styles and scripts, some of which load others from elsewhere."""
+    for gone in (
+        r"<(script|style)\b.*?</\1>",
+        r"<!--.*?-->",
+        r'<div class="zeroclipboard-container">.*?</clipboard-copy>\s*</div>',
+        r'<div class="clipboard-copy-txt".*?</div>',
+        r'<div class="jp-Collapser.*?</div>',
+    ):
+        html = re.sub(gone, "", html, flags=re.DOTALL)
+    code = r'<div class="highlight-ipynb hl-python"><pre><span></span>(.*?)</pre>'
+    html = re.sub(code, r'<div class="language-python highlight"><pre><code>\1</code></pre>', html, flags=re.DOTALL)
+    output = r'(data-mime-type="(?:text/plain|application/vnd.jupyter.std\w+)"[^>]*>\s*)<pre>(.*?)</pre>'
+    html = re.sub(output, r'\1<pre class="output"><code>\2</code></pre>', html, flags=re.DOTALL)
+    return html.replace('class="anchor-link"', 'class="headerlink" title="Permanent link"')
 
 
 def on_post_build(config):
