@@ -60,12 +60,12 @@ print(fit)
 print("found", fit.parameters.numpy().round(3), "true", truth)
 
 # %% [markdown]
-# From left to right: the start, the pose that was found, the mask.
+# From left to right: the start, the pose that was found, the mask; dark on white.
 
 # %%
 shown = [picture(np.zeros(6, np.float32)), picture(fit.parameters.numpy()), target]
-rts.save_image("pose.png", np.concatenate(shown, axis=1))
-Image.open("pose.png").convert("RGBA")
+rts.save_image("pose.png", 1 - np.concatenate(shown, axis=1)[..., 3])
+Image.open("pose.png")
 
 # %% [markdown]
 # ## If yours fails

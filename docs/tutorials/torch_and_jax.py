@@ -27,12 +27,12 @@ camera = rts.Camera.look_at((1, 1, 3), (0, 0, 0))
 
 
 # %%
-def image(vertices):
-    return rts.render(rts.Part(surface, {"vertices": vertices}, "silhouette"), camera, size)
+def ring_of(vertices):
+    return rts.Part(surface, {"vertices": vertices}, "silhouette")
 
 
 def loss(vertices):
-    return (image(vertices)[..., 3] ** 2).mean()
+    return (rts.render(ring_of(vertices), camera, size)[..., 3] ** 2).mean()
 
 
 # %% [markdown]
@@ -58,7 +58,8 @@ print(f"loss {value.item():.6f} by torch, {float(other):.6f} by jax; gradients d
 # %%
 colors = 0.5 + 0.5 * by_torch / np.abs(by_torch).max()
 pushed = rts.Part(surface, {"vertices": vertices, "colors": colors.astype(np.float32)}, "unlit")
-rts.save_image("torch_and_jax.png", np.concatenate([image(vertices), rts.render(pushed, camera, size)], axis=1))
+shown = [rts.render(part, camera, size, background=(0, 0, 0)) for part in (ring_of(vertices), pushed)]
+rts.save_image("torch_and_jax.png", np.concatenate(shown, axis=1))
 Image.open("torch_and_jax.png")
 
 # %% [markdown]
