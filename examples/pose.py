@@ -31,4 +31,5 @@ residuals = rts.ImageResiduals(posed, camera, SIZE, target)
 fit = rts.fit(residuals, start, method="lm", schedule=rts.pyramid(SIZE), progress=False)
 
 print("found", fit.parameters.numpy().round(3), "true", true, "loss", fit.loss)
-rts.save_image("pose.png", np.concatenate([picture(start.numpy()), picture(fit.parameters.numpy()), target], axis=1))
+shown = np.concatenate([picture(start.numpy()), picture(fit.parameters.numpy()), target], axis=1)
+rts.save_image("pose.png", 1 - shown[..., 3])  # Dark on white.

@@ -1,4 +1,4 @@
-"""The charts of the first page of results: speed against accuracy, growth with faces, and stability."""
+"""The charts of the pages of results; here those of the first page: speed against accuracy, growth, and stability."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.pages import table_charts
+from benchmarks.pages.drawing import INK, OURS, PALE, logarithmic, panels
 from benchmarks.pages.kept import kept, number, scene, written
-from rts_compare.chart_style import PEER_COLORS, SPLATTER_COLORS
+from rts_compare.chart_style import PEER_COLORS
 from rts_compare.pareto_front import milliseconds, timed
 
 IMAGES = Path(__file__).parents[2] / "docs/images/results"
 SCENES = ("bunny over black", "bunny before square", "square behind bunny")
-INK, PALE, OURS = "#1f2937", "#6b7280", SPLATTER_COLORS["visible"]
 VERDICTS = {"ok": "well", "degraded": "degraded", "failed": "failed", "cannot": "does not apply"}
 VERDICT_COLORS = {"ok": "#2F9E6E", "degraded": "#F2C14E", "failed": "#D1495B", "cannot": "#DDE1E6"}
 
@@ -51,34 +52,10 @@ def verdicts() -> dict[str, Any]:
     return {method: {v: cells.count(v) for v in VERDICTS} for method, cells in told.items()}
 
 
-def _axes(columns: int, width: float, height: float) -> tuple[Any, Any]:
-    """A figure and its axes."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    matplotlib.rcParams.update({"svg.hashsalt": "rts", "font.family": "DejaVu Sans", "font.size": 9})
-    figure = Figure(figsize=(width, height), layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    for one in axes:
-        one.spines[["top", "right"]].set_visible(False)
-        one.tick_params(colors=INK)
-        one.set_axisbelow(True)
-    return figure, axes
-
-
-def _logarithmic(axis: Any, text: Callable[[float], str]) -> None:
-    """Ticks at 1, 2, 5, 10, written out."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
-    axis.set_minor_formatter(NullFormatter())
-
-
 def draw_fronts(found: dict[str, Any]) -> Any:
     """Error against time, a panel a scene."""
-    figure, panels = _axes(3, 11, 3.9)
-    for axes, (name, lines) in zip(panels, found.items(), strict=True):
+    figure, three = panels(3, 11, 3.9)
+    for axes, (name, lines) in zip(three, found.items(), strict=True):
         axes.set(xscale="log", yscale="log", title=name, xlabel="time of a render and its gradient, ms")
         axes.grid(color="#e5e7eb")
         axes.plot(*zip(*lines["ours"], strict=True), "o-", color=OURS, drawstyle="steps-post", label="rts")
@@ -88,35 +65,35 @@ def draw_fronts(found: dict[str, Any]) -> Any:
         for spp, (ms, error) in zip((1, 4, 16), mitsuba, strict=True):
             axes.annotate(str(spp), (ms, error), (6, 3), textcoords="offset points", color=PALE, fontsize=8)
         axes.set(ylim=(0.006, 0.4), xlim=(2.5, 2500))
-        _logarithmic(axes.xaxis, lambda value: f"{value:g}")
-        _logarithmic(axes.yaxis, lambda value: f"{100 * value:g} %")
+        logarithmic(axes.xaxis, lambda value: f"{value:g}")
+        logarithmic(axes.yaxis, lambda value: f"{100 * value:g} %")
         axes.tick_params(axis="x", labelrotation=45)
-    panels[0].set_ylabel("error of the derivative image")
-    panels[0].legend(frameon=False, loc="lower right", fontsize=8)
+    three[0].set_ylabel("error of the derivative image")
+    three[0].legend(frameon=False, loc="lower right", fontsize=8)
     return figure
 
 
 def draw_growth(found: dict[str, Any]) -> Any:
     """Time against faces, a panel a size."""
-    figure, panels = _axes(2, 11, 3.9)
+    figure, two = panels(2, 11, 3.9)
     looks = {"rts, pose": ("o-", OURS), "rts, pose and vertices": ("o--", "#8A4B12"),
              "DEODR": ("X-", PEER_COLORS["DEODR"])}  # fmt: skip
-    for axes, (size, lines) in zip(panels, found.items(), strict=True):
+    for axes, (size, lines) in zip(two, found.items(), strict=True):
         axes.set(xscale="log", yscale="log", title=f"images of {size}", xlabel="triangles", ylim=(1, 1000))
         axes.grid(color="#e5e7eb")
         for name, (style, color) in looks.items():
             axes.plot(lines["faces"], lines[name], style, color=color, label=name)
         axes.set_xticks(lines["faces"], [f"{n / 1e3:.3g}K" if n < 1e6 else f"{n / 1e6:.2g}M" for n in lines["faces"]])
         axes.minorticks_off()
-        _logarithmic(axes.yaxis, lambda value: f"{value:g}")
-    panels[0].set_ylabel("a step of a pose's fit, ms")
-    panels[0].legend(frameon=False)
+        logarithmic(axes.yaxis, lambda value: f"{value:g}")
+    two[0].set_ylabel("a step of a pose's fit, ms")
+    two[0].legend(frameon=False)
     return figure
 
 
 def draw_verdicts(found: dict[str, Any]) -> Any:
     """Bars: outcomes by method."""
-    figure, (axes,) = _axes(1, 11, 3.6)
+    figure, (axes,) = panels(1, 11, 3.6)
     methods = list(found)[::-1]
     left = [0] * len(methods)
     for verdict, text in VERDICTS.items():
@@ -155,6 +132,9 @@ CHARTS = {
     "speed_against_accuracy": Chart(fronts, draw_fronts),
     "growth": Chart(growth, draw_growth),
     "outcomes": Chart(verdicts, draw_verdicts),
+    "error_vs_time": Chart(table_charts.times, table_charts.draw_times),
+    "samplers": Chart(table_charts.samplers, table_charts.draw_samplers),
+    "smooth": Chart(table_charts.smooth, table_charts.draw_smooth),
 }
 """Name of a file → its chart."""
 

@@ -38,26 +38,27 @@ def outcome(row: str, method: str) -> Mapping:
     return cells[table["methods"].index(method)]
 
 
-def written(page: str, head: str) -> tuple[list[str], dict[str, list[str]]]:
+def written(page: str, *head: str, keys: int = 1) -> tuple[list[str], dict[str, list[str]]]:
     """A table that stands on a page without JSON.
 
     Args:
         page: name of the page, without ".md".
-        head: the text of the table's first cell, such as "256², ms".
+        head: texts of the table's first cells, such as "256², ms".
+        keys: how many cells name a line.
 
     Returns:
-        The names of its columns but the first, and name of a line → its cells, as text.
+        The names of its other columns; and the name of each line, cells joined by " | " → its other cells, as text.
     """
     lines = iter((PAGES / f"{page}.md").read_text().splitlines())
-    columns = next(line for line in lines if line.startswith(f"| {head} |"))
+    columns = next(line for line in lines if line.startswith("| " + " | ".join(head) + " |"))
     next(lines)
     found = {}
     for line in lines:
         if not line.startswith("|"):
             break
-        name, *cells = [cell.strip() for cell in line.strip("|").split("|")]
-        found[name] = cells
-    return [cell.strip() for cell in columns.strip("|").split("|")][1:], found
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        found[" | ".join(cells[:keys])] = cells[keys:]
+    return [cell.strip() for cell in columns.strip("|").split("|")][keys:], found
 
 
 def number(text: str) -> float:
