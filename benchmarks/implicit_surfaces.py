@@ -315,9 +315,10 @@ def mixed(output: Path, side: int) -> tuple[str, dict]:
         for p in parts
     ]
     size = side, side * 5 // 2
-    image = rts.render(torch_parts, view, size, layers=2, supersample=3, background=(1.0, 1.0, 1.0))
+    image = rts.render(torch_parts, view, size, layers=2, background=(1.0, 1.0, 1.0))
     image[..., :3].square().mean().backward()
-    picture = encode_srgb(image.detach().numpy()[side // 5 : -side // 6, :, :3].clip(0, 1))
+    fine = rts.render(parts, view, size, layers=2, supersample=3, background=(1.0, 1.0, 1.0))
+    picture = encode_srgb(fine[side // 5 : -side // 6, :, :3].clip(0, 1))
     figure = Figure(figsize=(10, 10 * picture.shape[0] / picture.shape[1]))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.imshow(picture, interpolation="antialiased")

@@ -115,10 +115,8 @@ def _plot(path: Path, history: Sequence[float], levels: Sequence[int]) -> list[P
         steps, color = range(first, first + count), STAGE_COLORS[number % len(STAGE_COLORS)]
         axes.semilogy(steps, losses, ".-", color=color, linewidth=1, markersize=4, label=f"stage {number + 1}")
         first += count
-    axes.set(
-        xlabel="step", ylabel="loss of the stage", title="Silhouette: each stage compares other images, coarse to fine"
-    )
-    axes.title.set_fontsize(10)
+    axes.set(xlabel="step", ylabel="loss of the stage")
+    axes.set_title("Silhouette, coarse to fine: each stage compares other images", fontsize=10)
     axes.grid(alpha=0.3)
     if len(levels) > 1:
         axes.legend(frameon=False, fontsize=8)
