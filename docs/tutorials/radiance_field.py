@@ -109,4 +109,4 @@ Image.open("radiance_field.png")
 # ```
 #
 # `rts.volume_render` draws the field as a volume, to compare with. `benchmarks/paper/snerf.py` refines lattice and
-# network together ([measured](../../benchmarks/RESULTS.md#a-radiance-field-as-a-surface-light-field)).
+# network together ([measured](../results/radiance-field.md)).
