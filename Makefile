@@ -48,7 +48,7 @@ apps: warmup $(VENV)/.apps
 docs: warmup $(VENV)/.docs
 	mkdir -p build/pictures
 	echo '{"KernelManager": {"transport": "ipc"}}' > build/pictures/jupyter_nbconvert_config.json
-	cd build/pictures && PATH=$(abspath $(BIN)):$$PATH NO_MKDOCS_2_WARNING=1 mkdocs build --strict -f $(CURDIR)/mkdocs.yml
+	cd build/pictures && NO_MKDOCS_2_WARNING=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 warmup: system $(VENV)/.test $(VENV)/.warm
