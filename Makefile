@@ -45,10 +45,12 @@ apps: warmup $(VENV)/.apps
 
 # The site, in build/site: tutorials are executed, and every warning and every dead link is an error. RTS_QUICK=1 makes
 # the pictures of tutorials small. Tutorials write pictures into the folder that they run in.
+docs: export JUPYTER_CONFIG_DIR := $(CURDIR)/build/pictures
+docs: export NO_MKDOCS_2_WARNING := 1
 docs: warmup $(VENV)/.docs
 	mkdir -p build/pictures
 	echo '{"KernelManager": {"transport": "ipc"}}' > build/pictures/jupyter_nbconvert_config.json
-	cd build/pictures && PATH=$(abspath $(BIN)):$$PATH NO_MKDOCS_2_WARNING=1 mkdocs build --strict -f $(CURDIR)/mkdocs.yml
+	cd build/pictures && $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 warmup: system $(VENV)/.test $(VENV)/.warm

@@ -86,7 +86,7 @@ def test_the_python_of_the_readme_does_what_it_says(model):
     drawn = rts.load_image("view.png")[..., 3]
     assert 0.02 < drawn.mean() < 0.5 and drawn[[0, -1]].max() == drawn[:, [0, -1]].max() == 0
     assert found["vertices"].grad.abs().max() > 0
-    assert found["fit"].loss < 1e-5 and found["fit"].parameters.abs().max() < 1e-3
+    assert found["fit"].loss < 1e-5 and found["fit"].parameters.abs().max() < 5e-3  # From 0.1.
 
 
 def test_the_readme_is_short():

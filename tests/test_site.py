@@ -4,6 +4,7 @@ import ast
 import re
 from importlib import import_module
 from importlib.metadata import distribution
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
@@ -109,3 +110,22 @@ def test_the_messages_of_troubleshooting_are_those_of_the_library():
     assert len(quoted) > 15
     literal = "\n".join(messages())
     assert not [text for text in quoted if text not in literal and text not in dir(rts.errors)]
+
+
+def test_the_build_finds_dead_links_and_what_is_fetched_from_elsewhere(tmp_path, caplog):
+    pytest.importorskip("mkdocs")
+    spec = spec_from_file_location("hooks", ROOT / "docs/hooks.py")
+    hooks = module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    page = tmp_path / "a/index.html"
+    page.parent.mkdir()
+    page.write_text('<p id="here"><a href="#here"><a href="../b.html#there"><a href="https://elsewhere.org"></p>')
+    (tmp_path / "b.html").write_text('<h1 id="there"></h1><a href="a/"><img src="data:,"><script src="b.js"></script>')
+    (tmp_path / "b.js").touch()
+    hooks.on_post_build({"site_dir": str(tmp_path)})
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    page.write_text('<a href="../c.html"><a href="#gone"><a href="../b.html#gone"><script src="https://cdn.org/x.js">')
+    hooks.on_post_build({"site_dir": str(tmp_path)})
+    found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(found) == 4
+    assert sum("leads nowhere" in text for text in found) == 3 and sum("cdn.org" in text for text in found) == 1

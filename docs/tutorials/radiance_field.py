@@ -16,7 +16,7 @@ from PIL import Image
 import rts
 
 quick = "RTS_QUICK" in os.environ
-size, count, width = ((24, 24), 15, 16) if quick else ((64, 64), 200, 48)
+size, count, width = ((24, 24), 15, 16) if quick else ((64, 64), 120, 32)
 
 # %% [markdown]
 # ## A shiny ball from eight sides
