@@ -31,5 +31,4 @@ residuals = rts.ImageResiduals(posed, camera, SIZE, target)
 fit = rts.fit(residuals, start, method="lm", schedule=rts.pyramid(SIZE), progress=False)
 
 print("found", fit.parameters.numpy().round(3), "true", true, "loss", fit.loss)
-shown = np.concatenate([picture(start.numpy()), picture(fit.parameters.numpy()), target], axis=1)
-rts.save_image("pose.png", 1 - shown[..., 3])  # Dark on white.
+rts.save_image("pose.png", np.concatenate([picture(start.numpy()), picture(fit.parameters.numpy()), target], axis=1))
