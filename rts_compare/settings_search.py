@@ -226,7 +226,7 @@ class Search:
         return self.bounds.get(self._cell(best), 0.0) > NEARLY * self.tolerance
 
     def _best(self, cells: Sequence[Setting]) -> Setting:
-        """The tried setting with the least error; if none has an error, the first of `cells`.
+        """The setting with the least error of all that the search tried; without any error, the first of `cells`.
 
         Raises:
             InputError: there are no `cells` either.

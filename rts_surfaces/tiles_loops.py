@@ -82,7 +82,10 @@ def _count(rates, sides, edges):
 
 @loop
 def counted(inner, sides, edges):
-    """The number of triangles of all tiles, from their rates `inner` (n, 2), sides (n, k), and rates `edges` (E,)."""
+    """The total number of triangles of n tiles with k sides.
+
+    `inner` (n, 2) and `edges` (E,) are rates as in `tiles.triangles`; `sides` (n, k) are indices into `edges`.
+    """
     total = 0
     for n in range(len(inner)):
         total += _count(inner[n], sides[n], edges)

@@ -154,6 +154,10 @@ class Engine(Plugin):
         """True if compiled loops on the host may work on these arrays, in place of array code."""
         return False
 
+    def devices(self, arrays: Iterable[Array]) -> set[Any]:
+        """The devices that these arrays are bound to; traced arrays, and those of other engines, count for nothing."""
+        return set()
+
     def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
         """Call `f` with the arrays if `on_host` holds for them, else `otherwise`; both return equal tuples of arrays.
 
@@ -381,9 +385,20 @@ class Context(NamedTuple):
 
 
 def context_of(*trees: Tree) -> Context:
-    """The engine of these trees, and their `exemplar`."""
+    """The engine of these trees, and their `exemplar`.
+
+    Raises:
+        EngineError: arrays of two engines, of an unknown type, or on two devices.
+    """
     arrays = collected(trees)
-    return Context(_engine_of_leaves(arrays), _widest(arrays))
+    engine = _engine_of_leaves(arrays)
+    devices = engine.devices(arrays)
+    if len(devices) > 1:
+        raise EngineError(
+            f"arrays on the devices {' and '.join(sorted(map(str, devices)))} met in one call; move them to one device "
+            f"(NumPy arrays may stand beside any, as constants)"
+        )
+    return Context(engine, _widest(arrays))
 
 
 def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> Context:
@@ -399,7 +414,7 @@ def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = N
 
     Raises:
         InputError: `engine` is no name of an engine.
-        EngineError: arrays of two engines, or of another one than `engine`.
+        EngineError: arrays of two engines, of another one than `engine`, or on two devices.
     """
     own, like = context_of(parts, *others)
     if engine is not None:

@@ -171,7 +171,13 @@ def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
 
 
 def changed_part(index: int, part: CheckedPart, changes: Mapping[str, Any]) -> CheckedPart:
-    """A checked part with some fields changed; the changed fields are checked."""
+    """A checked part with changed fields, which are checked; an error names it by `index`.
+
+    `changes` has passed `check_changes`, and is not empty.
+
+    Raises:
+        InputError: a field's value is wrong.
+    """
     if set(changes) - {"transform"}:
         return _check_part(index, part.replace(**changes))
     transform = changes["transform"]

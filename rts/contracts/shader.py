@@ -15,8 +15,8 @@ from rts.scene.camera import Camera
 class Shader(Plugin):
     """A function that colours samples. A plain function with the signature of `__call__` will do, attributes or not.
 
-    Promises other than `opaque` hold for the `__call__` of the class that states them. A subclass that overrides
-    `__call__` has to repeat them.
+    The promises `uniform`, `takes_views` and `reads` hold for the `__call__` of the class that states them. A subclass
+    that overrides `__call__` has to repeat them, but inherits `opaque`.
 
     Attributes:
         channels: C, the number of channels besides alpha: 3 for colours, any other number for features.
@@ -26,8 +26,8 @@ class Shader(Plugin):
             `camera` is a `RowCameras`, whose methods give a row for each sample. Such a shader also declares `reads`,
             without "uv_footprint".
         reads: a promise to need no entries but these, of θ and, besides "position", of the G-buffer; None for all.
-            Samples then carry no others. `rts.explain` lists entries of θ that neither surface nor shader reads, and
-            warns of names that almost match one of these.
+            Samples then carry no others. Rendering warns of an unread entry of θ whose name is almost that of a read
+            one. `rts.explain` lists all entries of θ that neither surface nor shader reads.
     """
 
     channels: int = 3

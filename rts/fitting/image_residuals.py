@@ -396,7 +396,7 @@ class ImageResiduals(Residuals):
             Target (H, W, c) of c channels, 1 for alpha alone; weights (H, W, 1 or c) or None; and the background
             (H, W, C + 1), opaque where it was given without alpha, or None.
         """
-        engine = engine_of(like, self._target, self._weights, self._background)
+        engine = context_of(like, self._target, self._weights, self._background).engine
         fields = constants((self._target, self._weights, self._background), engine, like)
         xp = namespace(like)
         target, weights, background = (None if x is None else engine.stop_gradient(x) for x in fields)

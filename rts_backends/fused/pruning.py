@@ -122,9 +122,10 @@ def _load(z, covered, depth):
 
 @compiled
 def _bound(least, largest, hidden, front, second):
-    """Fill `least` and `largest` with depths of the fronts of each cell and its two neighbours in the row.
+    """Fill `least` and `largest` (W,) with the least and largest front of each cell and its two neighbours in the row.
 
-    Also fills `hidden` with the least depth of their second layers.
+    Fill `hidden` (W,) with the least depth of their second layers. Depths `front` and `second` (W + 2,) have a border
+    cell at each end, and NaN for none. Where all are NaN, `least` and `hidden` are infinite, `largest` −infinite.
     """
     infinity = least.dtype.type(np.inf)
     for x in range(len(least)):

@@ -43,9 +43,10 @@ w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
 
 @compiled
 def load_around(sources, loaded, grid, y, first, count):
-    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; return the first of them, or y + 2.
+    """Load the source rows y − 1, y and y + 1 that have no slot yet; return the first row loaded, or y + 2 for none.
 
-    `loaded` (3,), updated, names the row in each slot. Slots hold `count` cells from column `first` on.
+    `sources` holds the slots (see `slot`): `count` cells from column `first` on, in all layers. `loaded` (3,), updated,
+    names the row in each slot; for other columns, fill it with −9 before.
     """
     start = y + 2
     for v in range(y + 1, y - 2, -1):

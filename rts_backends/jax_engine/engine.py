@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -121,6 +121,11 @@ class JaxEngine(Engine):
     def on_host(self, *arrays: jax.Array) -> bool:
         """True if all arrays are on CPUs. A tracer's device is not known yet, and taken to be a CPU."""
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
+
+    def devices(self, arrays: Iterable[Any]) -> set[Any]:
+        """The devices of arrays that `jax.device_put` bound to one; jax moves the others as need be."""
+        bound = [x.devices() for x in arrays if isinstance(x, jax.Array) and not isinstance(x, Tracer) and x.committed]
+        return set().union(*(found for found in bound if len(found) == 1))
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
         """See `Engine.by_host`. A traced program chooses between `f` and `otherwise` once its device is known."""

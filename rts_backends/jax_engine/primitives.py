@@ -199,7 +199,11 @@ def _only_row(value: Any) -> Any:
 
 
 def _read_once(value: Any) -> bool:
-    """True for an array that a program about to be compiled computes, and that exactly one operation reads so far."""
+    """True for an array whose memory a result may take over.
+
+    The program about to be compiled computes it, and exactly one operation reads it so far. False for constants, and
+    for arguments of the program.
+    """
     name = getattr(value.owner, "name", "stablehlo.constant")  # An argument's owner has no name.
     return name != "stablehlo.constant" and sum(1 for _ in value.uses) == 1
 

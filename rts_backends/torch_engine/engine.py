@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -130,6 +130,10 @@ class TorchEngine(Engine):
     def on_host(self, *arrays: torch.Tensor) -> bool:
         """True if all tensors are in the memory of the host."""
         return all([x.is_cpu for x in arrays])
+
+    def devices(self, arrays: Iterable[Any]) -> set[torch.device]:
+        """The devices of the tensors."""
+        return {x.device for x in arrays if isinstance(x, torch.Tensor)}
 
     def exact_products(self, *arrays: torch.Tensor) -> bool:
         """True for two arrays of one dtype on the CPU, outside of `torch.autocast`."""

@@ -1,4 +1,7 @@
-"""Other differentiable renderers on a scene: DEODR and Mitsuba. They come with the extra `bench`."""
+"""The other differentiable renderers that can take a scene, DEODR and Mitsuba, and why one cannot.
+
+They are made here, and render later. They come with the extra `bench`.
+"""
 
 from __future__ import annotations
 

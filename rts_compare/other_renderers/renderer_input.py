@@ -272,7 +272,10 @@ def _of_vertices(index: int, part: Part, rate: int) -> np.ndarray:
 
 
 def _rgb(index: int, part: Part, colors: np.ndarray) -> np.ndarray:
-    """RGB colours (V, 3) of colours (V, C) for the shader `unlit`; alpha is refused unless the shader is opaque."""
+    """RGB colours (n, 3) of colours (n, C), as `unlit` shows them; one channel is a grey.
+
+    A fourth channel, even of ones, is `Unsuited` unless the shader is opaque. Errors name the part by `index`.
+    """
     if colors.shape[1] == 4 and not part.shader.opaque:
         raise Unsuited(f"part {index} is translucent")
     return colors[:, :3] if colors.shape[1] >= 3 else np.repeat(colors[:, :1], 3, axis=1)

@@ -160,15 +160,15 @@ class Limit:
     def stencils(
         self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64, channel: int = VERTEX
     ) -> np.ndarray:
-        """Weights (N, W) of the control points in the table, for points on the limit surface.
+        """Weights (N, W) of the vertices `table[faces]`: their weighted sums are points on the limit surface.
 
-        All are zero on a face without a limit surface.
+        All are zero on a face without a limit surface (whose kind is `NONE`).
 
         Args:
             faces: (N,) integers.
             params: (N, 2) float.
             dtype: float32 or float64.
-            channel: `VERTEX`; or `UV`, for weights (N, W') of rows in `uv_table`, which must not be None.
+            channel: `VERTEX`; or `UV`, for weights (N, W') of rows `uv_table[faces]`; `uv_table` must not be None.
 
         Raises:
             InputError: there is no such face, or parameters are of another shape, not finite, or far outside of their

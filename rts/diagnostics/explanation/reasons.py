@@ -91,7 +91,7 @@ class Reason(NamedTuple):
 
     @property
     def color(self) -> str:
-        """The colour of its pixels in the picture, in words; "none" if it marks none."""
+        """The colour of its kind in the picture, in words; "none" for a kind that marks no pixels."""
         return KINDS[self.kind][0]
 
 

@@ -61,7 +61,11 @@ def save_views(path: Any, views: Any) -> None:
 
 
 class _Entry(NamedTuple):
-    """A view as files have it: world-to-camera is OpenCV's, the lens that of the picture on disk at this size."""
+    """A view as files have it.
+
+    `rotation` and `translation` are OpenCV's, world to camera; `camera_to_world` has OpenGL's axes. `lens` is that of
+    the picture on disk, in pixels of the view's size.
+    """
 
     view: View
     place: str

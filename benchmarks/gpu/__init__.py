@@ -1,0 +1,1 @@
+"""Tests and timings on a machine with a GPU, by one command that needs no internet: `run.py`."""
