@@ -81,7 +81,7 @@ def summary(comparisons: Sequence[Mapping]) -> str:
     count = len(comparisons)
     opening = (
         f"The least setting within an error in three quarters of {count} scenes, and its median time where it was "
-        "timed; 256². Where no setting stays within the error so often, *at best* says in how many scenes one does.\n"
+        "timed;\n256². Where no setting stays within the error so often, *at best* says in how many scenes one does.\n"
     )
     parts = [f"### {c['scene']['name']}\n\n{fastest(c)}" for c in comparisons]
     return "\n".join([opening, recommended(comparisons), *parts])
