@@ -14,7 +14,7 @@ from PIL import Image
 import rts
 
 quick = "RTS_QUICK" in os.environ
-size, count = ((32, 32), 30) if quick else ((96, 96), 250)
+size, count = ((32, 32), 30) if quick else ((96, 96), 400)
 ball = trimesh.creation.icosphere(3)
 surface, vertices = rts.Mesh(ball.faces), np.asarray(ball.vertices, np.float32)
 cameras = [rts.Camera.look_at(eye, (0, 0, 0)) for eye in ((0, 0, 3), (3, 0, 0), (0, 3, 0.1))]

@@ -88,7 +88,8 @@ for step in range(count):
         print(f"step {step}: loss {loss:.5f}")
 
 # %% [markdown]
-# The view that was held out: before training, after, and the truth.
+# The view that was held out: before training, after, and the truth. The colours are there. Of the highlight, which
+# depends on the direction, there is little yet.
 
 # %%
 shown = [start, images([cameras[held_out]])[0].detach().numpy(), pictures[held_out].numpy()]
