@@ -73,4 +73,4 @@ Image.open("pose.png")
 # - The command does all of this for a file: `rts fit-pose model.obj mask.png`. It says whether the fit is good.
 # - Something hides part of the model? Give `rts.ImageResiduals` a [robust
 #   loss](../guides/fitting.md#targets-that-are-wrong-in-part).
-# - The start is upside down? One view and no start lead nowhere: try several starts, and keep the least loss.
+# - The start is upside down? A fit goes downhill from where it starts: try several starts, and keep the least loss.
