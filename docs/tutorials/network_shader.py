@@ -80,7 +80,7 @@ for step in range(count):
 # %%
 shown = [start, images()[0].detach().numpy(), pictures[0].numpy()]
 rts.save_image("network_shader.png", np.concatenate(shown, axis=1))
-Image.open("network_shader.png")
+Image.open("network_shader.png").copy()
 
 # %% [markdown]
 # More on such functions, and on images of any number of channels: [shaders of your own](../guides/shaders.md).

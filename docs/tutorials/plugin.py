@@ -73,7 +73,7 @@ print("found", fit.parameters.numpy().round(3), "true", truth, "loss", fit.loss)
 # %%
 found = np.asarray(rts.render(scene(fit.parameters.numpy()), camera, size))
 rts.save_image("plugin.png", np.concatenate([before, found, target], axis=1))
-Image.open("plugin.png")
+Image.open("plugin.png").copy()
 
 # %% [markdown]
 # ## A name for it

@@ -65,7 +65,7 @@ print("found", fit.parameters.numpy().round(3), "true", truth)
 # %%
 shown = [picture(np.zeros(6, np.float32)), picture(fit.parameters.numpy()), target]
 rts.save_image("pose.png", 1 - np.concatenate(shown, axis=1)[..., 3])
-Image.open("pose.png")
+Image.open("pose.png").copy()
 
 # %% [markdown]
 # ## If yours fails

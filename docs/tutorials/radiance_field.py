@@ -94,7 +94,7 @@ for step in range(count):
 # %%
 shown = [start, images([cameras[held_out]])[0].detach().numpy(), pictures[held_out].numpy()]
 rts.save_image("radiance_field.png", np.concatenate(shown, axis=1))
-Image.open("radiance_field.png")
+Image.open("radiance_field.png").copy()
 
 # %% [markdown]
 # ## From a trained field

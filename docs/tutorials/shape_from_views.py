@@ -91,7 +91,7 @@ for step in range(count):
 # %%
 shown = [images(start, ball.faces), images(steps.decode(u).detach().numpy(), ball.faces), pictures.numpy()]
 rts.save_image("shape_from_views.png", np.concatenate([x[2] for x in shown], axis=1))
-Image.open("shape_from_views.png")
+Image.open("shape_from_views.png").copy()
 
 # %% [markdown]
 # ## Further

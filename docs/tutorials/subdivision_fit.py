@@ -61,7 +61,7 @@ print(f"loss {fit.history[0]:.4f} → {fit.loss:.6f}; control points off by {off
 # %%
 shown = [np.asarray(images(control)[0]) for control in (cube, fit.parameters.numpy(), truth)]
 rts.save_image("subdivision_fit.png", np.concatenate(shown, axis=1))
-Image.open("subdivision_fit.png")
+Image.open("subdivision_fit.png").copy()
 
 # %% [markdown]
 # ## Further

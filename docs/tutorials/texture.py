@@ -65,7 +65,7 @@ print(f"loss {fit.history[0]:.4f} → {fit.loss:.6f}")
 view = np.asarray(rts.render(scene(fit.parameters), cameras[0], (128, 128), background=(0, 0, 0)))[..., :3]
 large = [np.kron(np.clip(x, 0, 1), np.ones((4, 4, 1))) for x in (fit.parameters.numpy(), truth)]
 rts.save_image("texture.png", np.concatenate([*large, view], axis=1))
-Image.open("texture.png")
+Image.open("texture.png").copy()
 
 # %% [markdown]
 # ## If texels stay grey

@@ -61,7 +61,7 @@ for step in range(count):
 # %%
 shown = [np.asarray(images(v)[0]) for v in (ball, values.detach().numpy(), ring)]
 rts.save_image("topology.png", np.concatenate(shown, axis=1))
-Image.open("topology.png")
+Image.open("topology.png").copy()
 
 # %% [markdown]
 # ## How a hole begins

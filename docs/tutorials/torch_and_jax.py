@@ -60,7 +60,7 @@ colors = 0.5 + 0.5 * by_torch / np.abs(by_torch).max()
 pushed = rts.Part(surface, {"vertices": vertices, "colors": colors.astype(np.float32)}, "unlit")
 shown = [rts.render(part, camera, size, background=(0, 0, 0)) for part in (ring_of(vertices), pushed)]
 rts.save_image("torch_and_jax.png", np.concatenate(shown, axis=1))
-Image.open("torch_and_jax.png")
+Image.open("torch_and_jax.png").copy()
 
 # %% [markdown]
 # Arrays of torch and jax in one scene are an error. NumPy arrays may stand beside either, as constants.
