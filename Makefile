@@ -20,9 +20,9 @@ BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || co
 SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++ $(BROWSER)
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
-.PHONY: check demo test test-all test-xla apps warmup lint types wheel oldest clean system
+.PHONY: check demo docs test test-all test-xla apps warmup lint types wheel oldest clean system
 
-check: lint types test test-all test-xla apps wheel oldest
+check: lint types docs test test-all test-xla apps wheel oldest
 
 demo: $(VENV)/.demo
 	$(BIN)/rts demo -o out
@@ -43,6 +43,15 @@ test-xla: warmup
 apps: warmup $(VENV)/.apps
 	@for app in $(APPS); do echo "== $$app"; $(BIN)/python -m pytest $$app/tests || exit 1; done
 
+# The site, in build/site: tutorials are executed, and every warning and every dead link is an error. RTS_QUICK=1 makes
+# the pictures of tutorials small. Tutorials write pictures into the folder that they run in.
+docs: export JUPYTER_CONFIG_DIR := $(CURDIR)/build/pictures
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: warmup $(VENV)/.docs
+	mkdir -p build/pictures
+	echo '{"KernelManager": {"transport": "ipc"}}' > build/pictures/jupyter_nbconvert_config.json
+	cd build/pictures && $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml
+
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 warmup: system $(VENV)/.test $(VENV)/.warm
 
@@ -57,11 +66,13 @@ lint: $(VENV)/.dev
 types: $(VENV)/.apps $(VENV)/.dev
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
 
-# Build both distributions, and the applications; then, elsewhere and from wheels alone, the demo, the tests of the
-# example plugin, and a folder of COLMAP made a mesh.
+# Build and check the distributions, and the applications; then, elsewhere and from wheels alone, the demo, the tests of
+# the example plugin, and a folder of COLMAP made a mesh.
 wheel: $(VENV)/.dev
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
 	for app in $(APPS); do $(BIN)/python -m build --wheel --outdir dist $$app || exit 1; done
 	PYTHON=$(PYTHON) tests/wheel.sh dist $(EXAMPLE) constraints.txt
 	PYTHON=$(PYTHON) apps/wheels.sh dist constraints.txt
@@ -99,6 +110,10 @@ $(VENV)/.test: $(BIN)/python $(SOURCES) $(EXAMPLE)/pyproject.toml
 
 $(VENV)/.apps: $(VENV)/.test $(APPS:%=%/pyproject.toml)
 	$(INSTALL) $(APPS:%=-e './%[test]')
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.test $(SOURCES)
+	$(INSTALL) --group docs
 	@touch $@
 
 $(VENV)/.dev: $(BIN)/python $(SOURCES)

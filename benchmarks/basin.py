@@ -36,6 +36,7 @@ from rts.fitting.schedule import Stage
 from rts_compare.chart_style import PEER_COLORS
 
 RESULTS = Path(__file__).parent / "results"
+IMAGES = Path(__file__).parent.parent / "docs/images/results"
 SIZE = (64, 64)
 MESHES = {"teapot": "teapot_2464", "bunny": "bunny_5k", "nefertiti": "nefertiti"}
 FACES = 5000
@@ -227,7 +228,7 @@ def main() -> None:
         rows = run(args, rows, path)
     text = summary(rows)
     path.with_suffix(".md").write_text(text + "\n")
-    draw(rows, path.with_suffix(".png"))
+    draw(rows, (IMAGES if args.output == RESULTS else args.output) / "basin.png")
     print(text)
 
 

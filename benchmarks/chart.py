@@ -1,8 +1,9 @@
 """Speed against accuracy on all built-in scenes: what `rts compare` measures, as files to keep.
 
-Writes to benchmarks/results a PNG and a JSON a scene, and summary.md: what to take for 10 %, 3 % and 1 % of error; and
-chart.html, a page of all of them, which is not kept: `--draw` makes it of the JSON files. What is measured is kept in a
-folder of its own, and a run that is interrupted goes on:
+Writes a JSON a scene to benchmarks/results, and a picture of each to docs/images/results. summary.md says which
+settings stay within 10 %, 3 % and 1 % of error. chart.html, a page of all scenes, is not kept: `--draw` makes it of the
+JSON files. Measurements are kept in a folder of their own, and a run that is interrupted goes on. Afterwards
+`python -m benchmarks.pages` brings docs/results up to date:
 
     python -m benchmarks.chart                                 # most of two hours on two cores
     python -m benchmarks.chart --scenes "thin wires" -o /tmp/wires
@@ -29,11 +30,13 @@ from rts_compare.pareto_front import LEVELS, best_within, timed
 from rts_compare.png_chart import draw
 
 RESULTS = Path(__file__).parent / "results"
+IMAGES = Path(__file__).parent.parent / "docs/images/results"
 
 
 def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS)
+    parser.add_argument("--images", type=Path, help="folder of the pictures; by default docs/images/results, or OUTPUT")
     parser.add_argument("--scenes", nargs="+", choices=BUILTIN, default=list(BUILTIN))
     parser.add_argument("--kept", type=Path, default=Path("out/chart"), help="where measurements and truths are kept")
     parser.add_argument("--draw", action="store_true", help="only draw what the JSON files of the output hold")
@@ -42,7 +45,9 @@ def options() -> argparse.Namespace:
 
 def main() -> None:
     args = options()
-    args.output.mkdir(parents=True, exist_ok=True)
+    images = args.images or (IMAGES if args.output == RESULTS else args.output)
+    for folder in (args.output, images):
+        folder.mkdir(parents=True, exist_ok=True)
     found = []
     for scene in args.scenes:
         path = args.output / f"{file_name(scene)}.json"
@@ -51,7 +56,7 @@ def main() -> None:
             data = compare(scene, output=args.kept, truths=args.kept).data
             path.write_text(json.dumps(rounded(data), separators=(",", ":")) + "\n")
         found.append(json.loads(path.read_text()))
-        draw(found[-1], path.with_suffix(".png"))
+        draw(found[-1], images / f"{path.stem}.png")
     write_page(found, args.output / "chart.html")
     (args.output / "summary.md").write_text(summary(found))
     print(f"wrote {args.output}")
@@ -73,28 +78,40 @@ def own(comparison: Mapping, mode: str) -> list[Mapping]:
 
 def summary(comparisons: Sequence[Mapping]) -> str:
     """The recommended settings: over all scenes, and for each of them."""
+    count = len(comparisons)
+    opening = (
+        f"The least setting within an error in three quarters of {count} scenes, and its median time where it was "
+        "timed;\n256². Where no setting stays within the error so often, *at best* says in how many scenes one does.\n"
+    )
+    parts = [f"### {c['scene']['name']}\n\n{fastest(c)}" for c in comparisons]
+    return "\n".join([opening, recommended(comparisons), *parts])
+
+
+def recommended(comparisons: Sequence[Mapping]) -> str:
+    """The table of the least settings over all scenes, a line a mode and a column an error."""
     modes = [mode for mode in MODES if any(mode in c["modes"] for c in comparisons)]
-    header = ["mode", *(f"{level:.0%}" for level in LEVELS)]
-    overall = table(header, [[mode, *(advice(comparisons, mode, level) for level in LEVELS)] for mode in modes])
-    parts = [f"The least setting within an error in three scenes of four; median time, 256².\n\n{overall}"]
-    for comparison in comparisons:
-        lines = []
-        for mode in comparison["modes"]:
-            cells = []
-            for level in LEVELS:
-                rows = [row for row in comparison["rows"] if row["mode"] == mode]
-                best, peer = best_within(own(comparison, mode), level), best_within(rows, level)
-                text = "none" if best is None else f"{label(best)}: {best['ms']['median']:.3g} ms"
-                if peer is not None and "peer" in peer:
-                    text += f" (**{label(peer)}: {peer['ms']['median']:.3g} ms**)"
-                cells.append(text)
-            lines.append([mode, *cells])
-        parts.append(f"### {comparison['scene']['name']}\n\n{table(header, lines)}")
-    return "\n".join(parts)
+    lines = [[mode, *(advice(comparisons, mode, level) for level in LEVELS)] for mode in modes]
+    return table(["mode", *(f"{level:.0%}" for level in LEVELS)], lines)
+
+
+def fastest(comparison: Mapping) -> str:
+    """The table of the fastest settings of one scene; in brackets another renderer that is faster."""
+    lines = []
+    for mode in comparison["modes"]:
+        cells = []
+        for level in LEVELS:
+            rows = [row for row in comparison["rows"] if row["mode"] == mode]
+            best, peer = best_within(own(comparison, mode), level), best_within(rows, level)
+            text = "none" if best is None else f"{label(best)}: {best['ms']['median']:.3g} ms"
+            if peer is not None and "peer" in peer:
+                text += f" (**{label(peer)}: {peer['ms']['median']:.3g} ms**)"
+            cells.append(text)
+        lines.append([mode, *cells])
+    return table(["mode", *(f"{level:.0%}" for level in LEVELS)], lines)
 
 
 def advice(comparisons: Sequence[Mapping], mode: str, level: float) -> str:
-    """The least setting, surfaces as they are, within an error in three scenes of four; or else that of most scenes."""
+    """A cell of `recommended`; the least setting has the fewest samples a pixel, then the fewest layers."""
     scenes = [c for c in comparisons if mode in c["modes"]]
     within: dict[tuple, set[int]] = defaultdict(set)
     times: dict[tuple, dict[int, float]] = defaultdict(dict)
@@ -109,7 +126,7 @@ def advice(comparisons: Sequence[Mapping], mode: str, level: float) -> str:
                 times[key][number] = min(row["ms"]["median"], times[key].get(number, float("inf")))
     known = [key for key in within if times[key]]
     if not known:
-        return "none"
+        return "no setting in any scene"
     enough = [key for key in known if 4 * len(within[key]) >= 3 * len(scenes)]
     if enough:
         best = min(enough, key=lambda key: (side_length(key[2]), key[1], -len(within[key])))
@@ -117,7 +134,8 @@ def advice(comparisons: Sequence[Mapping], mode: str, level: float) -> str:
         best = max(known, key=lambda key: (len(within[key]), -statistics.median(times[key].values())))
     splatter, layers, supersample = best
     asked = f"`{splatter}`, K = {layers}, {samples_label(supersample)}"
-    return f"{asked}: {len(within[best])} of {len(scenes)}, {statistics.median(times[best].values()):.3g} ms"
+    text = f"{len(within[best])} of {len(scenes)}, {statistics.median(times[best].values()):.3g} ms"
+    return f"{asked}: {text}" if enough else f"{asked}: at best {text}"
 
 
 if __name__ == "__main__":

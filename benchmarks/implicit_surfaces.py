@@ -29,6 +29,7 @@ from benchmarks.meshes import DATA, normalised
 from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
+from rts.files.srgb import encode_srgb
 from rts_compare.environment import environment
 from rts_surfaces.implicit.fields import smooth_union, swept_sphere
 from rts_surfaces.implicit.narrow_band import NarrowBand
@@ -305,16 +306,29 @@ def _stability_chart(results: dict, path: Path) -> None:
 
 def mixed(output: Path, side: int) -> tuple[str, dict]:
     """A mesh, Bézier patches, a cage, an isosurface and a field that rays are cast at, in one image."""
+    from matplotlib.figure import Figure
+
     view = rts.Camera.look_at((0.0, 1.6, 6.6), (0, 0.0, 0), fov_y=22)
     parts = mixed_parts()
     torch_parts = [
         p.replace(theta={k: torch.from_numpy(np.asarray(v)).requires_grad_() for k, v in p.theta.items()})
         for p in parts
     ]
-    image = rts.render(torch_parts, view, (side, side * 5 // 2), layers=2, background=(1.0, 1.0, 1.0))
+    size = side, side * 5 // 2
+    image = rts.render(torch_parts, view, size, layers=2, background=(1.0, 1.0, 1.0))
     image[..., :3].square().mean().backward()
-    rts.save_image(output / "mixed.png", image.detach().numpy())
+    fine = rts.render(parts, view, size, layers=2, supersample=3, background=(1.0, 1.0, 1.0))
+    picture = encode_srgb(fine[side // 5 : -side // 6, :, :3].clip(0, 1))
+    figure = Figure(figsize=(10, 10 * picture.shape[0] / picture.shape[1]))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.imshow(picture, interpolation="antialiased")
+    axes.set_axis_off()
     names = ("mesh", "bezier", "subdivision", "isosurface", "sdf")
+    labels = ("triangle mesh", "Bézier patches", "subdivision", "isosurface on a lattice", "field met by rays")
+    for part, label in zip(parts, labels, strict=True):
+        x = float(view.project(np.asarray(part.transform)[:3, 3][None], size)[0, 0])
+        axes.text(x, picture.shape[0] - 6, label, ha="center", va="bottom", fontsize=10, color="#1f2937")
+    figure.savefig(output / "mixed.png", dpi=120)
     results = {
         name: {k: float(v.grad.norm()) for k, v in part.theta.items() if v.grad is not None}
         for name, part in zip(names, torch_parts, strict=True)

@@ -32,7 +32,7 @@ def started(count: int, *words: object, restarts: int = 0, threads: int = 1) -> 
         "PYTHONPATH": os.pathsep.join(filter(None, paths)),
         "OMP_NUM_THREADS": str(threads),
         "NUMBA_NUM_THREADS": str(threads),
-        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Restarts may hang without, see docs/many_views.md.
+        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Restarts may hang without, see docs/guides/many_views.md.
     }
     done = subprocess.run(
         [sys.executable, *launch, *map(str, words)], env=environment, capture_output=True, text=True, check=False

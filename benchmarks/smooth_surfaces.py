@@ -46,12 +46,6 @@ MOST_FACETS = 6_000_000
 """Beyond this there is no mesh with a facet a pixel."""
 COLUMNS = {"ms": ("ms", ".1f"), "gradient": ("gradient", ".2g"), "MiB": ("memory", ".0f")}
 REFINED, AS_FOUND, MESH, PIXEL = "refined", "as found", "mesh", "mesh, a facet a pixel"
-STYLES = {
-    REFINED: {"color": "#c2410c", "marker": "o"},
-    AS_FOUND: {"color": "#7c3aed", "marker": "D"},
-    MESH: {"color": "#1d4ed8", "marker": "s"},
-    PIXEL: {"color": "#15803d", "marker": "^"},
-}
 
 
 class Scene(NamedTuple):
@@ -116,7 +110,7 @@ class Contender(NamedTuple):
     """A way to render the shape.
 
     Attributes:
-        kind: a key of `STYLES`.
+        kind: `REFINED`, `AS_FOUND`, `MESH` or `PIXEL`.
         setting: its tolerance, or its rate.
         part: (control points, shader) → the part, differentiable.
         triangles: (size) → how many there are.
@@ -303,30 +297,6 @@ def written(rows: list[dict[str, Any]], title: str) -> str:
     )
 
 
-def chart(results: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    """Errors against time; a row of panels a size."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    figure = Figure(figsize=(15, 4.2 * len(results)), layout="constrained")
-    panels = figure.subplots(len(results), 4, squeeze=False)
-    for line, (title, rows) in zip(panels, results.items(), strict=True):
-        for axes, (shader, error) in zip(line, [(s, e) for e in ("outline", "gradient") for s in SHADERS], strict=True):
-            for kind, style in STYLES.items():
-                chosen = [row for row in rows if row["kind"] == kind]
-                errors = [row["outline"] if error == "outline" else row[shader]["gradient"] for row in chosen]
-                axes.loglog([row[shader]["ms"] for row in chosen], errors, label=kind, markersize=5, **style)
-            what = "outline off, pixels" if error == "outline" else "gradient off, relative"
-            axes.set(title=f"{title}, {shader}", xlabel="milliseconds an iteration", ylabel=what)
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter("{x:,g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.grid(alpha=0.3, which="both")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
-    figure.suptitle("Smooth surfaces, differentiated through their control points", fontsize=11)
-    figure.savefig(path, dpi=70)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/smooth"))
@@ -343,7 +313,6 @@ def main() -> None:
     text = "\n".join(written(rows, title) for title, rows in results.items())
     (args.output / "smooth.md").write_text(text)
     print(text)
-    chart(results, args.output / "smooth.png")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """A table of ways to fail against methods; each cell is an outcome with its figure.
 
 The rows are those of `rts_compare.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
-the output are stability.md, stability.json and stability.png, and copies to benchmarks/results. A run that is
-interrupted goes on; rows can be run alone:
+the output are stability.md, stability.json and stability.png. Copies go to benchmarks/results and docs/images/results.
+A run that is interrupted goes on; rows can be run alone:
 
     python -m benchmarks.stability                                    # all of it
     python -m benchmarks.stability --rows "grazing sheet" pose -o /tmp/rows --no-results
@@ -26,6 +26,7 @@ from rts_compare.failures.table_rows import ROWS
 from rts_compare.kept_measurements import KeptMeasurements
 
 RESULTS = Path(__file__).parent / "results"
+IMAGES = Path(__file__).parent.parent / "docs/images/results"
 COLORS = {"ok": "#CDE9D6", "degraded": "#FBE7A8", "failed": "#F4B6AB", "cannot": "#ECECEC"}
 HAND = "hand, over learning rates"
 
@@ -122,8 +123,9 @@ def main() -> None:
         print(hand.summary(found))
         hand.draw(found, args.output / "hand.png")
     if args.rows is None and not args.no_results:
-        for name in ("stability.md", "stability.json", "stability.png"):
+        for name in ("stability.md", "stability.json"):
             shutil.copy(args.output / name, RESULTS / name)
+        shutil.copy(args.output / "stability.png", IMAGES / "stability.png")
     print(f"wrote {args.output}")
 
 

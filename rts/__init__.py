@@ -89,7 +89,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *registry.built_in_attributes()})
 
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Adaptive",

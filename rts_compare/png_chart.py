@@ -48,7 +48,7 @@ PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
 """Inches; `LINE_HEIGHT` is the height of a text line in the list under a panel."""
 CHARACTER_WIDTH = 0.075
 """Width of a character in the text below all panels, inches."""
-LONGEST = 70
+LONGEST = 84
 """The most characters of a text line in the list under a panel."""
 
 

@@ -60,16 +60,39 @@ def run(page, **names):
     return document.namespace, first
 
 
+GUIDES = [page for page in PAGES if page.startswith(("docs/guides/", "docs/start/")) and "many_views" not in page]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("page", [page for page in GUIDES if blocks(page, "python")])
+def test_the_python_of_a_guide_runs(page, tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    names, _ = run(page)
+    for path in tmp_path.glob("*.png"):
+        assert np.ptp(rts.load_image(path)) > 0.1, path.name
+    if page.endswith("first_gradient.md"):
+        assert names["vertices"].grad.abs().max() > 0
+        np.testing.assert_allclose(names["fit"].parameters, names["truth"], atol=0.03)
+    if page.endswith("guides/gradients.md"):
+        assert {reason.kind for reason in names["check"].reasons} == {"constant"}
+        assert str(names["check"]).splitlines()[1] in "".join(blocks(page, "text"))
+
+
 @pytest.mark.thorough
 def test_the_python_of_the_readme_does_what_it_says(model):
     pytest.importorskip("torch")
     found, _ = run("README.md")
-    assert np.asarray(found["image"]).shape == (256, 256, 4) and Path("view.png").is_file()
-    drawn = rts.load_image("arrays.png")[..., 3]
+    drawn = rts.load_image("view.png")[..., 3]
     assert 0.02 < drawn.mean() < 0.5 and drawn[[0, -1]].max() == drawn[:, [0, -1]].max() == 0
     assert found["vertices"].grad.abs().max() > 0
-    assert found["fit"].loss < 1e-5 and found["fit"].parameters.abs().max() < 1e-3
-    assert float((found["residuals"](found["fit"].parameters) ** 2).mean()) < 1e-5  # Of `ImageResiduals`, too.
+    assert found["fit"].loss < 1e-5 and found["fit"].parameters.abs().max() < 5e-3  # From 0.1.
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
+    [code] = blocks("README.md", "python")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 22
 
 
 GUIDE = {
@@ -124,7 +147,7 @@ def test_the_python_of_the_guide_to_plugins_does_what_it_says(tmp_path, monkeypa
 def test_the_python_of_the_guide_to_many_views_does_what_it_says(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
-    names, first = run("docs/many_views.md")
+    names, first = run("docs/guides/many_views.md")
     shape, cameras = first["fit"], names["fit"]
     assert shape.loss < 0.3 * shape.validated[0][1] and (tmp_path / "fit.npz").is_file()
     assert [step for step, _ in shape.validated] == [0, 10, 20, 30, 40, 50, 59]
@@ -200,4 +223,5 @@ def test_every_command_line_works(page, model):
 def test_every_link_within_the_repository_leads_somewhere(page):
     folder = (ROOT / page).parent
     for target in re.findall(r"\]\(([^)#]*)(?:#[^)]*)?\)", (ROOT / page).read_text()):
-        assert not target or target.startswith("http") or (folder / target).exists(), f"{page}: {target}"
+        made = (folder / target).resolve() == ROOT / "docs/reference/commands.md"  # Written as the site is built.
+        assert not target or made or target.startswith("http") or (folder / target).exists(), f"{page}: {target}"

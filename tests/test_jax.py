@@ -104,7 +104,7 @@ def test_jacfwd_and_jacrev_are_a_loop_of_jvps(jax, scene):
 def test_hessian_is_that_of_torch(jax, scene):
     torch = pytest.importorskip("torch")
     eye = scene["eye"]
-    # As the README compiles them.
+    # As docs/guides/speed.md compiles them.
     options: dict = {"xla_backend_optimization_level": 1, "xla_disable_hlo_passes": "fusion"}
     hessian = jax.hessian(lambda e: loss_of("jax")(with_eye(scene, e), **SIMPLE))
     found = jax.jit(hessian, compiler_options=options)(eye)

@@ -133,7 +133,7 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
         """
         from pathlib import Path
         from rts.cli import main, pose_report
-        assert pose_report._plot(Path("convergence.png"), [1.0, 0.1]) == []
+        assert pose_report._plot(Path("convergence.png"), [1.0, 0.1], [2]) == []
         main._say_skipped_plot([])
         """,
     )

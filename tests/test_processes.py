@@ -23,7 +23,7 @@ def run(count, *args, restarts=0):
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, paths)),
         "OMP_NUM_THREADS": "1",
-        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Restarts may hang without, see docs/many_views.md.
+        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Restarts may hang without, see docs/guides/many_views.md.
     }
     done = subprocess.run(
         [*command, str(SCRIPT), *map(str, args)], env=environment, capture_output=True, text=True, timeout=300

@@ -1,4 +1,4 @@
-"""The figures of `run`: derivative images, error against time, failures."""
+"""The figures of `run`: derivative images, and failures. `benchmarks.pages` draws error against time."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ COLUMNS = {
     "single, K = 1": "single, K = 1",
     "multi, K = 2": "multi, K = 2",
     "visible, K = 2": "visible, K = 2",
-    "visible, K = 2, 2 × 2": "visible, K = 2, 2 × 2",
+    "visible, K = 2, 2 × 2": "visible, K = 2,\n2 × 2 samples",
     "DEODR": "DEODR",
-    "Mitsuba, 64 spp": "Mitsuba, 64 spp",
+    "Mitsuba, 64 spp": "Mitsuba,\n64 spp",
 }
 """Methods of the derivative images, and their titles."""
 SHOWN, CONTRAST = slice(36, 228), 2.0
 """Rows and columns of A, B and C that are shown, and the factor on their derivatives."""
+ENLARGED = {"A": (40, 96, 60, 116), "B": (96, 152, 168, 224), "C": (84, 140, 166, 222)}
+"""First and last row, first and last column of what is enlarged of them."""
+TITLES = {"A": "A: bunny\nover black", "B": "B: square\nbehind bunny", "C": "C: bunny\nbefore square"}
 CONTRAST_LOW = 10.0
 """The factor on low-passed differences."""
-OUTLINES = {"4 × 4 at outlines": "D", "4 × 4 around outlines": "P", "8 × 8 at outlines": "*"}
-"""Samples where outlines are, and their marks in the figure of times."""
 FAILURES = (
     ("wires 0.5 px", 2, (88, 168, 72, 152)),
     ("half-plane", 2, (116, 140, 116, 140)),
@@ -50,79 +51,42 @@ def show(axes, picture: np.ndarray, title: str = "", left: str = "") -> None:
 
 
 def derivatives(images: dict, against: dict, path: Path) -> None:
-    """Derivative images of A, B and C, like the paper's figure 4."""
+    """Derivative images of A, B and C, like the paper's figure 4, and how they differ from the truth, enlarged.
+
+    A scene has two lines: the picture with a frame around the part that is enlarged, and the derivatives there; beneath
+    each derivative its difference from the truth, after the blur of the scores.
+    """
     from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
 
     cases = [c for c in CASES if c in against]
-    columns = {m: title for m, title in COLUMNS.items() if any((c, m) in images for c in scenes)}
+    columns = {m: title for m, title in COLUMNS.items() if any((c, m) in images for c in cases)}
     if not cases:
         return
     count = 2 + len(columns)
-    figure = Figure(figsize=(2.6 * count, 2.6 * len(cases) + 0.8), layout="constrained")
-    for n, (line, scene) in enumerate(zip(figure.subplots(len(cases), count, squeeze=False), cases, strict=True)):
-        truth = against[scene].pixel
-        show(line[0], scenes.scene(scene).image()[SHOWN, SHOWN].clip(0, 1), "" if n else "image", scene)
-        pictures = {"truth": truth.derivative, **{title: images[scene, m] for m, title in columns.items()}}
-        for axes, (title, picture) in zip(line[1:], pictures.items(), strict=True):
-            show(axes, signed(picture[SHOWN, SHOWN], CONTRAST), "" if n else title)
-    figure.suptitle(f"Derivative of the image a pixel of motion × {CONTRAST:g}, grey where it is zero", fontsize=14)
-    figure.savefig(path, dpi=100)
-
-
-def error_vs_time(results: dict, path: Path) -> None:
-    """Error of the derivative against the time of a gradient; one panel a scene."""
-    from matplotlib.figure import Figure
-
-    errors = {(r["scene"], r["method"]): r["exact"]["low_relative_l2"] for r in results["rows"]}
-    cases = [c for c in CASES if any(r["scene"] == c for r in results["times"])]
-    if not cases:
-        return
-    figure = Figure(figsize=(4.6 * len(cases), 5.2), layout="constrained")
-    for axes, scene in zip(figure.subplots(1, len(cases), sharey=True, squeeze=False)[0], cases, strict=True):
-        for start, end, label, style in (
-            ("visible", ("2", "4"), "visible, K = 2, s × s samples a pixel", {"color": "#c2410c", "marker": "o"}),
-            *(
-                ("visible", (where,), f"the same, {where}", {"color": "#c026d3", "marker": marker, "linestyle": "none"})
-                for where, marker in OUTLINES.items()
-            ),
-            ("Mitsuba", ("",), "Mitsuba 3, direct_projective", {"color": "#1d4ed8", "marker": "s"}),
-            ("DEODR", ("",), "DEODR", {"color": "#15803d", "marker": "^"}),
-        ):
-            rows = [
-                r
-                for r in results["times"]
-                if r["scene"] == scene and r["method"].startswith(start) and r["method"].endswith(end)
-            ]
-            points = [(r["seconds"], errors[scene, r["method"]]) for r in rows]
-            axes.loglog(*np.array(points).reshape(-1, 2).T, label=label, **style)
-            place = {"xytext": (-6, -11), "ha": "right"} if start == "visible" else {"xytext": (6, 4)}
-            for point, row in zip(points, rows, strict=True):
-                text = _sampled(row["method"])
-                axes.annotate(text, point, textcoords="offset points", fontsize=9, color=style["color"], **place)
-        noise = results["scenes"][scene]["noise"]["exact"]["low_relative_l2"]
-        axes.axhline(noise, color="grey", linestyle="--", linewidth=1, label="noise of the truth")
-        axes.set_title(scene)
-        axes.set_xlabel("seconds of render and gradient")
-        axes.grid(alpha=0.3, which="both")
-        axes.margins(x=0.22)
-    figure.axes[0].set_ylabel("low-passed relative L2 of the derivative image")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=10)
+    figure = Figure(figsize=(1.75 * count, 3.6 * len(cases) + 0.6), layout="constrained")
+    lines = figure.subplots(2 * len(cases), count, squeeze=False)
+    for n, scene in enumerate(cases):
+        truth = against[scene].pixel.derivative
+        top, bottom, left, right = ENLARGED[scene]
+        rows, line, below = (slice(top, bottom), slice(left, right)), lines[2 * n], lines[2 * n + 1]
+        show(line[0], scenes.scene(scene).image()[SHOWN, SHOWN].clip(0, 1), "" if n else "picture", TITLES[scene])
+        corner = left - SHOWN.start - 0.5, top - SHOWN.start - 0.5
+        line[0].add_patch(Rectangle(corner, right - left, bottom - top, fill=False, edgecolor="white", linewidth=1.5))
+        show(line[1], signed(truth[rows], CONTRAST), "" if n else "truth")
+        for axes in below[:2]:
+            axes.set_axis_off()
+        below[1].text(0.98, 0.5, f"difference from\nthe truth, blurred,\n× {CONTRAST_LOW:g}", ha="right", va="center",
+                      transform=below[1].transAxes, fontsize=11)  # fmt: skip
+        for axes, under, (method, title) in zip(line[2:], below[2:], columns.items(), strict=True):
+            found = images[scene, method]
+            show(axes, signed(found[rows], CONTRAST), "" if n else title)
+            show(under, signed(low_pass(found - truth)[rows], CONTRAST_LOW))
     figure.suptitle(
-        "Error of the derivative image against the time of one render and gradient in a scalar motion, both axes "
-        "logarithmic.\nThe truth is a difference over ¼ pixel: one over a pixel blurs the derivative by as much as the "
-        "methods are off.",
-        fontsize=11,
+        f"Derivative of the picture a pixel of motion, × {CONTRAST:g}; grey is zero. Below, how far each is off.",
+        fontsize=13,
     )
-    figure.savefig(path, dpi=120)
-
-
-def _sampled(method: str) -> str:
-    """The label of a point beside its line; points at outlines are labelled in the legend."""
-    if method.startswith("Mitsuba"):
-        return method.split(", ")[1]
-    if method.endswith("outlines"):
-        return ""
-    return (method.split(", ")[2:] or ["1 × 1"])[0] if method.startswith("visible") else ""
+    figure.savefig(path, dpi=100)
 
 
 def failures(images: dict, against: dict, path: Path) -> None:

@@ -177,7 +177,6 @@ def main() -> None:
     (args.output / "accuracy.json").write_text(json.dumps(results, indent=1))
     (args.output / "accuracy.md").write_text(tables.document(results))
     figures.derivatives(images, against, args.output / "derivatives.png")
-    figures.error_vs_time(results, args.output / "error_vs_time.png")
     figures.failures(images, against, args.output / "failures.png")
     print(tables.summary(results))
     print(f"wrote {args.output}/accuracy.md, .json and figures")

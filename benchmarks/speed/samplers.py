@@ -173,34 +173,6 @@ def crossover(rows: list[dict], layers: int, size: int) -> float | None:
     return None
 
 
-def chart(rows: list[dict], path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    for axes, size in zip(figure.subplots(1, 2, sharey=True), SIZES, strict=True):
-        for sampler, color in zip(SAMPLERS, ("#c2410c", "#1d4ed8", "#15803d"), strict=True):
-            for layers, style in zip(LAYERS, ("-", "--", ":"), strict=True):
-                chosen = [r for r in rows if r["size"] == size and r["layers"] == layers]
-                axes.loglog(
-                    [r["faces"] for r in chosen],
-                    [r["sample"][sampler] for r in chosen],
-                    style,
-                    color=color,
-                    marker="o",
-                    markersize=3,
-                    label=f"{sampler}, K = {layers}",
-                )
-        for layers in LAYERS:
-            at = crossover(rows, layers, size)
-            if at is not None:
-                axes.axvline(at, color="grey", linewidth=0.8)
-                axes.text(at, 0.75, f"K = {layers}: embree ahead \nfrom {at / 1e3:.0f}K faces ", fontsize=8, ha="right")
-        axes.set(title=f"{size}²", xlabel="faces", ylabel="milliseconds to sample")
-        axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=7)
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/samplers"))
@@ -221,8 +193,7 @@ def main() -> None:
             at = crossover(rows, layers, size)
             print(f"{size}², K = {layers}: " + (f"embree ahead from {at:,.0f} faces" if at else "no crossover"))
     (args.output / "samplers.json").write_text(json.dumps(rows, indent=1))
-    chart(rows, args.output / "samplers.png")
-    print(f"wrote {args.output}/samplers.json and .png")
+    print(f"wrote {args.output}/samplers.json")
 
 
 if __name__ == "__main__":

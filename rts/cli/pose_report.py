@@ -20,6 +20,7 @@ from rts.scene.parts import Part
 
 PICTURE_SIDE, FRAMES = 512, 48
 PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)
+STAGE_COLORS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def write_report(
@@ -58,13 +59,13 @@ def write_report(
 
     save_image(folder / "before.png", picture(result.start, large))
     save_image(folder / "after.png", picture(result.pose, large))
-    save_image(folder / "target.png", large)
+    save_image(folder / "target.png", large[..., None] * np.array([*MARKED, 1.0]))  # Its alpha is the mask.
     moved = [result.trail[0]] + [b for a, b in zip(result.trail, result.trail[1:], strict=False) if _moved(a, b)]
     chosen = moved[:: -(-len(moved) // FRAMES)]
     frames = [picture(p, small) for p in [chosen[0]] * 4 + chosen + [result.pose] * 10]
     save_animation(folder / "animation.gif", frames, fps=8)
     names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
-    return [folder / name for name in names] + _plot(folder / "convergence.png", result.history)
+    return [folder / name for name in names] + _plot(folder / "convergence.png", result.history, result.levels)
 
 
 def _numbers(result: PoseFit) -> dict[str, Any]:
@@ -97,17 +98,28 @@ def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.nda
     return image + 0.85 * edge * (np.asarray(MARKED) - image)
 
 
-def _plot(path: Path, history: list[float]) -> list[Path]:
-    """Plot the loss over the steps. Returns a list of the file, or an empty one if matplotlib is missing."""
+def _plot(path: Path, history: Sequence[float], levels: Sequence[int]) -> list[Path]:
+    """Plot the loss over the steps, a line a stage: losses of two stages are of different images.
+
+    Returns a list of the file, or an empty one if matplotlib is missing.
+    """
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:
         return []
     figure = Figure(figsize=(6, 3.5), layout="constrained")
     axes = figure.subplots()
-    axes.semilogy(np.maximum(history, 1e-12), ".-", color="#c2410c", linewidth=1, markersize=4)
-    axes.set(xlabel="step", ylabel="loss", title="Silhouette, from coarse pixels to fine")
+    first = 0
+    for number, count in enumerate(levels):
+        losses = np.maximum(history[first : first + count], 1e-12)
+        steps, color = range(first, first + count), STAGE_COLORS[number % len(STAGE_COLORS)]
+        axes.semilogy(steps, losses, ".-", color=color, linewidth=1, markersize=4, label=f"stage {number + 1}")
+        first += count
+    axes.set(xlabel="step", ylabel="loss of the stage")
+    axes.set_title("Silhouette, coarse to fine: each stage compares other images", fontsize=10)
     axes.grid(alpha=0.3)
+    if len(levels) > 1:
+        axes.legend(frameon=False, fontsize=8)
     with writing(path):
         figure.savefig(path, dpi=120)
     return [path]

@@ -144,7 +144,7 @@ def levenberg_marquardt(
 
     The model of a robust loss has the loss's second derivative where that is positive enough (`Loss.weights`). With ρ'
     alone (iteratively reweighted least squares) the model would lie above the loss, but steps would be shorter: up to
-    2.7 times as many (benchmarks/RESULTS.md).
+    2.7 times as many (docs/results/hidden-masks.md).
 
     Args:
         terms: the terms of the loss; all of them count at every step.

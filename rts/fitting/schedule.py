@@ -63,7 +63,7 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
     An outline is pulled over one pixel only, to whichever outline is nearest, the right one or not. Blurred images
     show where most of an object is. So the first stage is of few pixels, with many samples each, and blurred by a
     sixteenth of the longer side. Later stages double the resolution; the last is the image itself, or as `largest`
-    says. From how far off poses are found: benchmarks/RESULTS.md, "Basin of convergence".
+    says. From how far off poses are found: docs/results/basin.md.
 
     Args:
         size: (height, width) of the residuals.

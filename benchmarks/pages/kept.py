@@ -1,0 +1,66 @@
+"""The JSON files of benchmarks/results, and tables that pages hold as they were written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rts_compare.builtin_scenes import BUILTIN
+from rts_compare.comparison import file_name
+
+RESULTS = Path(__file__).parents[1] / "results"
+PAGES = Path(__file__).parents[2] / "docs/results"
+
+
+@cache
+def kept(name: str) -> Any:
+    """What a JSON file of benchmarks/results holds."""
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def scenes() -> list[Mapping]:
+    """The comparisons of all built-in scenes that were measured, in the order of `rts compare list`."""
+    return [kept(file_name(name)) for name in BUILTIN if (RESULTS / f"{file_name(name)}.json").exists()]
+
+
+def scene(name: str) -> Mapping:
+    """The comparison of a built-in scene."""
+    return kept(file_name(name))
+
+
+def outcome(row: str, method: str) -> Mapping:
+    """A cell of the table of stability: its verdict, text and numbers."""
+    table = kept("stability")
+    cells = next(found["cells"] for found in table["rows"] if found["name"] == row)
+    return cells[table["methods"].index(method)]
+
+
+def written(page: str, *head: str, keys: int = 1) -> tuple[list[str], dict[str, list[str]]]:
+    """A table that stands on a page without JSON.
+
+    Args:
+        page: name of the page, without ".md".
+        head: texts of the table's first cells, such as "256², ms".
+        keys: how many cells name a line.
+
+    Returns:
+        The names of its other columns; and the name of each line, cells joined by " | " → its other cells, as text.
+    """
+    lines = iter((PAGES / f"{page}.md").read_text().splitlines())
+    columns = next(line for line in lines if line.startswith("| " + " | ".join(head) + " |"))
+    next(lines)
+    found = {}
+    for line in lines:
+        if not line.startswith("|"):
+            break
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        found[" | ".join(cells[:keys])] = cells[keys:]
+    return [cell.strip() for cell in columns.strip("|").split("|")][keys:], found
+
+
+def number(text: str) -> float:
+    """The number that a cell begins with, such as 4.35 of "4.35 (4.21–4.53)" and 2464 of "2,464"."""
+    return float(text.strip("*").split(" ")[0].replace(",", ""))

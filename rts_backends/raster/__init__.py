@@ -1,0 +1,1 @@
+"""The sampler that draws triangles on all cores."""
