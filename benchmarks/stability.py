@@ -1,7 +1,8 @@
 """A table of ways to fail against methods; each cell is an outcome with its figure.
 
 The rows are those of `rts_compare.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
-the output are stability.md, stability.json and stability.png. Copies go to benchmarks/results and docs/images/results.
+the output are stability.md, stability.json and stability.png. The hand's errors are in hand.json, its
+pictures in hand.png. Copies go to benchmarks/results and docs/images.
 A run that is interrupted goes on; rows can be run alone:
 
     python -m benchmarks.stability                                    # all of it
@@ -11,6 +12,7 @@ A run that is interrupted goes on; rows can be run alone:
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -122,10 +124,12 @@ def main() -> None:
         found = hand.measured(kept, hand.FACTORS, hand.SEEDS, hand.STEPS)
         print(hand.summary(found))
         hand.draw(found, args.output / "hand.png")
+        (args.output / "hand.json").write_text(json.dumps(hand.errors(found), indent=1) + "\n")
     if args.rows is None and not args.no_results:
-        for name in ("stability.md", "stability.json"):
+        for name in ("stability.md", "stability.json", "hand.json"):
             shutil.copy(args.output / name, RESULTS / name)
         shutil.copy(args.output / "stability.png", IMAGES / "stability.png")
+        shutil.copy(args.output / "hand.png", IMAGES.parent / "hand.png")
     print(f"wrote {args.output}")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.pages import charts
-from benchmarks.pages.__main__ import MARKED, PAGES, filled
+from benchmarks.pages.__main__ import DOCS, MARKED, filled
 from benchmarks.pages.headline import HEADLINES, ratio
 from benchmarks.pages.kept import kept, number
 from benchmarks.pages.tables import TABLES
@@ -14,13 +14,15 @@ from benchmarks.pages.tables import TABLES
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGES = DOCS / "results"
 MARKS = TABLES | HEADLINES
 ADVICE = "Run `python -m benchmarks.pages`."
 
 
-@pytest.mark.parametrize("page", sorted(PAGES.glob("*.md")), ids=lambda page: page.stem)
-def test_tables_of_results_are_those_of_the_files(page):
-    assert filled(page.read_text(), MARKS) == page.read_text(), ADVICE
+def test_tables_of_results_are_those_of_the_files():
+    pages = sorted(DOCS.rglob("*.md"))
+    assert sum(bool(MARKED.search(page.read_text())) for page in pages) > 4
+    assert not [page.name for page in pages if filled(page.read_text(), MARKS) != page.read_text()], ADVICE
 
 
 def test_each_table_stands_on_a_page():

@@ -1,4 +1,4 @@
-"""Bring docs/results up to date with the JSON files of benchmarks/results.
+"""Bring docs/results, and marked tables of other pages of docs, up to date with the files of benchmarks/results.
 
 A page holds prose and marked tables. A mark is a line `<!-- table: NAME -->`; the table, or list, reaches to the line
 `<!-- end -->`. This command fills each of them anew and draws the charts of the first page. Prose is left as it is:
@@ -19,7 +19,7 @@ from benchmarks.pages import charts
 from benchmarks.pages.headline import HEADLINES
 from benchmarks.pages.tables import TABLES
 
-PAGES = Path(__file__).parents[2] / "docs/results"
+DOCS = Path(__file__).parents[2] / "docs"
 MARKED = re.compile(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="change nothing, tell what is out of date")
     check = parser.parse_args().check
     stale = []
-    for page in sorted(PAGES.glob("*.md")):
+    for page in sorted(DOCS.rglob("*.md")):
         text = page.read_text()
         new = filled(text, TABLES | HEADLINES)
         if new != text:

@@ -29,7 +29,7 @@ def derivative(name: str, mode: str, level: float) -> list[str]:
     groups = {"ours": [row for row in rows if "peer" not in row]}
     groups |= {peer: [row for row in rows if row.get("peer") == peer] for peer in PEERS}
     best = {who: best_within(found, level) for who, found in groups.items()}
-    times = {who: row and row["ms"]["median"] for who, row in best.items()}
+    times = {who: None if row is None else row["ms"]["median"] for who, row in best.items()}
     cells = [_time(best[who], found) for who, found in groups.items()]
     setting = f"`{label(best['ours'])}`" if best["ours"] else LOST
     page = "[chart](speed-against-accuracy.md#" + name.replace(" ", "-") + ")"

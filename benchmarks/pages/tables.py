@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from benchmarks import basin
 from benchmarks.chart import fastest, own, recommended
 from benchmarks.pages.kept import kept, scene, scenes
+from benchmarks.paper import hand
 from benchmarks.report import table
 from rts_compare.comparison import file_name
 
@@ -28,6 +29,22 @@ def stability() -> str:
         cells = [MARKS[c["verdict"]] + c["text"] if c["verdict"] in MARKS else "–" for c in row["cells"]]
         lines.append([row["name"], *cells])
     return table(["", *found["methods"]], lines)
+
+
+def hand_rates() -> str:
+    """The hand's median errors by method and learning rate."""
+    return hand.summary(kept("hand"))
+
+
+def hand_seeds() -> str:
+    """A list: where each seed of the hand ends at the two rates beyond which nothing holds."""
+    fits = kept("hand")["fits"]
+    lines = []
+    for factor in list(next(iter(fits.values())))[-3:-1]:
+        ends = {m: " ".join(f"{run['error']:.3f}" for run in runs[factor]) for m, runs in fits.items()}
+        told = "; ".join(f"`{method}` {text}" for method, text in ends.items())
+        lines.append(f"At ×{factor} the seeds end at: {told}.")
+    return _items(*lines)
 
 
 def why() -> str:
@@ -129,6 +146,8 @@ def by_scene() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "stability": stability,
     "why": why,
+    "hand": hand_rates,
+    "hand-seeds": hand_seeds,
     "defects": defects,
     "medians": medians,
     "ratios": ratios,

@@ -283,6 +283,18 @@ def summary(found: dict[str, Any]) -> str:
     return f"{text}\nAt the start {begun:.4f}; DEODR's fitter {judge:.4f}.\n"
 
 
+def errors(found: dict[str, Any]) -> dict[str, Any]:
+    """The errors alone of what `measured` gives, in its form, as benchmarks/results/hand.json keeps them."""
+    fits = {
+        method: {
+            factor: [{"error": float(f"{run['error']:.4g}")} for run in runs] for factor, runs in by_factor.items()
+        }
+        for method, by_factor in found["fits"].items()
+    }
+    deodr = {"error": float(f"{found['deodr']['error']:.4g}")}
+    return {"fits": fits, "deodr": deodr, "start": [float(f"{e:.4g}") for e in found["start"]]}
+
+
 def draw(found: dict[str, Any], path: Path) -> None:
     """Errors against learning rates, the course of losses, and pictures of the fits."""
     import matplotlib
