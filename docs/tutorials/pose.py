@@ -31,7 +31,10 @@ camera = rts.Camera.look_at((1, 2, 4), (0, 0, 0))
 # %% [markdown]
 # ## The mask
 #
-# Here we make the mask ourselves, so that we know the answer. For a photograph, `rts.load_image("mask.png")` gives it.
+# Here we make the mask ourselves, so that we know the answer. Of a file that is white on black take one channel:
+# `rts.load_image("mask.png")[..., 0]`. Of a cut-out that is transparent around take `[..., 3]`, its alpha. Do not take
+# all four of an ordinary picture: its alpha is 1 everywhere, as if the shape filled it.
+#
 # A pose is six numbers: a rotation vector in radians, then a translation. `rts.rigid` makes a matrix of them.
 
 
