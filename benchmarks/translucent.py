@@ -82,8 +82,8 @@ def through_a_ball() -> list[rts.Part]:
 
 
 SCENES: dict[str, tuple[Callable[[], list[rts.Part]], int]] = {
-    "two half-planes over a card: the upper": (cards, 0),
-    "two half-planes over a card: the lower": (cards, 1),
+    "two panes over a card: the upper": (cards, 0),
+    "two panes over a card: the lower": (cards, 1),
     "a glass ball before stripes": (lambda: [ball(0.5), stripes(-1)], 0),
     "stripes behind a glass ball": (lambda: [ball(0.5), stripes(-1)], 1),
     "a card behind a glass ball": (through_a_ball, 1),

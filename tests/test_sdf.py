@@ -7,6 +7,7 @@ from test_torus import RADII, closed_form, some_rays
 
 import rts
 from rts.plugin_api.records import Samples
+from rts.rendering import settings
 from rts.testing import SurfaceConformance
 from rts_surfaces.implicit.casting import ball, box, cast, moving
 from rts_surfaces.implicit.fields import sphere, swept_sphere, union
@@ -341,3 +342,33 @@ class TestSdf(SurfaceConformance):
     @pytest.fixture
     def sampler(self):
         return "rays"
+
+
+def test_pictures_of_torch_are_the_same_in_every_mode_and_require_no_gradient():
+    torch = pytest.importorskip("torch")
+    part = rts.Sdf.example()
+    still = part.replace(theta={name: torch.tensor(x) for name, x in part.theta.items()})
+    camera = rts.Camera.look_at((1, 1.5, 3), (0, 0, 0))
+    image = rts.render(still, camera, (20, 24))
+    assert not image.requires_grad and image[..., 3].max() > 0.9
+    for mode in (torch.no_grad, torch.inference_mode):
+        with mode():
+            assert torch.equal(rts.render(still, camera, (20, 24)), image)
+
+
+@pytest.mark.parametrize("grad", [True, False])
+def test_bands_of_a_large_picture_have_the_gradient_of_the_whole(monkeypatch, grad):
+    torch = pytest.importorskip("torch")
+    part, camera = rts.Sdf.example(), rts.Camera.look_at((1, 1.5, 3), (0, 0, 0))
+
+    def image():
+        radii = torch.tensor(part.theta["radii"], requires_grad=grad)
+        return radii, rts.render(part.replace(theta={"radii": radii}), camera, (24, 20), supersample=3)
+
+    radii, whole = image()
+    monkeypatch.setattr(settings, "BAND", 500)
+    other, banded = image()
+    assert torch.allclose(whole, banded, atol=1e-6) and banded.requires_grad == grad
+    if grad:
+        slopes = [torch.autograd.grad((x * x).mean(), r)[0] for x, r in ((whole, radii), (banded, other))]
+        assert torch.allclose(*slopes, rtol=1e-4) and slopes[0].abs().min() > 1e-4

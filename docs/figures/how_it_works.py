@@ -72,11 +72,14 @@ def pipeline() -> Figure:
         x = 0.9 + 2.15 * n
         axes.add_patch(FancyBboxPatch((x, 0.95), 1.6, 1.25, boxstyle="round,pad=0.05", fc=color, ec=INK, lw=0.8))
         axes.text(x + 0.8, 1.98, name, ha="center", va="center", weight="bold", color=INK)
-        axes.text(x + 0.8, 1.42, text, ha="center", va="center", fontsize=7.5, color=INK)
-    for x, text in ((0.2, "θ"), (2.55, "U"), (4.7, ""), (6.85, ""), (9.0, "image")):
-        arrow = {"arrowstyle": "-|>", "mutation_scale": 10, "color": INK}
-        axes.add_patch(FancyArrowPatch((x, 1.57), (x + 0.6 if x < 9 else x + 0.45, 1.57), **arrow))
-        axes.text(x + 0.25, 1.72, text, ha="center", color=INK)
+        axes.text(x + 0.8, 1.42, text, ha="center", va="center", fontsize=8, color=INK)
+    arrow = {"arrowstyle": "-|>", "mutation_scale": 10, "color": INK}
+    for x, text in ((0.3, "θ"), (2.55, "U"), (4.7, ""), (6.85, ""), (9.0, "image")):
+        axes.add_patch(FancyArrowPatch((x, 1.57), (x + 0.42, 1.57), **arrow))
+        axes.text(x + 0.22, 1.72, text, ha="center", color=INK)
+    axes.plot((0.45, 0.45, 6.0), (1.95, 2.5, 2.5), color=INK, lw=0.8)
+    for x in (3.85, 6.0):  # The numbers themselves go to these steps, too.
+        axes.add_patch(FancyArrowPatch((x, 2.5), (x, 2.24), **arrow))
     back = {"arrowstyle": "-|>", "mutation_scale": 12, "color": ORANGE, "lw": 1.5}
     axes.add_patch(FancyArrowPatch((9.4, 0.7), (2.9, 0.7), **back))
     axes.text(6.2, 0.4, "derivatives, by the framework that owns θ", ha="center", color=ORANGE)

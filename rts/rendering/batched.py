@@ -76,7 +76,7 @@ def render_views(
 
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
-        EngineError: torch and jax arrays in one scene.
+        EngineError: torch and jax arrays in one scene, or arrays on two devices.
         PluginError: a plugin cannot be imported, such as for want of a package.
 
     Warns:

@@ -73,7 +73,7 @@ def render(
 
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
-        EngineError: torch and jax arrays in one scene.
+        EngineError: torch and jax arrays in one scene, or arrays on two devices.
         PluginError: a plugin cannot be imported, such as for want of a package.
 
     Warns:
@@ -167,7 +167,7 @@ def render_samples(
     Raises:
         InputError: an argument is wrong; the samples are of another number of parts, their apron is too narrow for the
             splatter, or samples that it needs were left out.
-        EngineError: torch and jax arrays in one scene.
+        EngineError: torch and jax arrays in one scene, or arrays on two devices.
     """
     if not isinstance(sampled, Sampled):
         raise InputError(f"sampled is {quoted(sampled)}; expected what rts.sample gave")

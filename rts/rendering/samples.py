@@ -64,7 +64,7 @@ def sample(
 
     Raises:
         InputError: an argument is wrong; the scene cannot be sampled.
-        EngineError: torch and jax arrays in one scene.
+        EngineError: torch and jax arrays in one scene, or arrays on two devices.
         PluginError: a plugin cannot be imported, such as for want of a package.
     """
     scene = Scene.of(parts, camera, sampler, engine)

@@ -37,6 +37,7 @@ class Adaptive:
             pixels are active too: at edges of colour on surfaces. Needs colours, which are missing in `rts.sample`,
             compiled programs and derivatives of several directions at once. None to ignore colours; 0.2 suits.
         thin: True if pixels are active, too, where triangles lie between samples: once more through all triangles.
+            Triangles that the near or far plane cuts, and those at depths of at most 0, are not looked for.
     """
 
     samples: int

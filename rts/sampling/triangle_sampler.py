@@ -410,7 +410,10 @@ class _Search:
         grid = layers, *self.shape.size
 
         def between(known: Entry, fragments: Fragments) -> np.ndarray | None:
-            return sampler.between(known.prepared, camera, view, self.cull, fragments.depth[0]) if self.thin else None
+            if not self.thin:
+                return None
+            found = sampler.between(known.prepared, camera, view, self.cull, fragments.depth[0])
+            return np.zeros(self.shape.size, np.float32) if found is None else found
 
         def draw(known: Entry) -> _Drawn:
             if not (count := len(known.proxy.faces)):

@@ -118,8 +118,10 @@ class Raster(TriangleSampler):
 
     def between(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
-    ) -> np.ndarray:
+    ) -> np.ndarray | None:
         """See `TriangleSampler.between`; triangles that the near or the far plane cuts are left out."""
+        if not self._draws:  # A subclass that prepares something else.
+            return None
         return between(prepared, camera, size, facing(camera, cull), depth)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -25,6 +26,10 @@ for _cls, _split, _join in Engine.records():
 
 _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, torch.uint8, torch.float16, torch.bfloat16}
 """Dtypes of tensors that are taken as they are; others may be complex, or quantized."""
+
+
+_running = threading.local()
+"""`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""
 
 
 def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
@@ -132,8 +137,8 @@ class TorchEngine(Engine):
         return all([x.is_cpu for x in arrays])
 
     def devices(self, arrays: Iterable[Any]) -> set[torch.device]:
-        """The devices of the tensors."""
-        return {x.device for x in arrays if isinstance(x, torch.Tensor)}
+        """The devices of the tensors. Single numbers on the CPU count for nothing: torch takes them beside any."""
+        return {x.device for x in arrays if isinstance(x, torch.Tensor) and (x.ndim or not x.is_cpu)}
 
     def exact_products(self, *arrays: torch.Tensor) -> bool:
         """True for two arrays of one dtype on the CPU, outside of `torch.autocast`."""
@@ -229,8 +234,10 @@ class TorchEngine(Engine):
         return x
 
     def concurrent(self) -> bool:
-        """True unless a transform, a compilation or inference mode is on: torch sets these for one thread alone."""
-        return not transformed() and not torch.is_inference_mode_enabled()
+        """True unless a transform, compilation, inference mode or `checkpoint` is on: these are one thread's alone."""
+        return (
+            not transformed() and not getattr(_running, "checkpoint", False) and not torch.is_inference_mode_enabled()
+        )
 
     def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:
         """See `Engine.split`: by `torch.split`, whose derivative is one array for all pieces."""
@@ -260,7 +267,15 @@ class TorchEngine(Engine):
         """See `Engine.checkpoint`: by `torch.utils.checkpoint`; under `torch.func` transforms all arrays are kept."""
         if not torch.is_grad_enabled() or transformed():
             return f(make())
-        return torch.utils.checkpoint.checkpoint(lambda: f(make()), use_reentrant=False)
+
+        def run() -> torch.Tensor:
+            _running.checkpoint = True
+            try:
+                return f(make())
+            finally:  # Also where torch stops it, once it has made again what was asked for.
+                _running.checkpoint = False
+
+        return torch.utils.checkpoint.checkpoint(run, use_reentrant=False)
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """See `Engine.jvp`: by forward-mode autodiff."""
@@ -270,17 +285,11 @@ class TorchEngine(Engine):
 
     def gradient_of_rows(self, f: Callable[[torch.Tensor], torch.Tensor], rows: torch.Tensor) -> torch.Tensor:
         """See `Engine.gradient_of_rows`: by reverse mode, which is faster here, and safe on several threads at once."""
-        if transformed() or torch_internals.forward_level() >= 0:
-            value, pull = torch.func.vjp(f, rows)[:2]
-            return pull(torch.ones_like(value))[0]
-        # `torch.func.vjp` does not work within `checkpoint`.
-        further = torch.is_grad_enabled()
-        with torch.enable_grad():
-            at = rows if rows.requires_grad else rows.detach().requires_grad_(True)
-            value = f(at).sum()
-            if not value.requires_grad:
-                return torch.zeros_like(rows)
-            return torch.autograd.grad(value, at, create_graph=further, materialize_grads=True)[0]
+        if getattr(_running, "checkpoint", False):  # Where torch refuses reverse mode within.
+            quiet_forward_mode()
+            return super().gradient_of_rows(f, rows)
+        value, pull = torch.func.vjp(f, rows)[:2]
+        return pull(torch.ones_like(value))[0]
 
     def jacobian(self, f: Callable) -> Callable:
         """See `Engine.jacobian`: by forward-mode autodiff, all unknowns in one vectorised pass."""
