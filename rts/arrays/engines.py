@@ -155,7 +155,7 @@ class Engine(Plugin):
         return False
 
     def devices(self, arrays: Iterable[Array]) -> set[Any]:
-        """The devices that these arrays are bound to; traced arrays, and those of other engines, count for nothing."""
+        """The devices that these arrays are bound to; arrays without values, and other engines', count for nothing."""
         return set()
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:

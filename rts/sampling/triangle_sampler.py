@@ -347,7 +347,7 @@ class _Search:
     hidden: Hidden | None
     entry: Entry | None
     cells: np.ndarray | None
-    thin: bool = False
+    thin: bool
 
     def in_place(self, sides: bool, exits: bool, pairs: bool) -> Samples:
         """Samples on the triangles, or refined by a surface that does not move them.

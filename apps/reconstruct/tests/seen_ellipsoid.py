@@ -42,5 +42,14 @@ def views(change=lambda image: image):
     return [rts.View(camera, change(image), name=f"{i}.png") for i, (camera, image) in enumerate(both)]
 
 
+def written(folder):
+    """A new folder of these pictures, as Blender has it."""
+    folder.mkdir()
+    for i, image in enumerate(images()):
+        rts.save_image(folder / f"{i}.png", image)
+    rts.save_views(folder / "transforms.json", views())
+    return folder
+
+
 def on_white(image):
     return image[..., :3] + 1 - image[..., 3:]

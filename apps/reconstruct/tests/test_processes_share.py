@@ -6,16 +6,14 @@ import sys
 
 import numpy as np
 import pytest
-from seen_ellipsoid import SIZE, images, views
-
-import rts
+from seen_ellipsoid import SIZE, written
 
 pytestmark = pytest.mark.thorough
 WORDS = f"--quick --steps 30 --size {SIZE} --texture 32 --held-out 4 --batch 4 --fit-cameras".split()
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
-    "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Processes may hang without, see docs/many_views.md.
+    "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Processes may hang without, see docs/guides/many_views.md.
 }
 
 
@@ -30,16 +28,10 @@ def ran(photos, out, *launcher):
 
 
 def test_two_processes_give_the_mesh_of_one(tmp_path):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for i, image in enumerate(images()):
-        rts.save_image(photos / f"{i}.png", image)
-    rts.save_views(photos / "transforms.json", views())
+    photos = written(tmp_path / "photos")
     one, table = ran(photos, tmp_path / "one")
     two, again = ran(photos, tmp_path / "two", "-m", "torch.distributed.run", "--nproc-per-node", "2")
     assert set(one) == set(two) and "atlas_texture" in one
-    for name in one:
-        print(name, np.abs(one[name].astype(float) - two[name]).max())
     for name in one:
         np.testing.assert_allclose(two[name], one[name], atol=1e-5, err_msg=name)
     assert table == again

@@ -12,7 +12,7 @@ import pytest
 import rts_reconstruct
 import trimesh
 from PIL import Image
-from seen_ellipsoid import CENTER, RADII, SIZE, cameras, images, on_white, views
+from seen_ellipsoid import CENTER, RADII, SIZE, cameras, images, on_white, views, written
 from typer.testing import CliRunner
 
 import rts
@@ -24,12 +24,7 @@ TINY = dict(steps=9, size=SIZE, batch=3, held_out=4, texture=32, quick=True, pro
 @pytest.fixture
 def folder(tmp_path):
     """A folder of pictures as Blender has it."""
-    path = tmp_path / "photos"
-    path.mkdir()
-    for i, image in enumerate(images()):
-        rts.save_image(path / f"{i}.png", image)
-    rts.save_views(path / "transforms.json", views())
-    return path
+    return written(tmp_path / "photos")
 
 
 # ----------------------------------------------------------------------------------------------------- the whole
