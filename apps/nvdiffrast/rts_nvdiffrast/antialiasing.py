@@ -15,6 +15,7 @@ import torch
 
 import rts
 from rts import InputError
+from rts.plugin_api.operations import take
 from rts_nvdiffrast.checks import (
     check_corners,
     check_devices,
@@ -185,7 +186,7 @@ class _Colors(rts.Shader):
         """See `rts.Shader`."""
         position = gbuffer["position"].detach()
         pixel = self.shaded.pixels(position, gbuffer["triangle"][:, 0].detach().round().long(), camera)
-        rgb = self.colors.index_select(0, pixel)
+        rgb = take(self.colors, pixel)
         return torch.cat([rgb, torch.ones_like(rgb[:, :1])], dim=1)
 
 

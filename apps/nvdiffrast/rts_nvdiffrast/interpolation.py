@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from rts import InputError
+from rts.plugin_api.operations import take
 from rts_nvdiffrast.checks import check_corners, check_devices, check_floats, check_rast, check_triangles
 
 
@@ -50,7 +51,7 @@ def interpolate(
         return _scattered(values, pixels, shape), values.new_zeros((*shape, 0))
     if check_floats("rast_db", rast_db, ("images", "height", "width", 4)).shape != rast.shape:
         raise InputError(f"rast_db has shape {tuple(rast_db.shape)} and rast {tuple(rast.shape)}; expected the same")
-    db = rast_db.reshape(-1, 2, 2).index_select(0, pixels)
+    db = take(rast_db.reshape(-1, 4), pixels).reshape(-1, 2, 2)
     sides = (corners[:, :2] - corners[:, 2:])[:, :, wanted]
     changes = (sides[..., None] * db[:, :, None, :]).sum(dim=1)
     return _scattered(values, pixels, shape), _scattered(changes.flatten(1), pixels, shape)
@@ -62,14 +63,14 @@ def _at_pixels(
     """The covered pixels (P,), u and v (P, 1) there, and the attributes (P, 3, A) of the triangles' corners."""
     flat = rast.reshape(-1, 4)
     pixels = (flat[:, 3].detach() > 0).nonzero()[:, 0]
-    at = flat.index_select(0, pixels)
+    at = take(flat, pixels)
     triangle = at[:, 3].detach().long() - 1
     if len(triangle) and int(triangle.max()) >= len(tri):
         raise InputError(f"rast shows triangle {int(triangle.max())} and tri has {len(tri)}; expected that of rasterize")
     rows = tri.index_select(0, triangle).long()
     if attr.ndim == 3 and len(attr) > 1:
         rows = rows + (pixels // (rast.shape[1] * rast.shape[2]) * attr.shape[1])[:, None]
-    corners = attr.reshape(-1, attr.shape[-1]).index_select(0, rows.reshape(-1))
+    corners = take(attr.reshape(-1, attr.shape[-1]), rows.reshape(-1))
     return pixels, at[:, :1], at[:, 1:2], corners.reshape(len(pixels), 3, attr.shape[-1])
 
 

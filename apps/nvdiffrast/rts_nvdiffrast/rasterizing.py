@@ -9,6 +9,7 @@ import torch
 
 import rts
 from rts import InputError
+from rts.plugin_api.operations import take
 from rts_nvdiffrast.checks import check_corners, check_devices, check_floats, check_triangles, described
 from rts_nvdiffrast.triangles import Image, Topology, images
 
@@ -186,7 +187,7 @@ def _layer(given: _Geometry, layer: int, grad_db: bool) -> tuple[torch.Tensor, t
     rows = given.tri.index_select(0, triangle).long()
     if given.ranges is None:
         rows = rows + (pixels // (height * width) * given.pos.shape[1])[:, None]
-    corners = given.pos.reshape(-1, 4).index_select(0, rows.reshape(-1)).reshape(-1, 3, 4)
+    corners = take(given.pos.reshape(-1, 4), rows.reshape(-1)).reshape(-1, 3, 4)
     uv, db, depth = _barycentrics(corners, pixels % width, pixels // width % height, given.size)
     values = torch.cat([uv, depth[:, None], triangle[:, None].to(uv.dtype) + 1], dim=1)
     rast, rast_db = (_scattered(x, pixels, (*shown.shape, 4)) for x in (values, db if grad_db else db.detach()))
