@@ -213,6 +213,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--seeds", type=int, default=3)
     given = parser.parse_args()
+    torch.set_num_threads(1)
     for seed in range(given.seeds):
         for size, method in product(given.sizes if "cube" in given.only else (), given.methods):
             name = f"{method} {size} {seed}"

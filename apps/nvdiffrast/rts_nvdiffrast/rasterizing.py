@@ -220,9 +220,9 @@ def _barycentrics(
     height, width = size
     px, py = ((2 * column + 1).to(x.dtype) / width - 1)[:, None], ((2 * row + 1).to(x.dtype) / height - 1)[:, None]
     x, y = x - px * w, y - py * w
-    j, k = [1, 2, 0], [2, 0, 1]
-    weight = x[:, j] * y[:, k] - y[:, j] * x[:, k]
-    along_x, along_y = y[:, j] * w[:, k] - w[:, j] * y[:, k], w[:, j] * x[:, k] - x[:, j] * w[:, k]
+    # Of the next corner, and of the one after it.
+    (x1, y1, w1), (x2, y2, w2) = ((x.roll(s, 1), y.roll(s, 1), w.roll(s, 1)) for s in (-1, 1))
+    weight, along_x, along_y = x1 * y2 - y1 * x2, y1 * w2 - w1 * y2, w1 * x2 - x1 * w2
     total = weight.sum(dim=1, keepdim=True)
     total = torch.where(total == 0, torch.ones_like(total), total)
     bary = weight / total
