@@ -164,6 +164,7 @@ def test_directions_that_are_none_are_zero_and_have_no_gradients():
     tex, uv, uv_da, _ = inputs()
     good = texture(tex, uv, uv_da, boundary_mode="cube")
     uv[0, 0, 0], uv[0, 1, 0, 1], uv[1, 2, 0, 2] = 0, torch.nan, torch.inf
+    uv_da[0, 0, 0, 1], uv_da[0, 1, 0] = torch.inf, torch.nan
     bad = [(0, 0, 0), (0, 1, 0), (1, 2, 0)]
     for x in (tex, uv, uv_da):
         x.requires_grad_()
