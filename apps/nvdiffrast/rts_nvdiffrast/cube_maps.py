@@ -39,7 +39,7 @@ def on_faces(directions: Tensor, directions_da: Tensor | None) -> tuple[Tensor, 
         Faces (…) int64; coordinates (…, 2) float on them, from 0 to 1; their derivatives (…, 2, 2), or None.
     """
     faces = faces_of(directions.detach())
-    turns = directions.new_tensor(FACES)[faces]
+    turns = torch.tensor(FACES, dtype=directions.dtype).to(directions.device)[faces]
     turned = (turns * directions[..., None, :]).sum(-1)
     flat, depth = turned[..., :2] / turned[..., 2:], turned[..., 2:]
     if directions_da is None:

@@ -96,7 +96,7 @@ def level_of(st_da: Tensor, height: int, width: int) -> Tensor:
     Returns:
         Levels (…), float, not yet limited to those that exist. Zero derivatives give a very negative one.
     """
-    texels = st_da * st_da.new_tensor([width, height])[:, None]
+    texels = st_da * torch.tensor([[width], [height]], dtype=st_da.dtype).to(st_da.device)
     xx, yy = (texels * texels).sum(-2).unbind(-1)
     half, xy = (xx - yy) / 2, texels.prod(-1).sum(-1)
     circle = (half == 0) & (xy == 0)  # There the root has no derivative.

@@ -85,9 +85,12 @@ def texture(
         uv = torch.where(valid, uv, 1.0)
         st_da = None if st_da is None else torch.where(valid[..., None], st_da, 0.0)
         faces, st, st_da = on_faces(uv, st_da)
-    level, share = _chosen(tex, len(levels) - 1, st_da, mip_level_bias, filter_mode)
+    level = mip_level_bias
+    if st_da is not None:
+        level = level_of(st_da, *tex.shape[-3:-1]) + (0.0 if mip_level_bias is None else mip_level_bias)
+    chosen, share = _chosen(level, len(levels) - 1, filter_mode == "linear-mipmap-nearest", tex.device)
     table = _Table.of(levels, boundary_mode == "cube")
-    sampled = _sampled(table, st, faces, level, share, boundary_mode, filter_mode == "nearest")
+    sampled = _sampled(table, st, faces, chosen, share, boundary_mode, filter_mode == "nearest")
     return sampled if valid is None else torch.where(valid, sampled, 0.0)
 
 
@@ -98,25 +101,22 @@ def _mipmaps(tex: Tensor, mip: MipStack | Sequence[Tensor] | None, limit: int | 
     if not isinstance(mip, (MipStack, list, tuple)):
         raise InputError(f"mip is a {type(mip).__name__}; expected a list of tensors, or texture_construct_mip(tex)")
     levels = list(mip.levels if isinstance(mip, MipStack) else mip)[:limit]
-    size = tuple(tex.shape[-3:-1])
+    height, width = tex.shape[-3:-1]
     for i, level in enumerate(levels):
-        size = halved_size(*size, i)
-        expected = (*tex.shape[:-3], *size, tex.shape[-1])
+        height, width = halved_size(height, width, i)
+        expected = (*tex.shape[:-3], height, width, tex.shape[-1])
         if not isinstance(level, Tensor) or tuple(level.shape) != expected or level.dtype != tex.dtype:
             given = f"{level.dtype} {tuple(level.shape)}" if isinstance(level, Tensor) else type(level).__name__
             raise InputError(f"mip[{i}] is {given}; expected {tex.dtype} {expected}, half of the one before")
     return levels
 
 
-def _chosen(
-    tex: Tensor, last: int, st_da: Tensor | None, bias: Tensor | None, filter_mode: str
-) -> tuple[Tensor, Tensor | None]:
-    """Mipmaps to sample, (B, h, w, K) int64 with K = 1 or 2, and the share of each, or None where K = 1."""
-    if last == 0:
-        return torch.zeros((1, 1, 1, 1), dtype=torch.int64, device=tex.device), None
-    level = 0.0 if st_da is None else level_of(st_da, *tex.shape[-3:-1])
-    level = torch.as_tensor(level if bias is None else level + bias).clamp(0, last)[..., None]
-    if filter_mode == "linear-mipmap-nearest":
+def _chosen(level: Tensor | None, last: int, nearest: bool, device: torch.device) -> tuple[Tensor, Tensor | None]:
+    """Mipmaps to sample for a level (B, h, w), int64 (B, h, w, K), and the share of each, or None where K = 1."""
+    if level is None or last == 0:
+        return torch.zeros((1, 1, 1, 1), dtype=torch.int64, device=device), None
+    level = level.clamp(0, last)[..., None]
+    if nearest:
         return level.detach().round().long().clamp(0, last), None
     lower = level.detach().floor().long().clamp(0, last - 1)
     upper_share = level - lower
@@ -154,12 +154,11 @@ class _Table:
             parts.append(part)
             count += part.shape[1]
         texels = torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
-        sizes = torch.tensor([(tex.shape[-2], tex.shape[-3]) for tex in levels], device=device)
-        return cls(texels, sizes, torch.tensor(starts, device=device), torch.cat(borders) if cube else None)
+        sizes = torch.tensor([(tex.shape[-2], tex.shape[-3]) for tex in levels]).to(device)
+        return cls(texels, sizes, torch.tensor(starts).to(device), torch.cat(borders) if cube else None)
 
-    def rows(self, texel: Tensor, level: Tensor, faces: Tensor | None) -> Tensor:
-        """Indices into `texels` (…) of texels (…, 2), [column, row], of mipmaps (…) and faces (…)."""
-        column, row = texel.unbind(-1)
+    def rows(self, column: Tensor, row: Tensor, level: Tensor, faces: Tensor | None) -> Tensor:
+        """Indices (…) into `texels`, from columns, rows, mipmaps and faces (…)."""
         start, width, height = self.starts[level], self.sizes[level, 0], self.sizes[level, 1]
         if self.borders is None or faces is None:
             return start + row * width + column
@@ -182,28 +181,29 @@ def _sampled(
     if boundary == "wrap":
         st = st - st.detach().floor()
     place = st[..., None, :] * sizes
+    if boundary == "clamp":
+        place = torch.minimum(place.clamp_min(0.5), sizes - 0.5)
+    # Along each axis the one or two texels to read, and their weights: (B, h, w, K, 2, 1 or 2).
     if nearest:
-        texel, weights = place.detach().floor().long()[..., None, :], torch.ones_like(place[..., :1])
+        texel = place.detach().floor().long()[..., None]
+        weights = torch.ones_like(place)[..., None]
     else:
-        if boundary == "clamp":
-            place = torch.minimum(place.clamp_min(0.5), sizes - 0.5)
         place = place - 0.5
-        low = place.detach().floor()
-        part = torch.stack([1 - (place - low), place - low], dim=-1)
-        texel = low.long()[..., None, :] + torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], device=low.device)
-        weights = (part[..., 1, :, None] * part[..., 0, None, :]).flatten(-2)
-    sizes = sizes[..., None, :]
-    inside = torch.minimum(texel.clamp_min(0), sizes - 1)
-    if boundary == "zero":
-        weights = weights * (texel == inside).all(-1)
-    if boundary == "wrap":
-        inside = texel % sizes
-    elif boundary == "cube" and not nearest:
-        inside = texel
+        lower = place.detach().floor()
+        texel = torch.stack([lower.long(), lower.long() + 1], dim=-1)
+        weights = torch.stack([1 - (place - lower), place - lower], dim=-1)
+    if boundary != "cube" or nearest:
+        beyond, sizes = texel, sizes[..., None]
+        if boundary == "wrap":
+            texel = torch.where(texel < 0, texel + sizes, torch.where(texel < sizes, texel, texel - sizes))
+        texel = torch.minimum(texel.clamp_min(0), sizes - 1)
+        if boundary == "zero":
+            weights = weights * (texel == beyond)
     if share is not None:
-        weights = weights * share[..., None]
-    faces = None if faces is None else faces[..., None, None]
-    return table.sum(table.rows(inside, level[..., None], faces).flatten(-2), weights.flatten(-2))
+        weights = torch.cat([weights[..., :1, :] * share[..., None, None], weights[..., 1:, :]], dim=-2)
+    faces = None if faces is None else faces[..., None, None, None]
+    rows = table.rows(texel[..., 0, None, :], texel[..., 1, :, None], level[..., None, None], faces)
+    return table.sum(rows.flatten(-3), (weights[..., 0, None, :] * weights[..., 1, :, None]).flatten(-3))
 
 
 def _check(tex: Tensor, uv: Tensor, uv_da: Tensor | None, bias: Tensor | None, boundary: str) -> None:
