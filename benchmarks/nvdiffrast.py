@@ -25,9 +25,10 @@ from scipy.spatial.transform import Rotation
 
 import rts
 from benchmarks import analytic_antialias
+from benchmarks.report import table
 
 FILE = Path(__file__).parent / "results/nvdiffrast.json"
-SIZES, STEPS, POSE_STEPS, POSE_SIZE = (4, 8, 16), 1000, 1000, 128
+SIZES, STEPS, POSE_STEPS, POSE_SIZE = (4, 8, 16), 1000, 1000, 64
 CLOSE = 1.0
 """Degrees within which a pose counts as found."""
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32) - 0.5
@@ -83,8 +84,8 @@ def by_pairs(faces: torch.Tensor = FACES) -> Render:
     return render
 
 
-def by_rts(samples: int = 3, faces: torch.Tensor = FACES) -> Render:
-    """`rts.render`."""
+def by_rts(samples: int = 3, splatter: str = "auto", faces: torch.Tensor = FACES) -> Render:
+    """`rts.render`, with samples at outlines; with no splatter, with as many everywhere."""
     camera = rts.Camera(np.eye(4), PROJECTION.double().numpy())
 
     def unlit(theta, gbuffer, camera):
@@ -96,7 +97,8 @@ def by_rts(samples: int = 3, faces: torch.Tensor = FACES) -> Render:
     def render(vertices, colors, rows, modelview, size):
         surface = surfaces.setdefault(id(rows), rts.Mesh(faces.numpy(), {"side": rows.numpy()}))
         part = rts.Part(surface, {"vertices": vertices, "side": colors}, unlit, transform=modelview)
-        return rts.render(part, camera, (size, size), supersample=rts.Adaptive(samples))[..., :3]
+        more = rts.Adaptive(samples) if splatter == "auto" else samples
+        return rts.render(part, camera, (size, size), supersample=more, splatter=splatter)[..., :3]
 
     return render
 
@@ -191,29 +193,89 @@ def pose(render: Render, seed: int, steps: int, size: int) -> float:
             loss.backward()
             optimizer.step()
         found.data /= found.data.norm()
-    return float(np.degrees(2 * np.arccos(min(1.0, abs(float(best @ truth) / float(best.norm()))))))
+    a, b = (q.double().numpy() / np.linalg.norm(q.double().numpy()) for q in (best, truth))
+    return float(np.degrees(4 * np.arcsin(min(np.linalg.norm(a - b), np.linalg.norm(a + b)) / 2)))
+
+
+def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
+    """How images differ at outlines: by method and beside the truth, of cubes in random poses.
+
+    Shares of pixels are in percent; differences are means over the pixels where two images differ by 0.001 in a channel.
+    """
+    rng, colors = np.random.default_rng(1), torch.tensor(np.random.default_rng(0).uniform(0.1, 1, (24, 3))).float()
+    sums, corners = dict.fromkeys(("pixels", "apart", "rts_nvdiffrast", "analytic", "none"), 0.0), torch.tensor(CORNERS)
+    methods = {"rts_nvdiffrast": by_module(), "analytic": by_pairs(), "truth": by_rts(16, "none")}
+    for _ in range(count):
+        view = modelview(torch.tensor(Rotation.random(random_state=rng).as_matrix(), dtype=torch.float32))
+        images = {name: render(corners, colors, SIDES, view, size) for name, render in methods.items()}
+        images["truth"] = images["truth"].flip(0)
+        images["none"] = by_rts(1, "none")(corners, colors, SIDES, view, size).flip(0)
+        apart = (images["rts_nvdiffrast"] - images["analytic"]).abs().amax(dim=2)
+        off = (images["none"] - images["truth"]).abs().amax(dim=2) > 1e-3
+        sums["pixels"] += 100 * (apart > 1e-3).float().mean().item() / count
+        sums["apart"] += apart[apart > 1e-3].mean().item() / count
+        for name in ("rts_nvdiffrast", "analytic", "none"):
+            sums[name] += (images[name] - images["truth"]).abs().amax(dim=2)[off].mean().item() / count
+    return sums
+
+
+def cube_table(results: dict) -> str:
+    """Means over seeds, and the number of them."""
+    rows = []
+    for size in SIZES:
+        cells = []
+        for method in METHODS:
+            found = [v for k, v in results["cube"].items() if k.startswith(f"{method} {size} ")]
+            cells.append(f"{statistics.fmean(found):.4f} ({len(found)})" if found else "–")
+        rows.append([f"{size}²", *cells])
+    return table(["image", *METHODS], rows)
+
+
+def pose_table(results: dict) -> str:
+    """How many poses were found, and the median of those."""
+    rows = []
+    for method in METHODS:
+        found = [v for k, v in results["pose"].items() if k.startswith(f"{method} ")]
+        near = [v for v in found if v < CLOSE]
+        rows.append([method, f"{len(near)} of {len(found)}", f"{statistics.median(near):.3f}°" if near else "–"])
+    return table(["method", f"within {CLOSE:g}°", "median of these"], rows)
+
+
+def outline_table(results: dict) -> str:
+    """Distances from the truth at outlines."""
+    found = results["outlines"]
+    names = {"none": "no antialiasing", "analytic": "analytic", "rts_nvdiffrast": "rts_nvdiffrast"}
+    return table(["method", "mean distance from the truth"], [[t, f"{found[n]:.3f}"] for n, t in names.items()])
+
+
+def time_table(results: dict) -> str:
+    """Milliseconds of each iteration."""
+    return table(["iteration", "ms"], [[name, f"{ms:.0f}"] for name, ms in results["time"].items()])
 
 
 def kept() -> dict:
     """Results so far."""
-    return json.loads(FILE.read_text()) if FILE.exists() else {"cube": {}, "pose": {}, "time": {}}
+    return json.loads(FILE.read_text()) if FILE.exists() else {"cube": {}, "pose": {}, "time": {}, "outlines": {}}
 
 
 def keep(kind: str, name: str, value: float) -> None:
     """Add a result to the file."""
     results = kept()
-    results[kind][name] = value
+    results.setdefault(kind, {})[name] = value
     FILE.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("cube", "pose"), nargs="+", default=("cube", "pose"))
+    parser.add_argument("--only", choices=("outlines", "cube", "pose"), nargs="+", default=("outlines", "cube", "pose"))
     parser.add_argument("--methods", choices=METHODS, nargs="+", default=tuple(METHODS))
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--seeds", type=int, default=3)
     given = parser.parse_args()
     torch.set_num_threads(1)
+    if "outlines" in given.only:
+        for name, value in outlines().items():
+            keep("outlines", name, value)
     for seed in range(given.seeds):
         for size, method in product(given.sizes if "cube" in given.only else (), given.methods):
             name = f"{method} {size} {seed}"

@@ -79,10 +79,10 @@ def antialias(
         raise InputError(
             f"topology_hash {described(topology_hash)}; expected what antialias_construct_topology_hash gave"
         )
-    drawn = getattr(rast, DRAWN, None) or Drawn(SAMPLES, _shown_ranges(rast) if pos.ndim == 2 else None)
+    drawn = getattr(rast, DRAWN, None) or Drawn(SAMPLES, _shown_ranges(rast) if pos.ndim == 2 else None, 0)
     values, motions = [], []
     for b, image in enumerate(images(pos, topology_hash, drawn.ranges)):
-        value, motion = _image(color[b], rast[b].detach(), image, drawn.samples)
+        value, motion = _image(color[b], rast[b].detach(), image, drawn)
         values.append(value)
         motions.append(motion)
     value = torch.stack(values)
@@ -190,7 +190,7 @@ class _Colors(rts.Shader):
         return torch.cat([rgb, torch.ones_like(rgb[:, :1])], dim=1)
 
 
-def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, samples: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, drawn: Drawn) -> tuple[torch.Tensor, torch.Tensor]:
     """An image (H, W, C) with antialiased outlines twice: with a derivative in colours, and with one in positions."""
     shaded = _Shaded(rast[..., 3].long() - 1, rast[..., 2], image)
     vertices, camera = image.seen.vertices, image.seen.camera
@@ -198,14 +198,24 @@ def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, samples: int) 
         return color, color.detach() + 0 * vertices.sum()
     background = _background(color, shaded.triangle < 0)
     part = rts.Part(image.surface, {"vertices": vertices.detach()}, _Colors(shaded, color))
-    sampled = rts.sample(
-        part, camera, color.shape[:2], sampler="raster", splatter="visible", supersample=rts.Adaptive(samples)
-    )
+    sampled = _sampled(part, camera, color.shape[:2], drawn)
     value = _over(rts.render_samples(sampled, part, camera, splatter="none"), background)
     if not vertices.requires_grad:
         return value, value
     part = part.replace(theta={"vertices": vertices}, shader=_Colors(shaded, color.detach()))
     return value, _over(rts.render_samples(sampled, part, camera, splatter="visible"), background.detach())
+
+
+def _sampled(part: rts.Part, camera: rts.Camera, size: Any, drawn: Drawn) -> Any:
+    """Samples of a layer of surfaces and of the one behind it."""
+    if drawn.layer == 0:
+        more = rts.Adaptive(drawn.samples)
+        return rts.sample(part, camera, size, sampler="raster", splatter="visible", supersample=more)
+    # Outlines of the first layer tell nothing of deeper ones, so all pixels have s² samples.
+    first = drawn.layer
+    sampled = rts.sample(part, camera, size, sampler="raster", layers=first + 2, supersample=drawn.samples)
+    layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n)) is not None}
+    return sampled.replace(**layers)
 
 
 def _over(image: torch.Tensor, background: torch.Tensor) -> torch.Tensor:

@@ -28,10 +28,12 @@ class Drawn(NamedTuple):
     Attributes:
         samples: number of samples along each side of a pixel at outlines.
         ranges: (B, 2) ranges of triangles; None in instanced mode.
+        layer: the layer of surfaces, 0 for the front.
     """
 
     samples: int
     ranges: np.ndarray | None
+    layer: int
 
 
 class RasterizeCudaContext:
@@ -191,7 +193,7 @@ def _layer(given: _Geometry, layer: int, grad_db: bool) -> tuple[torch.Tensor, t
     uv, db, depth = _barycentrics(corners, pixels % width, pixels // width % height, given.size)
     values = torch.cat([uv, depth[:, None], triangle[:, None].to(uv.dtype) + 1], dim=1)
     rast, rast_db = (_scattered(x, pixels, (*shown.shape, 4)) for x in (values, db if grad_db else db.detach()))
-    setattr(rast, DRAWN, Drawn(given.samples, given.ranges))
+    setattr(rast, DRAWN, Drawn(given.samples, given.ranges, layer))
     return rast, rast_db
 
 

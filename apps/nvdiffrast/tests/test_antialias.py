@@ -170,6 +170,26 @@ def test_ranges_are_images_of_their_own():
     torch.testing.assert_close(forgotten[2], image[2])
 
 
+def test_a_peeled_layer_has_outlines_of_its_own():
+    """A cube's back has the outline of its front; a square behind a smaller one has it only behind that."""
+    turned = scenes.CUBE @ scenes.rotation(torch.tensor([0.4, 0.6, 0.1])).T
+    for layer in range(2):
+        scale = torch.ones((), requires_grad=True)
+        pos = flat(scale * turned)
+        with dr.DepthPeeler(CONTEXT, pos, scenes.CUBE_FACES, (48, 48)) as peeler:
+            for _ in range(layer + 1):
+                rast, _ = peeler.rasterize_next_layer()
+        area = dr.antialias((rast[..., 3:] > 0).float(), rast, pos, scenes.CUBE_FACES).sum()
+        area.backward()
+        assert scale.grad.item() == pytest.approx(2 * area.item(), rel=0.05)
+    small, large = SQUARE, 1.5 * SQUARE + torch.tensor([0, 0, 0.5])
+    pos, tri = flat(torch.cat([small, large])), torch.cat([TWO, TWO + 4])
+    with dr.DepthPeeler(CONTEXT, pos, tri, (32, 32)) as peeler:
+        layers = [peeler.rasterize_next_layer()[0] for _ in range(2)]
+    back = dr.antialias((layers[1][..., 3:] > 0).float(), layers[1], pos, tri)
+    torch.testing.assert_close(back, mask(flat(small), TWO), atol=1e-6, rtol=0)  # Only behind the small one.
+
+
 def test_nothing_in_view_stays_as_it_is():
     pos = scenes.clip(scenes.CUBE, shift=(0, 0, 5.0)).requires_grad_()
     rast, _ = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (8, 8))
