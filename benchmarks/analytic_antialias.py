@@ -1,5 +1,6 @@
-"""Antialiasing by pairs of pixels, after Laine et al. 2020, "Modular Primitives for High-Performance Differentiable
-Rendering", section 3.4, in plain torch: a yardstick for `rts_nvdiffrast.torch.antialias`.
+"""Antialiasing by pairs of pixels in plain torch, a yardstick for `rts_nvdiffrast.torch.antialias`.
+
+After Laine et al. 2020, "Modular Primitives for High-Performance Differentiable Rendering".
 
 Two pixels side by side, or one above the other, show different triangles. The nearer triangle has an edge between the
 pixels' centres. If this edge is a silhouette (of one triangle, or of two on the same side of it in the image), then one
@@ -15,7 +16,7 @@ import torch
 
 
 def opposites(tri: torch.Tensor) -> torch.Tensor:
-    """(T, 3): for edge i of a triangle, from corner i to i + 1, the third corner of the triangle beyond; −1 for none."""
+    """(T, 3): for edge i of a triangle, from corner i on, the third corner of the triangle beyond; −1 for none."""
     edges, faces = defaultdict(list), tri.tolist()
     for t, face in enumerate(faces):
         for i in range(3):

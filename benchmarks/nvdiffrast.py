@@ -2,12 +2,11 @@
 
 The experiments are those of nvdiffrast's samples, written anew: a cube with unknown corners and colours in images of
 few pixels, and the pose of a cube whose sides have colours of their own. Three methods: `rts_nvdiffrast`; its
-rasterization with nvdiffrast's analytic antialiasing (`analytic_antialias`); and `rts.render` with 3 x 3 samples a pixel
-at outlines. Each method makes its own targets.
+rasterization with nvdiffrast's analytic antialiasing (`analytic_antialias`); and `rts.render` with 3 × 3 samples a
+pixel at outlines. Each method makes its own targets. Fits that results/nvdiffrast.json has are not repeated.
 
-    python -m benchmarks.nvdiffrast                # adds to results/nvdiffrast.json; runs that are there are not repeated
-    python -m benchmarks.nvdiffrast --only pose --seeds 8
-    python -m benchmarks.nvdiffrast --only time
+    python -m benchmarks.nvdiffrast
+    python -m benchmarks.nvdiffrast --only pose --seeds 20
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ def by_module(samples: int = 3, faces: torch.Tensor = FACES) -> Render:
 
 
 def by_pairs(faces: torch.Tensor = FACES) -> Render:
-    """The same rasterization, with nvdiffrast's antialiasing."""
+    """Rasterization by `rts_nvdiffrast`, with nvdiffrast's antialiasing."""
     import rts_nvdiffrast.torch as dr
 
     context, beyond = dr.RasterizeCudaContext(), analytic_antialias.opposites(faces)
@@ -161,7 +160,9 @@ def pose(render: Render, seed: int, steps: int, size: int) -> float:
     """Degrees by which the pose of a cube with coloured sides is off after a search at random and then descent."""
     rng = np.random.default_rng(seed)
     symmetries = Rotation.create_group("O")
-    side_colors = torch.tensor(np.repeat(np.random.default_rng(0).uniform(0.1, 1, (6, 3)), 4, axis=0).astype(np.float32))
+    side_colors = torch.tensor(
+        np.repeat(np.random.default_rng(0).uniform(0.1, 1, (6, 3)), 4, axis=0).astype(np.float32)
+    )
     corners = torch.tensor(CORNERS)
 
     def image(q):
@@ -200,7 +201,7 @@ def pose(render: Render, seed: int, steps: int, size: int) -> float:
 def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
     """How images differ at outlines: by method and beside the truth, of cubes in random poses.
 
-    Shares of pixels are in percent; differences are means over the pixels where two images differ by 0.001 in a channel.
+    Shares of pixels are in percent. Differences are means over pixels where two images differ by 0.001 in a channel.
     """
     rng, colors = np.random.default_rng(1), torch.tensor(np.random.default_rng(0).uniform(0.1, 1, (24, 3))).float()
     sums, corners = dict.fromkeys(("pixels", "apart", "rts_nvdiffrast", "analytic", "none"), 0.0), torch.tensor(CORNERS)

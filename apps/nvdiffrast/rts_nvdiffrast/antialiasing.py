@@ -124,7 +124,7 @@ class _WithoutMotion(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         value, rast = ctx.saved_tensors
         with torch.enable_grad():
             (share,) = torch.autograd.grad(value, rast, g, retain_graph=True, allow_unused=True)

@@ -30,7 +30,8 @@ def check_floats(name: str, x: Any, shape: tuple[int | str, ...], *others: tuple
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
-    return len(shape) == len(expected) and all(isinstance(e, str) or n == e for n, e in zip(shape, expected))
+    pairs = zip(shape, expected, strict=False)
+    return len(shape) == len(expected) and all(isinstance(e, str) or n == e for n, e in pairs)
 
 
 def check_triangles(tri: Any) -> torch.Tensor:

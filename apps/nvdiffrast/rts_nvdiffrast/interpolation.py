@@ -48,13 +48,13 @@ def interpolate(
     values = u * corners[:, 0] + v * corners[:, 1] + (1 - u - v) * corners[:, 2]
     shape = rast.shape[:3]
     if rast_db is None or not wanted:
-        return _scattered(values, pixels, shape), values.new_zeros((*shape, 0))
+        return scattered(values, pixels, shape), values.new_zeros((*shape, 0))
     if check_floats("rast_db", rast_db, ("images", "height", "width", 4)).shape != rast.shape:
         raise InputError(f"rast_db has shape {tuple(rast_db.shape)} and rast {tuple(rast.shape)}; expected the same")
     db = take(rast_db.reshape(-1, 4), pixels).reshape(-1, 2, 2)
     sides = (corners[:, :2] - corners[:, 2:])[:, :, wanted]
     changes = (sides[..., None] * db[:, :, None, :]).sum(dim=1)
-    return _scattered(values, pixels, shape), _scattered(changes.flatten(1), pixels, shape)
+    return scattered(values, pixels, shape), scattered(changes.flatten(1), pixels, shape)
 
 
 def _at_pixels(
@@ -66,7 +66,9 @@ def _at_pixels(
     at = take(flat, pixels)
     triangle = at[:, 3].detach().long() - 1
     if len(triangle) and int(triangle.max()) >= len(tri):
-        raise InputError(f"rast shows triangle {int(triangle.max())} and tri has {len(tri)}; expected that of rasterize")
+        raise InputError(
+            f"rast shows triangle {int(triangle.max())} and tri has {len(tri)}; expected that of rasterize"
+        )
     rows = tri.index_select(0, triangle).long()
     if attr.ndim == 3 and len(attr) > 1:
         rows = rows + (pixels // (rast.shape[1] * rast.shape[2]) * attr.shape[1])[:, None]
@@ -89,7 +91,7 @@ def _wanted(diff_attrs: Any, count: int) -> list[int]:
     return wanted
 
 
-def _scattered(values: torch.Tensor, pixels: torch.Tensor, shape: torch.Size) -> torch.Tensor:
+def scattered(values: torch.Tensor, pixels: torch.Tensor, shape: torch.Size) -> torch.Tensor:
     """An image (B, H, W, C) that has `values` (P, C) at `pixels`, and is 0 elsewhere."""
     flat = values.new_zeros((shape.numel(), values.shape[1]))
     return flat.index_copy(0, pixels, values).reshape(*shape, -1)

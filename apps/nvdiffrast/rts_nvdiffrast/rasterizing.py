@@ -11,6 +11,7 @@ import rts
 from rts import InputError
 from rts.plugin_api.operations import take
 from rts_nvdiffrast.checks import check_corners, check_devices, check_floats, check_triangles, described
+from rts_nvdiffrast.interpolation import scattered
 from rts_nvdiffrast.triangles import Image, Topology, images
 
 SAMPLES = 3
@@ -70,9 +71,7 @@ class RasterizeGLContext(RasterizeCudaContext):
         samples: as in `RasterizeCudaContext`.
     """
 
-    def __init__(
-        self, output_db: bool = True, mode: str = "automatic", device: Any = None, *, samples: int = SAMPLES
-    ):
+    def __init__(self, output_db: bool = True, mode: str = "automatic", device: Any = None, *, samples: int = SAMPLES):
         super().__init__(device, samples=samples)
 
 
@@ -95,9 +94,9 @@ def rasterize(
         grad_db: whether the second result has a derivative.
 
     Returns:
-        `rast` and `rast_db`, (B, H, W, 4) each, in the dtype of `pos`; 0 where there is no triangle. `rast` has u and v,
-        the perspective-correct weights of the first two corners; z/w; and the triangle's number plus one. u and v have
-        a derivative in `pos`. `rast_db` has ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y, per pixel, with a derivative in `pos`.
+        `rast` and `rast_db`, (B, H, W, 4) each, in the dtype of `pos`; 0 where there is no triangle. `rast` has u and
+        v, the perspective-correct weights of the first two corners; z/w; and the triangle's number plus one. u and v
+        have a derivative in `pos`. `rast_db` has ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y, per pixel, with a derivative in `pos`.
 
     Raises:
         InputError: an argument is of another type, shape or dtype, a triangle names no vertex, a range no triangles, or
@@ -192,7 +191,7 @@ def _layer(given: _Geometry, layer: int, grad_db: bool) -> tuple[torch.Tensor, t
     corners = take(given.pos.reshape(-1, 4), rows.reshape(-1)).reshape(-1, 3, 4)
     uv, db, depth = _barycentrics(corners, pixels % width, pixels // width % height, given.size)
     values = torch.cat([uv, depth[:, None], triangle[:, None].to(uv.dtype) + 1], dim=1)
-    rast, rast_db = (_scattered(x, pixels, (*shown.shape, 4)) for x in (values, db if grad_db else db.detach()))
+    rast, rast_db = (scattered(x, pixels, shown.shape) for x in (values, db if grad_db else db.detach()))
     setattr(rast, DRAWN, Drawn(given.samples, given.ranges, layer))
     return rast, rast_db
 
@@ -212,7 +211,7 @@ def _triangles(image: Image, size: tuple[int, int], layer: int) -> torch.Tensor:
 def _barycentrics(
     corners: torch.Tensor, column: torch.Tensor, row: torch.Tensor, size: tuple[int, int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """u and v (P, 2), their changes from pixel to pixel (P, 4), and z/w (P,) of corners (P, 3, 4) at some pixels.
+    """U and v (P, 2), their changes from pixel to pixel (P, 4), and z/w (P,) of corners (P, 3, 4) at some pixels.
 
     Edge functions in homogeneous coordinates relative to the pixel, so that few digits cancel; in float64 where the
     device has it.
@@ -234,12 +233,6 @@ def _barycentrics(
     still = bary.detach()
     depth = ((still * z.detach()).sum(dim=1) / (still * w.detach()).sum(dim=1)).clamp(-1, 1)
     return bary[:, :2].to(dtype), db.to(dtype), depth.to(dtype)
-
-
-def _scattered(values: torch.Tensor, pixels: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
-    """An image of some shape (…, C) that has `values` (P, C) at `pixels` (P,), and is 0 elsewhere."""
-    flat = values.new_zeros((int(np.prod(shape[:-1])), shape[-1]))
-    return flat.index_copy(0, pixels, values).reshape(shape)
 
 
 def set_log_level(level: int) -> None:

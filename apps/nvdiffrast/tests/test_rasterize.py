@@ -154,7 +154,8 @@ class TestArguments:
         other = dr.RasterizeGLContext(output_db=True, mode="manual")
         other.set_context()
         torch.testing.assert_close(
-            dr.rasterize(other, scenes.TRIANGLE, scenes.ONE, SIZE), dr.rasterize(context, scenes.TRIANGLE, scenes.ONE, SIZE)
+            dr.rasterize(other, scenes.TRIANGLE, scenes.ONE, SIZE),
+            dr.rasterize(context, scenes.TRIANGLE, scenes.ONE, SIZE),
         )
         other.release_context()
 
@@ -162,7 +163,10 @@ class TestArguments:
         "changes, message",
         [
             ({"glctx": None}, "glctx is NoneType; expected a RasterizeCudaContext"),
-            ({"pos": scenes.TRIANGLE[..., :3]}, r"pos has shape \(1, 3, 3\) and dtype float32; expected a tensor \(images"),
+            (
+                {"pos": scenes.TRIANGLE[..., :3]},
+                r"pos has shape \(1, 3, 3\) and dtype float32; expected a tensor \(images",
+            ),
             ({"pos": scenes.TRIANGLE.half()}, "dtype float16"),
             ({"pos": scenes.TRIANGLE.numpy()}, "pos is ndarray"),
             ({"tri": scenes.ONE.float()}, "tri has shape .* dtype float32; expected a tensor"),
