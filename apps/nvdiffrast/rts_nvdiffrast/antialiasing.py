@@ -152,13 +152,13 @@ class _Shaded(NamedTuple):
         """
         height, width = self.triangle.shape
         at = camera.project(position, (height, width))[:, :2]
-        limit = torch.tensor([width - 1, height - 1], device=at.device)
+        limit = torch.tensor([width - 1, height - 1]).to(at.device)
         own = torch.minimum(at.floor().long().clamp_min(0), limit)
         chosen = own[:, 1] * width + own[:, 0]
         rest = (self.triangle.reshape(-1)[chosen] != triangle).nonzero()[:, 0]
         if not len(rest):
             return chosen
-        steps = torch.tensor(AROUND, device=at.device)
+        steps = torch.tensor(AROUND).to(at.device)
         near = own[rest, None] + steps
         inside = ((near >= 0) & (near <= limit)).all(dim=2)
         near = torch.minimum(near.clamp_min(0), limit)

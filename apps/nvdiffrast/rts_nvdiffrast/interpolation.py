@@ -52,7 +52,7 @@ def interpolate(
     if check_floats("rast_db", rast_db, ("images", "height", "width", 4)).shape != rast.shape:
         raise InputError(f"rast_db has shape {tuple(rast_db.shape)} and rast {tuple(rast.shape)}; expected the same")
     db = take(rast_db.reshape(-1, 4), pixels).reshape(-1, 2, 2)
-    sides = (corners[:, :2] - corners[:, 2:])[:, :, wanted]
+    sides = torch.stack([corners[:, :2, i] - corners[:, 2:, i] for i in wanted], dim=2)
     changes = (sides[..., None] * db[:, :, None, :]).sum(dim=1)
     return scattered(values, pixels, shape), scattered(changes.flatten(1), pixels, shape)
 

@@ -24,7 +24,7 @@ _level = [1]
 
 
 class Drawn(NamedTuple):
-    """What `antialias` needs to know of a call of `rasterize`, and is not told by its arguments.
+    """Facts about a call of `rasterize` that `antialias` is not told by its arguments.
 
     Attributes:
         samples: number of samples along each side of a pixel at outlines.
@@ -55,14 +55,14 @@ class RasterizeCudaContext:
         self.samples = samples
 
     def set_context(self) -> None:
-        """Nothing: there is no OpenGL context."""
+        """Do nothing: there is no OpenGL context."""
 
     def release_context(self) -> None:
-        """Nothing: there is no OpenGL context."""
+        """Do nothing: there is no OpenGL context."""
 
 
 class RasterizeGLContext(RasterizeCudaContext):
-    """The same as `RasterizeCudaContext`.
+    """Another name of `RasterizeCudaContext`, with the arguments of nvdiffrast's class.
 
     Args:
         output_db: accepted and ignored: image-space derivatives are always there.
