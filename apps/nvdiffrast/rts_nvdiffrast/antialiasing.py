@@ -48,7 +48,7 @@ def antialias(
     share of u and v in the derivative of *this* image is taken off `rast` again. Gradients of other images that come
     from the same `rast` keep theirs, and so do attributes, textures and other calls of `antialias`. An image that is
     antialiased twice, one call after the other, has its outlines counted twice. The share is found by going backwards
-    from this image to `rast`; so shading runs backwards twice.
+    from this image to `rast`; so shading runs backwards twice. Where `pos` has no gradient, nothing is taken off.
 
     Args:
         color: (B, H, W, C), shaded at the pixels of `rast`; float32 or float64.
@@ -56,7 +56,7 @@ def antialias(
         pos: as in `rasterize`.
         tri: as in `rasterize`.
         topology_hash: the result of `antialias_construct_topology_hash` for `tri`; None to look for one.
-        pos_gradient_boost: factor on the derivative in `pos`.
+        pos_gradient_boost: factor on the derivative in `pos`, of outlines and of colours that move.
 
     Returns:
         (B, H, W, C). Pixels away from outlines are those of `color`.
@@ -75,10 +75,9 @@ def antialias(
         raise InputError(f"shapes are {shapes}; expected as many images, and color and rast of one size")
     if topology_hash is None:
         topology_hash = Topology.of(tri)
-    elif not isinstance(topology_hash, Topology):
-        raise InputError(
-            f"topology_hash {described(topology_hash)}; expected what antialias_construct_topology_hash gave"
-        )
+    elif not isinstance(topology_hash, Topology) or len(topology_hash.faces) != len(tri):
+        given = described(topology_hash) if not isinstance(topology_hash, Topology) else "is of other triangles"
+        raise InputError(f"topology_hash {given}; expected what antialias_construct_topology_hash gave for tri")
     drawn = getattr(rast, DRAWN, None) or Drawn(SAMPLES, _shown_ranges(rast) if pos.ndim == 2 else None, 0)
     values, motions = [], []
     for b, image in enumerate(images(pos, topology_hash, drawn.ranges)):
@@ -86,10 +85,10 @@ def antialias(
         values.append(value)
         motions.append(motion)
     value = torch.stack(values)
-    if rast.requires_grad and value.requires_grad:
-        value = _WithoutMotion.apply(value, rast)
     if not pos.requires_grad:
         return value
+    if rast.requires_grad and value.requires_grad:
+        value = _WithoutMotion.apply(value, rast)
     motion = torch.stack(motions)
     return value + pos_gradient_boost * (motion - motion.detach())
 

@@ -123,6 +123,12 @@ class TestMotionCountsOnce:
         image.mean().backward()
         assert shift.grad.item() == pytest.approx(-self.SLOPE, rel=0.02)
 
+    def test_without_a_gradient_here_u_and_v_keep_theirs(self):
+        def loss(_, image, color, rast, pos):
+            return dr.antialias(color, rast, pos.detach(), TWO)[:, 2:-2, 2:-2].mean()
+
+        assert self.slope(loss) == pytest.approx(-self.SLOPE, rel=1e-3)
+
     def test_attributes_keep_their_gradient(self):
         attr = (4 * SQUARE[:, :1]).contiguous().requires_grad_()
         pos = flat(4 * SQUARE).requires_grad_()
@@ -212,6 +218,7 @@ RAST = dr.rasterize(CONTEXT, scenes.TRIANGLE, scenes.ONE, (8, 8))[0]
         ({"pos": scenes.TRIANGLE.expand(2, -1, -1)}, "expected as many images"),
         ({"tri": scenes.ONE + 1}, "tri names rows 1 to 3"),
         ({"topology_hash": scenes.ONE}, "expected what antialias_construct_topology_hash gave"),
+        ({"topology_hash": dr.antialias_construct_topology_hash(TWO)}, "topology_hash is of other triangles"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(changes, message):
