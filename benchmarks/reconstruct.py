@@ -100,7 +100,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", nargs="*", default=["spot", "bunny", "lego"])
     parser.add_argument("--start", default="ball")
+    parser.add_argument("--surface", default="mesh")
+    parser.add_argument("--light", action="store_true")
+    parser.add_argument("--quick", action="store_true")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/reconstruct"))
     options = parser.parse_args()
     for shape in options.shapes:
-        run(shape, options.output, {"start": options.start})
+        run(shape, options.output, {name: getattr(options, name) for name in ("start", "surface", "light", "quick")})

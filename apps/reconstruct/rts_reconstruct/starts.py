@@ -62,18 +62,8 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
             "start is 'hull', which needs to know where the object is; the pictures have neither alpha nor masks: "
             "add masks, or start from 'ball' or a mesh"
         )
-    axis = np.linspace(-REACH, REACH, LATTICE)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    least, seen = np.ones(len(points)), np.zeros(len(points), int)
-    for view in pictures.views:
-        alpha = view.image[..., 3]
-        x, y = np.moveaxis(np.asarray(view.camera.project(points, view.size)), -1, 0)[:2]
-        inside = visible(view, points)
-        found = scipy.ndimage.map_coordinates(alpha, [y[inside] - 0.5, x[inside] - 0.5], order=1, mode="nearest")
-        least[inside] = np.minimum(least[inside], found)
-        seen += inside
-    least[seen < 2] = 0  # Space that nobody looks into is no object.
-    values = scipy.ndimage.gaussian_filter(least.reshape((LATTICE,) * 3), 0.7)
+    least = least_alpha(pictures, LATTICE)
+    values = scipy.ndimage.gaussian_filter(least, 0.7)
     labels, count = cast(Any, scipy.ndimage.label(values > 0.5))
     if count == 0:
         raise rts.InputError(
@@ -86,6 +76,27 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
     found = surface.extract({"values": values.astype(np.float32)})
     mesh = trimesh.Trimesh(found.vertices, found.faces)
     return max(mesh.split(only_watertight=False), key=lambda piece: len(piece.faces))
+
+
+def lattice_points(count: int) -> np.ndarray:
+    """The points (count³, 3) of a lattice that reaches as far as a hull's."""
+    axis = np.linspace(-REACH, REACH, count)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def least_alpha(pictures: Pictures, count: int) -> np.ndarray:
+    """The least alpha (count, count, count) of the views that see a lattice's points; 0 where fewer than two do."""
+    points = lattice_points(count)
+    least, seen = np.ones(len(points)), np.zeros(len(points), int)
+    for view in pictures.views:
+        alpha = view.image[..., 3]
+        x, y = np.moveaxis(np.asarray(view.camera.project(points, view.size)), -1, 0)[:2]
+        inside = visible(view, points)
+        found = scipy.ndimage.map_coordinates(alpha, [y[inside] - 0.5, x[inside] - 0.5], order=1, mode="nearest")
+        least[inside] = np.minimum(least[inside], found)
+        seen += inside
+    least[seen < 2] = 0  # Space that nobody looks into is no object.
+    return least.reshape((count,) * 3)
 
 
 def visible(view: rts.View, points: np.ndarray) -> np.ndarray:

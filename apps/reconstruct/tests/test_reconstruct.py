@@ -189,7 +189,7 @@ def test_bad_input_is_one_line(folder, tmp_path):
     out = ["-o", tmp_path / "out"]
     assert "expected a whole number, at least 3" in told(folder, *out, "--steps", 0)
     assert "expected three numbers, such as 1,1,1" in told(folder, *out, "--background", "red")
-    assert "expected 'mesh' or 'subdivision'" in told(folder, *out, "--surface", "isosurface")
+    assert "expected 'mesh', 'subdivision' or 'isosurface'" in told(folder, *out, "--surface", "nurbs")
     assert "no file none.obj" in told(folder, *out, "--start", "none.obj")
     assert "at least 16 texels" in told(folder, *out, "--texture", 3)
     assert "left to fit; expected at least two" in told(folder, *out, "--held-out", 1)
