@@ -18,6 +18,8 @@ RADIUS = 0.57
 """The ball's radius, as a share of that of a ball that all cameras see."""
 LATTICE, REACH = 64, 1.1
 """Points of a hull's lattice along each axis, and how far it reaches from the origin."""
+CLOSED = 5
+"""The width of a window, in points of the lattice; gaps of a hull that it does not fit into are filled."""
 
 
 def start(kind: str | Path, pictures: Pictures) -> trimesh.Trimesh:
@@ -62,7 +64,8 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
             "start is 'hull', which needs to know where the object is; the pictures have neither alpha nor masks: "
             "add masks, or start from 'ball' or a mesh"
         )
-    least = least_alpha(pictures, LATTICE)
+    # A mesh whose thin tunnels close has walls that cross, and cannot lose the tunnel.
+    least = scipy.ndimage.grey_closing(least_alpha(pictures, LATTICE), size=(CLOSED,) * 3)
     values = scipy.ndimage.gaussian_filter(least, 0.7)
     labels, count = cast(Any, scipy.ndimage.label(values > 0.5))
     if count == 0:
