@@ -272,7 +272,7 @@ class _Run:
         if self.settings.cameras and self.pictures.held_out:
             self.model = posing.posed(self.model, self.pictures, self.settings)
         if light:
-            self.model = job.shared(lambda: texturing.unlit(self.model))
+            self.model = job.shared(lambda: texturing.in_even_light(self.model))
         rows = measures.measured(self.model, self.pictures)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None

@@ -42,7 +42,7 @@ def _baked(model: Model, size: int) -> Model:
     return model._replace(atlas=Atlas(uv, faces, texture.astype(np.float32)))
 
 
-def unlit(model: Model) -> Model:
+def in_even_light(model: Model) -> Model:
     """The model whose light is apart from its colours, which then are as in even light; see `light.fitted`."""
     normals = np.asarray(trimesh.Trimesh(model.vertices, model.faces, process=False).vertex_normals)
     known = light.fitted(model.vertices, normals, model.colors)

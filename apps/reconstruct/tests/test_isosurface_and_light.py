@@ -149,7 +149,7 @@ def test_a_model_in_its_light_looks_as_before():
     points = np.asarray(trimesh.creation.icosphere(4).vertices, np.float32)
     seen = light.encoded(patched(points) * light.irradiance(points, LIGHT))
     before = texturing.baked(ball(1.0)._replace(colors=np.float32(seen)), 256)
-    after = texturing.unlit(before)
+    after = texturing.in_even_light(before)
     camera = rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=45)
     pair = [np.asarray(rts.render(model.part, camera, (64, 64))) for model in (before, after)]
     assert np.abs(pair[0] - pair[1]).mean() < 0.003
