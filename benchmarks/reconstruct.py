@@ -114,6 +114,7 @@ def run(name: str, folder: Path, options: dict[str, Any]) -> None:
     found = rts_reconstruct.reconstruct(views, folder / name, held_out=every, **options)
     if light:
         apart = rts_reconstruct.reconstruct(views, folder / name, held_out=every, light=True, resume=True, **options)
+        assert apart.model.light is not None
         print(f"{name}: albedo off by {albedo_off(found, name):.1f} % as seen, {albedo_off(apart, name):.1f} % apart;")
         print(f"the light:\n{np.round(apart.model.light, 2)}\nPSNR {apart.psnr:.1f} dB")
     vertices = found.pictures.world.outside(found.model.vertices)

@@ -13,11 +13,12 @@ import rts
 
 DARK = 0.05
 """The least irradiance, so that colours can be divided by it."""
-PAIRS, REACH, LEAST = 60_000, 0.06, 2.5
+PAIRS, REACH, LEAST = 30_000, 0.2, 2.5
 """The most pairs of vertices that are compared; how far apart they may be, in radii of the object; or if that is more,
-in distances of nearest ones."""
-SCALE = 0.05
-"""The difference of log colours from which on a pair counts less and less, as one of two materials."""
+in distances of nearest ones. Of very near ones normals are too noisy, which makes the light too even.
+"""
+SCALE = 0.03
+"""The difference of log colours from which on a pair's own counts less, as one of two materials."""
 BLACK, WHITE = 0.05, 0.98
 """Encoded colours beyond which a picture tells nothing of the light."""
 
@@ -79,7 +80,7 @@ def fitted(points: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> np.nd
         shade = torch.log(irradiance(way, torch.cat([torch.ones(1, 3), p["light"]])))
         return weights * (difference - (shade[first] - shade[second]))
 
-    loss = rts.Loss("cauchy", f_scale=SCALE)
+    loss = rts.Loss("soft_l1", f_scale=SCALE)
     fit = rts.fit(residuals, {"light": torch.zeros(8, 3)}, method="lm", loss=loss, progress=False)
     return np.concatenate([np.ones((1, 3), np.float32), fit.parameters["light"].numpy()])
 

@@ -173,6 +173,6 @@ def test_colours_in_even_light_are_nearer_to_the_albedo(tmp_path):
         assert found.psnr > 24
         assert (b"KHR_materials_unlit" in (tmp_path / "mesh.glb").read_bytes()) != told
         assert (tmp_path / "light.json").exists() == told
-    assert off[1] < 0.5 * off[0], off  # 0.36 of it was measured.
+    assert off[1] < 0.5 * off[0], off  # 0.38 of it was measured.
     known = json.loads((tmp_path / "light.json").read_text())["irradiance"]
     assert known["1"] == [1, 1, 1] and known["x"][0] > known["x"][2] > 0.1
