@@ -14,8 +14,10 @@ from rts.arrays.engines import is_traced, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Hidden, Request, Sampled
-from rts.errors import InputError
+from rts.contracts.surface import TriangleSurface
+from rts.errors import InputError, InputWarning, warn
 from rts.plugin_base import promised
+from rts.registry import name_of
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
@@ -131,7 +133,7 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidde
     `hidden` tells which samples to drop; traced ones may stay.
     """
     samples, alone, listed = [], len(scene.parts) == 1, request.cells
-    for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
+    for part, sampler, entry in zip(scene.parts, scene.chosen(request.between), scene.entries, strict=True):
         camera = grid.camera.within(part.transform)
         own_request = replace(request, entry=entry, hidden=hidden if alone else None)
         own = sampler.sample(part, camera, grid.size, count, own_request)
@@ -139,6 +141,12 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidde
             check_samples(own, grid.size if listed is None else tuple(listed.shape), sampler)
         else:
             own = at_cells(check_samples(own, grid.size, sampler), listed, request.capacity)
+        if request.between and listed is None and own.between is None and isinstance(part.surface, TriangleSurface):
+            warn(
+                f"thin of Adaptive is True, and the sampler {name_of('rts.samplers', sampler)} does not tell what lies "
+                f"between samples of {part.surface!r}; give sampler='raster' (to rts.prepare, if it built the parts)",
+                InputWarning,
+            )
         samples.append(own)
     sampled = merge(samples, count)
     # Traced arrays have the shape of the worst case anyway.
@@ -166,7 +174,8 @@ def with_fine(
     flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
 
     def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
-        request = Request(capacity, listed, facing="facing" in reads, exits="exit" in reads and gradient)
+        exits = "exit" in reads and gradient
+        request = Request(capacity, listed, facing="facing" in reads, exits=exits, between=adaptive.thin)
         return _taken(scene, grid, request, count, hidden)
 
     fine = fine_samples(coarse, cells, where, taken, hidden, settings.layers, settings.capacity, flat)
