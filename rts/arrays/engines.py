@@ -248,6 +248,14 @@ class Engine(Plugin):
         """
         return f(make())
 
+    def choose(self, which: Array, usual: Callable[[], Array], rare: Callable[[], Array]) -> Array:
+        """The result of `usual()` if `which` () bool is true, else that of `rare()`, arrays of one shape and dtype.
+
+        Where `which` is true, `rare` would give the same: the default calls it where the value of `which` is hidden.
+        For the gradient `rare` may run again, so that `usual` need not make room for its intermediate arrays.
+        """
+        return usual() if self.known(which) else rare()
+
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
         """The gradient (N, C) of a function of rows (N, C) of which each value (N,) depends on its own row alone.
 

@@ -92,6 +92,10 @@ class Room(NamedTuple):
     columns: int
     cells: int
 
+    def share(self, of_all: float) -> Room:
+        """A share of the room."""
+        return Room(math.ceil(of_all * self.columns), math.ceil(of_all * self.cells))
+
 
 def rounded(count: int) -> int:
     """The least 2ⁿ or 3·2ⁿ that is at least `count` and 16: few shapes, so that compiled programs are reused."""

@@ -242,6 +242,11 @@ class JaxEngine(Engine):
         operand = make()
         return jax.checkpoint(lambda: f(operand))()
 
+    def choose(self, which: jax.Array, usual: Callable[[], jax.Array], rare: Callable[[], jax.Array]) -> jax.Array:
+        """See `Engine.choose`: a traced program has both functions, by `jax.lax.cond`; under `vmap` it runs both."""
+        # Intermediate arrays of either would be results of both, for the gradient: zeros as large as those of `rare`.
+        return jax.lax.cond(which, usual, jax.checkpoint(rare))
+
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""
         return jax.jvp(f, (primal,), (tangent,))
