@@ -27,11 +27,13 @@ class Engine(Plugin):
         name: the name of its entry point.
         namespace: the array-API namespace of its arrays.
         differentiates: whether it has derivatives: `value_and_grad`, `jvp`, `jacobian` and `optimizer`.
+        branches: whether its compiled programs hold both functions of `choose`.
     """
 
     name: ClassVar[str]
     namespace: ClassVar[Any]
     differentiates: ClassVar[bool] = True
+    branches: ClassVar[bool] = False
 
     # ------------------------------------------------------------------------------------- methods of every framework
 
@@ -251,8 +253,8 @@ class Engine(Plugin):
     def choose(self, which: Array, usual: Callable[[], Array], rare: Callable[[], Array]) -> Array:
         """The result of `usual()` if `which` () bool is true, else that of `rare()`, arrays of one shape and dtype.
 
-        Where `which` is true, `rare` would give the same: the default calls it where the value of `which` is hidden.
-        For the gradient `rare` may run again, so that `usual` need not make room for its intermediate arrays.
+        An engine that `branches` chooses when a compiled program runs; others have to know the value. For the gradient
+        `rare` may run again, so that programs need no room for its intermediate arrays where `usual` runs.
         """
         return usual() if self.known(which) else rare()
 

@@ -216,9 +216,7 @@ class Finer(NamedTuple):
 
         def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
             exits = "exit" in reads and gradient
-            request = Request(
-                capacity, listed, facing="facing" in reads, exits=exits, between=settings.thin
-            )
+            request = Request(capacity, listed, facing="facing" in reads, exits=exits, between=settings.thin)
             return _taken(scene, grid, request, count, hidden)
 
         given = settings.layers, settings.capacity, flat, layout

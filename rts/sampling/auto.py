@@ -66,7 +66,8 @@ def choose(part: Part, *, static: bool, thin: bool = False) -> Choice:
     if faces < STATIC_FACES:
         return Choice("raster", f"{faces} triangles are drawn faster than rays find them (below {STATIC_FACES})")
     if thin:
-        return Choice("raster", f"it tells what lies between samples (thin=True), and embree, for {faces} faces, cannot")
+        reason = f"{faces} triangles that stay would suit embree; thin=True asks for raster, which tells of thin things"
+        return Choice("raster", reason)
     try:
         registry.plugin("rts.samplers", "embree")
     except PluginError as error:

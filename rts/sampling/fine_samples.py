@@ -18,7 +18,6 @@ from rts.sampling.hidden import HiddenRule, planned, with_layers_that_count
 from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, Room, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
 
-
 FEW = 1 / 6
 """A share of all pixels at outlines that few images exceed: compiled programs have a branch with room for these."""
 
@@ -93,13 +92,15 @@ class Known(NamedTuple):
 
     def find(self, *values: np.ndarray) -> np.ndarray:
         """Active pixels (H, W) bool, from the values of `arrays`, on the host."""
-        return active(**dict(zip(self.arrays, values, strict=True)), sizes=self.sizes, apron=self.apron, where=self.where)
+        given = dict(zip(self.arrays, values, strict=True))
+        return active(**given, sizes=self.sizes, apron=self.apron, where=self.where)
 
     def values(self, engine: Engine) -> list[np.ndarray] | None:
         """The values of `arrays`; None if some are traced."""
         found = [engine.known(x) for x in self.arrays.values()]
         values = [x for x in found if x is not None]
-        return values if len(values) == len(found) and self.arrays["row"].ndim == 3 else None
+        # Under `vmap` of torch values are those of all items.
+        return values if len(values) == len(found) and values[0].ndim == 3 else None
 
     def laid_out(self, engine: Engine, grid: FineGrid, room: Room) -> Layout:
         """The layout of traced samples, as far as there is room."""
@@ -111,9 +112,11 @@ class Known(NamedTuple):
 
 
 def few_laid_out(coarse: Sampled, grid: FineGrid, where: Where) -> Layout | None:
-    """The layout of traced samples in a `FEW` of the room for all pixels, which a few outlines need; else None."""
+    """The layout of traced samples in a share `FEW` of the room; None if a program cannot choose, or need not."""
     known, engine = Known.of(coarse, where), engine_of(coarse)
-    return None if known.values(engine) is not None else known.laid_out(engine, grid, grid.room(None, 1).share(FEW))
+    if not engine.branches or known.values(engine) is not None:
+        return None
+    return known.laid_out(engine, grid, grid.room(None, 1).share(FEW))
 
 
 def fine_samples(

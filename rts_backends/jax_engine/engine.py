@@ -15,7 +15,7 @@ from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
-from rts_backends.jax_engine import host, operations, row_blocks
+from rts_backends.jax_engine import choice, host, operations, row_blocks
 from rts_backends.jax_engine.used_rows import UsedRows
 
 for _cls, _split, _join in Engine.records():
@@ -46,6 +46,7 @@ class JaxEngine(Engine):
 
     name = "jax"
     namespace = jnp
+    branches = True
     _error: RtsError | None = None
 
     def __init__(self):
@@ -243,9 +244,8 @@ class JaxEngine(Engine):
         return jax.checkpoint(lambda: f(operand))()
 
     def choose(self, which: jax.Array, usual: Callable[[], jax.Array], rare: Callable[[], jax.Array]) -> jax.Array:
-        """See `Engine.choose`: a traced program has both functions, by `jax.lax.cond`; under `vmap` it runs both."""
-        # Intermediate arrays of either would be results of both, for the gradient: zeros as large as those of `rare`.
-        return jax.lax.cond(which, usual, jax.checkpoint(rare))
+        """See `Engine.choose`; all items of a batch take one branch: `usual` if `which` is true for all."""
+        return choice.choose(which, usual, rare)
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""
