@@ -32,7 +32,7 @@ from rts_compare.png_chart import draw
 
 RESULTS = Path(__file__).parent / "results"
 IMAGES = Path(__file__).parent.parent / "docs/images/results"
-MORE = {"thin wires": [Adaptive(4, thin=True)]}
+MORE = {"thin wires": [Adaptive(4, thin=True), Adaptive(8, thin=True)]}
 """Values of `supersample` that are measured on some scenes alone, by scene."""
 
 

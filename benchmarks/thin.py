@@ -8,6 +8,7 @@ marks are pixels of meshes without thin things that `thin` makes active. The cub
 
     python -m benchmarks.thin
     python -m benchmarks.thin --mitsuba 4 16 64
+    python -m benchmarks.thin --truths 8 16
     python -m benchmarks.thin --cost
     python -m benchmarks.thin --false-marks
     python -m benchmarks.thin --cube
@@ -141,6 +142,16 @@ def errors(output: Path, spp: list[int]) -> str:
     return table(["samples", *made], rows)
 
 
+def noise(output: Path, points: list[int]) -> str:
+    """The table of estimated errors of true derivatives, of so many points a pixel along each side."""
+    plain, rows = Method("1", {"splatter": "visible", "layers": 2}), []
+    for n in points:
+        context = Context(samples=n, folder=output / "truths")
+        found = [Derivative(make).numbers(plain, context)["truth_error"] for make in SCENES.values()]
+        rows.append([f"{n} × {n}", *(f"{x:.2f}" for x in found)])
+    return table(["points", *SCENES], rows)
+
+
 def draw(path: Path) -> None:
     """The scenes as pictures, by what is sampled."""
     import matplotlib
@@ -218,6 +229,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/thin"))
     parser.add_argument("--mitsuba", type=int, nargs="*", default=[], metavar="SPP")
+    parser.add_argument(
+        "--truths", type=int, nargs="*", default=[], metavar="POINTS", help="errors of the truth itself"
+    )
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--false-marks", action="store_true")
@@ -226,7 +240,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="of fits of the cube")
     given = parser.parse_args()
     (given.output / "truths").mkdir(parents=True, exist_ok=True)
-    if given.cost or given.false_marks or given.cube:
+    if given.truths or given.cost or given.false_marks or given.cube:
+        if given.truths:
+            print(noise(given.output, given.truths))
         if given.cost:
             print(cost(given.output, given.rounds))
         if given.false_marks:
