@@ -4,6 +4,7 @@ The calls are those that `rts compare` times: `visible`, K = 2, `raster`, in tur
 
     python -m benchmarks.speed.compiled
     python -m benchmarks.speed.compiled --scenes "stack of cards" --rounds 20
+    python -m benchmarks.speed.compiled --room          # the share of all fine cells that the outlines of scenes need
 """
 
 from __future__ import annotations
@@ -14,7 +15,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
+import rts
 from benchmarks.report import table
+from rts.sampling.fine_samples import FEW
+from rts.sampling.strips import FineGrid, lay_out
 from rts_compare.builtin_scenes import BUILTIN
 from rts_compare.compared_settings import Setting, engines
 from rts_compare.kept_measurements import KeptMeasurements
@@ -71,12 +77,29 @@ def _cells(torch: Times, jax: Times) -> list[str]:
     return cells
 
 
+def room(name: str) -> list[str]:
+    """A line of the table of rooms: the share of fine cells that a scene needs, and whether the fast branch has it."""
+    scene, (engine,) = BUILTIN[name].make(), engines(["torch"])[0]
+    parts, camera = scene.at(scene.moved(next(iter(scene.directions)), 0.0, engine))
+    fine = rts.sample(parts, camera, scene.size, supersample=rts.Adaptive(4), splatter="visible").fine
+    assert fine is not None
+    grid = FineGrid(scene.size, fine.supersample, fine.apron)
+    active, whole = np.asarray(fine.pixel) >= 0, grid.room(None, 1)
+    needed = np.count_nonzero(lay_out(active, grid).cells >= 0) / whole.cells
+    fits = int(lay_out(active, grid, whole.share(FEW)).dropped) == 0
+    return [name, f"{active.mean():.3f}", f"{needed:.3f}", "yes" if fits else "no"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", choices=BUILTIN, default=SCENES)
     parser.add_argument("--samples", nargs="+", choices=SAMPLES, default=list(SAMPLES))
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--room", action="store_true")
     args = parser.parse_args()
+    if args.room:
+        print(table(["scene", "active pixels", "fine cells", "few"], map(room, BUILTIN)))
+        return
     lines = []
     for name in args.scenes:
         lines += measured(name, args.rounds, args.samples)
