@@ -127,7 +127,7 @@ def _on_one_grid(
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     exits = exits and "exit" in reader.reads and gradient
     request = Request(capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin)
-    taken = partial(_taken, scene, grid, request)
+    taken = partial(_taken, scene.telling(settings.thin), grid, request)
     if settings.layers == "auto":
         sampled = with_layers_that_count(taken, hidden, scene.opaque)
     else:
@@ -141,7 +141,7 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidde
     `hidden` tells which samples to drop; traced ones may stay.
     """
     samples, alone, listed = [], len(scene.parts) == 1, request.cells
-    for part, sampler, entry in zip(scene.parts, scene.chosen(request.between), scene.entries, strict=True):
+    for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
         camera = grid.camera.within(part.transform)
         own_request = replace(request, entry=entry, hidden=hidden if alone else None)
         own = sampler.sample(part, camera, grid.size, count, own_request)
@@ -215,9 +215,8 @@ class Finer(NamedTuple):
         flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
 
         def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
-            exits = "exit" in reads and gradient
-            request = Request(capacity, listed, facing="facing" in reads, exits=exits, between=settings.thin)
-            return _taken(scene, grid, request, count, hidden)
+            request = Request(capacity, listed, facing="facing" in reads, exits="exit" in reads and gradient)
+            return _taken(scene.telling(settings.thin), grid, request, count, hidden)
 
         given = settings.layers, settings.capacity, flat, layout
         fine = fine_samples(coarse, cells, self.where, taken, self.hidden, *given)

@@ -71,10 +71,14 @@ class Scene(NamedTuple):
         """The rule that tells which samples are hidden; None to keep all. See `rts.sampling.hidden.hidden_by`."""
         return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
 
-    def chosen(self, thin: bool = False) -> list[Sampler]:
-        """The sampler that samples each part; with `thin`, "auto" takes one that tells what lies between samples."""
+    def telling(self, thin: bool) -> Scene:
+        """The scene itself; with `thin`, "auto" takes samplers that tell what lies between samples."""
         samplers = [replace(s, thin=True) if thin and isinstance(s, Auto) else s for s in self.samplers]
-        pairs = zip(samplers, self.parts, strict=True)
+        return self._replace(samplers=samplers) if thin else self
+
+    def chosen(self) -> list[Sampler]:
+        """The sampler that samples each part."""
+        pairs = zip(self.samplers, self.parts, strict=True)
         return [suited_sampler(sampler, part, self.camera) for sampler, part in pairs]
 
     def context_with(self, *others: Tree) -> Context:
