@@ -12,18 +12,24 @@ cd "$folder"
 unset PYTHONPATH
 export PYTHONWARNINGS=ignore
 venv/bin/python -m pip install --quiet --upgrade pip
-venv/bin/python -m pip install --quiet -c "$constraints" --find-links "$dist" rts-reconstruct rts-viewer
+venv/bin/python -m pip install --quiet -c "$constraints" --find-links "$dist" rts-nvdiffrast rts-reconstruct rts-viewer
 unset PYTHONWARNINGS
 venv/bin/python - <<'PYTHON'
 import numpy as np
+import torch
 import trimesh
 
 import rts
+import rts_nvdiffrast.torch as dr
 import rts_reconstruct
 import rts_viewer
 
-for module in (rts, rts_reconstruct, rts_viewer):
+for module in (rts, dr, rts_reconstruct, rts_viewer):
     assert "site-packages" in module.__file__, module.__file__
+one = torch.tensor([[[-1.0, -1, 0, 1], [1, -1, 0, 1], [0, 1, 0, 1]]], requires_grad=True)
+rast, _ = dr.rasterize(dr.RasterizeCudaContext(), one, torch.arange(3, dtype=torch.int32)[None], (32, 32))
+dr.antialias((rast[..., 3:] > 0).float(), rast, one, torch.arange(3, dtype=torch.int32)[None]).mean().backward()
+assert one.grad.abs().max() > 0
 ball = trimesh.creation.icosphere(3)
 theta = {"vertices": np.float32(ball.vertices), "colors": np.float32(0.5 + 0.4 * ball.vertices)}
 views = []

@@ -8,7 +8,7 @@ import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 
-from benchmarks import basin
+from benchmarks import basin, nvdiffrast
 from benchmarks.chart import fastest, own, recommended
 from benchmarks.pages.kept import kept, scene, scenes
 from benchmarks.paper import hand
@@ -153,6 +153,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "faces": faces,
     "scenes": by_scene,
     "advice": lambda: recommended(scenes()),
+    "nvdiffrast-cube": lambda: nvdiffrast.cube_table(kept("nvdiffrast")),
+    "nvdiffrast-pose": lambda: nvdiffrast.pose_table(kept("nvdiffrast")),
+    "nvdiffrast-outlines": lambda: nvdiffrast.outline_table(kept("nvdiffrast")),
+    "nvdiffrast-time": lambda: nvdiffrast.time_table(kept("nvdiffrast")),
     "basin": lambda: basin.summary(kept("basin")["rows"]),
 }
 """Name of a mark → a function that makes its table."""

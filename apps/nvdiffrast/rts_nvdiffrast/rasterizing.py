@@ -1,0 +1,251 @@
+"""`rasterize`: which triangle each pixel shows, and where on it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+import rts
+from rts import InputError
+from rts.plugin_api.operations import take
+from rts_nvdiffrast.checks import check_corners, check_devices, check_floats, check_triangles, described
+from rts_nvdiffrast.interpolation import scattered
+from rts_nvdiffrast.triangles import Image, Topology, images
+
+SAMPLES = 3
+"""Samples along each side of a pixel at outlines, unless a context says otherwise."""
+
+DRAWN = "rts_drawn"
+"""The attribute of `rast` that has its `Drawn`."""
+LEVELS = 0, 1, 2, 3
+_level = [1]
+
+
+class Drawn(NamedTuple):
+    """Facts about a call of `rasterize` that `antialias` is not told by its arguments.
+
+    Attributes:
+        samples: number of samples along each side of a pixel at outlines.
+        ranges: (B, 2) ranges of triangles; None in instanced mode.
+        layer: the layer of surfaces, 0 for the front.
+    """
+
+    samples: int
+    ranges: np.ndarray | None
+    layer: int
+
+
+class RasterizeCudaContext:
+    """Settings of images; a context holds no memory here, and needs no GPU.
+
+    Args:
+        device: accepted and ignored: tensors stay on the device that they are on.
+        samples: number of samples along each side of a pixel that `antialias` takes at outlines, from 2 to 16. More
+            give better derivatives of small images, and take longer.
+
+    Raises:
+        InputError: another number of samples.
+    """
+
+    def __init__(self, device: Any = None, *, samples: int = SAMPLES):
+        if not isinstance(samples, int) or not 2 <= samples <= 16:
+            raise InputError(f"samples is {samples!r}; expected an integer from 2 to 16")
+        self.samples = samples
+
+    def set_context(self) -> None:
+        """Do nothing: there is no OpenGL context."""
+
+    def release_context(self) -> None:
+        """Do nothing: there is no OpenGL context."""
+
+
+class RasterizeGLContext(RasterizeCudaContext):
+    """Another name of `RasterizeCudaContext`, with the arguments of nvdiffrast's class.
+
+    Args:
+        output_db: accepted and ignored: image-space derivatives are always there.
+        mode: accepted and ignored.
+        device: accepted and ignored.
+        samples: as in `RasterizeCudaContext`.
+    """
+
+    def __init__(self, output_db: bool = True, mode: str = "automatic", device: Any = None, *, samples: int = SAMPLES):
+        super().__init__(device, samples=samples)
+
+
+def rasterize(
+    glctx: RasterizeCudaContext,
+    pos: torch.Tensor,
+    tri: torch.Tensor,
+    resolution: Any,
+    ranges: torch.Tensor | None = None,
+    grad_db: bool = True,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Find the triangle at each pixel's centre; row 0 is the bottom.
+
+    Args:
+        glctx: a context.
+        pos: (B, V, 4) clip space, or (V, 4) with `ranges`; float32 or float64.
+        tri: (T, 3) int32, corners as rows of `pos`.
+        resolution: (height, width), pixels.
+        ranges: (B, 2) int32, for each image the first triangle and the number of triangles; used where `pos` is (V, 4).
+        grad_db: whether the second result has a derivative.
+
+    Returns:
+        `rast` and `rast_db`, (B, H, W, 4) each, in the dtype of `pos`; 0 where there is no triangle. `rast` has u and
+        v, the perspective-correct weights of the first two corners; z/w; and the triangle's number plus one. u and v
+        have a derivative in `pos`. `rast_db` has ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y, per pixel, with a derivative in `pos`.
+
+    Raises:
+        InputError: an argument is of another type, shape or dtype, a triangle names no vertex, a range no triangles, or
+            tensors are on several devices.
+    """
+    return _layer(_checked(glctx, pos, tri, resolution, ranges), 0, grad_db)
+
+
+class DepthPeeler:
+    """The layers of surfaces at each pixel, one after the other, front to back. Arguments are those of `rasterize`.
+
+    Use it as `with DepthPeeler(glctx, pos, tri, resolution) as peeler:`. Other calls may use the context meanwhile.
+    """
+
+    def __init__(
+        self,
+        glctx: RasterizeCudaContext,
+        pos: torch.Tensor,
+        tri: torch.Tensor,
+        resolution: Any,
+        ranges: torch.Tensor | None = None,
+        grad_db: bool = True,
+    ):
+        self._geometry = _checked(glctx, pos, tri, resolution, ranges)
+        self._grad_db, self._next, self._open = grad_db, 0, False
+
+    def __enter__(self) -> DepthPeeler:
+        self._open, self._next = True, 0
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._open = False
+
+    def rasterize_next_layer(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The results of `rasterize` for the next layer.
+
+        Two triangles at one depth are two layers.
+
+        Raises:
+            InputError: the call is not inside of `with`.
+        """
+        if not self._open:
+            raise InputError("rasterize_next_layer was called outside of `with DepthPeeler(...) as peeler`")
+        self._next += 1
+        return _layer(self._geometry, self._next - 1, self._grad_db)
+
+
+class _Geometry:
+    """Checked arguments of `rasterize`."""
+
+    def __init__(self, glctx: Any, pos: torch.Tensor, tri: torch.Tensor, size: Any, ranges: np.ndarray | None):
+        self.pos, self.tri, self.size, self.ranges, self.samples = pos, tri, size, ranges, glctx.samples
+        self.images = list(images(pos.detach(), Topology.of(tri), ranges))
+
+
+def _checked(glctx: Any, pos: Any, tri: Any, resolution: Any, ranges: Any) -> _Geometry:
+    """The geometry of checked arguments."""
+    if not isinstance(glctx, RasterizeCudaContext):
+        raise InputError(f"glctx is {type(glctx).__name__}; expected a RasterizeCudaContext or RasterizeGLContext")
+    pos = check_floats("pos", pos, ("images", "vertices", 4), ("vertices", 4))
+    tri = check_triangles(tri)
+    check_devices(pos=pos, tri=tri)
+    check_corners(tri, pos.shape[-2], "pos")
+    try:
+        height, width = (int(n) for n in resolution)
+    except (TypeError, ValueError):
+        height = width = 0
+    if height < 1 or width < 1:
+        raise InputError(f"resolution is {resolution!r}; expected (height, width), two positive integers")
+    return _Geometry(glctx, pos, tri, (height, width), _ranges(ranges, len(tri)) if pos.ndim == 2 else None)
+
+
+def _ranges(ranges: Any, count: int) -> np.ndarray:
+    """Ranges (B, 2) of `count` triangles, on the host."""
+    integers = isinstance(ranges, torch.Tensor) and not ranges.is_floating_point() and ranges.dtype != torch.bool
+    if not integers or ranges.ndim != 2 or ranges.shape[1] != 2:
+        raise InputError(f"pos is (vertices, 4) and ranges {described(ranges)}; expected a tensor (images, 2) of int32")
+    checked = ranges.cpu().numpy()
+    if len(checked) and (checked.min() < 0 or checked.sum(axis=1).max() > count):
+        raise InputError(f"ranges are {checked.tolist()}; expected first triangles and counts within {count} triangles")
+    return checked
+
+
+def _layer(given: _Geometry, layer: int, grad_db: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """`rast` and `rast_db` of one layer of surfaces."""
+    shown = torch.stack([_triangles(image, given.size, layer) for image in given.images]).to(given.pos.device)
+    (height, width), pixels = given.size, (shown.reshape(-1) >= 0).nonzero()[:, 0]
+    triangle = shown.reshape(-1)[pixels].long()
+    rows = given.tri.index_select(0, triangle).long()
+    if given.ranges is None:
+        rows = rows + (pixels // (height * width) * given.pos.shape[1])[:, None]
+    corners = take(given.pos.reshape(-1, 4), rows.reshape(-1)).reshape(-1, 3, 4)
+    uv, db, depth = _barycentrics(corners, pixels % width, pixels // width % height, given.size)
+    values = torch.cat([uv, depth[:, None], triangle[:, None].to(uv.dtype) + 1], dim=1)
+    rast, rast_db = (scattered(x, pixels, shown.shape) for x in (values, db if grad_db else db.detach()))
+    setattr(rast, DRAWN, Drawn(given.samples, given.ranges, layer))
+    return rast, rast_db
+
+
+def _triangles(image: Image, size: tuple[int, int], layer: int) -> torch.Tensor:
+    """(H, W) int32, the triangle that a layer shows at each pixel, or −1."""
+    part = rts.Part(image.surface, {"vertices": image.seen.vertices}, "silhouette")
+    # A splatter that needs only fronts has hidden samples left out.
+    needs = "none" if layer == 0 else None
+    sampled = rts.sample(part, image.seen.camera, size, sampler="raster", layers=layer + 1, splatter=needs)
+    border = sampled.apron
+    row = sampled.row[layer, border : border + size[0], border : border + size[1]]
+    ids = sampled.samples[0].ids[:, 0]
+    return torch.cat([ids, torch.full_like(row[0, :1], -1)])[row.long()]  # Row −1, for none, is the last.
+
+
+def _barycentrics(
+    corners: torch.Tensor, column: torch.Tensor, row: torch.Tensor, size: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """U and v (P, 2), their changes from pixel to pixel (P, 4), and z/w (P,) of corners (P, 3, 4) at some pixels.
+
+    Edge functions in homogeneous coordinates relative to the pixel, so that few digits cancel; in float64 where the
+    device has it.
+    """
+    dtype = corners.dtype
+    x, y, z, w = (corners if corners.device.type == "mps" else corners.double()).unbind(dim=2)
+    height, width = size
+    px, py = ((2 * column + 1).to(x.dtype) / width - 1)[:, None], ((2 * row + 1).to(x.dtype) / height - 1)[:, None]
+    x, y = x - px * w, y - py * w
+    # Of the next corner, and of the one after it.
+    (x1, y1, w1), (x2, y2, w2) = ((x.roll(s, 1), y.roll(s, 1), w.roll(s, 1)) for s in (-1, 1))
+    weight, along_x, along_y = x1 * y2 - y1 * x2, y1 * w2 - w1 * y2, w1 * x2 - x1 * w2
+    total = weight.sum(dim=1, keepdim=True)
+    total = torch.where(total == 0, torch.ones_like(total), total)
+    bary = weight / total
+    across = (along_x - bary * along_x.sum(dim=1, keepdim=True)) / total * (2 / width)
+    up = (along_y - bary * along_y.sum(dim=1, keepdim=True)) / total * (2 / height)
+    db = torch.stack([across[:, 0], up[:, 0], across[:, 1], up[:, 1]], dim=1)
+    still = bary.detach()
+    depth = ((still * z.detach()).sum(dim=1) / (still * w.detach()).sum(dim=1)).clamp(-1, 1)
+    return bary[:, :2].to(dtype), db.to(dtype), depth.to(dtype)
+
+
+def set_log_level(level: int) -> None:
+    """Set the level of messages, from 0 to 3. There are none here.
+
+    Raises:
+        InputError: another level.
+    """
+    if level not in LEVELS:
+        raise InputError(f"level is {level!r}; expected one of {LEVELS}")
+    _level[0] = level
+
+
+def get_log_level() -> int:
+    """The level that `set_log_level` set; 1 at first."""
+    return _level[0]

@@ -1,0 +1,228 @@
+"""`antialias`: its values, its derivatives against coverage that is known, and motion that counts once."""
+
+import pytest
+import rts_nvdiffrast.torch as dr
+import scenes
+import torch
+
+import rts
+
+CONTEXT = dr.RasterizeCudaContext()
+SQUARE = torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+TWO = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
+
+
+def flat(vertices):
+    """Clip space (1, V, 4) of vertices that are there already, with w = 1."""
+    return torch.cat([vertices, torch.ones_like(vertices[:, :1])], dim=1)[None]
+
+
+def mask(pos, tri, size=(32, 32), context=CONTEXT, **options):
+    rast, _ = dr.rasterize(context, pos, tri, size)
+    return dr.antialias((rast[..., 3:] > 0).to(pos.dtype), rast, pos, tri, **options)
+
+
+def test_inside_and_outside_nothing_changes():
+    pos = scenes.clip(scenes.CUBE)
+    rast, _ = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (48, 48))
+    color = torch.rand((1, 48, 48, 5), generator=torch.Generator().manual_seed(1))
+    covered = rast[..., 3] > 0
+    image = dr.antialias(color, rast, pos, scenes.CUBE_FACES)
+    count = torch.nn.functional.avg_pool2d(covered.float(), 5, stride=1, padding=2)
+    count[:, :2], count[:, -2:], count[:, :, :2], count[:, :, -2:] = 0, 0, 0, 0
+    away = ((count > 0.999) | (count < 0.001)) & torch.ones_like(covered)
+    away[:, :2] = away[:, -2:] = away[:, :, :2] = away[:, :, -2:] = False
+    assert 500 < away.sum() < 2000
+    torch.testing.assert_close(image[away], color[away], atol=1e-6, rtol=0)
+    assert (image != color).any()
+
+
+@pytest.mark.parametrize("samples", [2, 3, 4, 5])
+def test_a_pixel_at_an_outline_is_the_mean_of_its_samples(samples):
+    shift = 0.013
+    pos = flat(SQUARE + torch.tensor([shift, 0, 0]))
+    image = mask(pos, TWO, (16, 16), dr.RasterizeCudaContext(samples=samples))
+    x = (torch.arange(16 * samples) + 0.5) * 2 / (16 * samples) - 1
+    inside = ((x > -0.5 + shift) & (x < 0.5 + shift)).float().reshape(16, samples).mean(dim=1)
+    up = ((x > -0.5) & (x < 0.5)).float().reshape(16, samples).mean(dim=1)
+    torch.testing.assert_close(image[0, ..., 0], up[:, None] * inside, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("matrix", ["perspective", "orthographic"])
+def test_the_covered_area_changes_as_it_should(matrix):
+    """A square of side a grows: the area by 2 a."""
+    side = torch.tensor(1.1, requires_grad=True)
+    vertices = SQUARE * side
+    if matrix == "perspective":
+        pos, scale = scenes.clip(vertices, (0, 0, 0.3)), 2.5 / 3.5
+        # A vertex on the axis at another depth, so that z is affine in w.
+        extra = scenes.clip(torch.tensor([[0.0, 0, 0.4], [0.001, 0, 0.4], [0, 0.001, 0.4]]), (0, 0, 0))
+        pos, tri = torch.cat([pos, extra], dim=1), torch.cat([TWO, torch.tensor([[4, 5, 6]], dtype=torch.int32)])
+    else:
+        pos, tri, scale = flat(vertices), TWO, 1.0
+    area = mask(pos, tri, (64, 64)).mean() * 4
+    area.backward()
+    expected = (scale * 1.1) ** 2
+    assert area.item() == pytest.approx(expected, rel=0.02)
+    assert side.grad.item() == pytest.approx(2 * scale**2 * 1.1, rel=0.03)
+
+
+def test_a_surface_in_front_of_another_moves_over_it():
+    """Colours 0.2 and 0.9, both covering: a shift of the front square moves its left and right edge."""
+    shift = torch.zeros((), requires_grad=True)
+    front = SQUARE + torch.stack([shift, shift * 0, shift * 0 - 0.5])
+    back = 3 * SQUARE + torch.tensor([0, 0, 0.5])
+    pos, tri = flat(torch.cat([front, back])), torch.cat([TWO, TWO + 4])
+    rast, _ = dr.rasterize(CONTEXT, pos, tri, (32, 32))
+    color = torch.where(rast[..., 3:] <= 2, 0.2, 0.9)
+    image = dr.antialias(color, rast, pos, tri)
+    half = image[0, :, 16:, 0].sum() * (2 / 32) ** 2
+    half.backward()
+    assert shift.grad.item() == pytest.approx(1.0 * (0.2 - 0.9), rel=0.03)  # An edge of length 1 goes right.
+
+
+class TestMotionCountsOnce:
+    """A plane whose colour is a ramp in x, moved along x: everywhere the image changes by minus the ramp."""
+
+    SLOPE = 0.3
+
+    def render(self, shift, antialiased=True, through=lambda color: color):
+        wide = 4 * SQUARE + torch.stack([shift, shift * 0, shift * 0])
+        pos = flat(wide)
+        rast, _ = dr.rasterize(CONTEXT, pos, TWO, (16, 16))
+        color, _ = dr.interpolate(self.SLOPE * 4 * SQUARE[:, :1].contiguous(), rast, TWO)
+        color = through(color)
+        # Beyond the image's border no colours are known.
+        return color[:, 2:-2, 2:-2], dr.antialias(color, rast, pos, TWO)[:, 2:-2, 2:-2], color, rast, pos
+
+    def slope(self, f):
+        shift = torch.zeros((), requires_grad=True)
+        f(*self.render(shift)).backward()
+        return shift.grad.item()
+
+    def test_of_an_antialiased_image(self):
+        assert self.slope(lambda color, image, *_: image.mean()) == pytest.approx(-self.SLOPE, rel=0.02)
+
+    def test_of_an_image_that_is_not_antialiased(self):
+        assert self.slope(lambda color, image, *_: color.mean()) == pytest.approx(-self.SLOPE, rel=1e-4)
+
+    def test_of_both_together(self):
+        both = self.slope(lambda color, image, *_: color.mean() + image.mean())
+        assert both == pytest.approx(-2 * self.SLOPE, rel=0.02)
+
+    def test_of_two_calls_beside_each_other(self):
+        def loss(_, image, color, rast, pos):
+            return image.mean() + dr.antialias(3 * color, rast, pos, TWO)[:, 2:-2, 2:-2].mean()
+
+        assert self.slope(loss) == pytest.approx(-4 * self.SLOPE, rel=0.02)
+
+    def test_of_a_colour_without_u_and_v(self):
+        """Positions as colours: they carry the motion themselves, and nothing is taken off."""
+        shift = torch.zeros((), requires_grad=True)
+        image = self.render(shift, through=lambda color: color.detach())[1]
+        image.mean().backward()
+        assert shift.grad.item() == pytest.approx(-self.SLOPE, rel=0.02)
+
+    def test_without_a_gradient_here_u_and_v_keep_theirs(self):
+        def loss(_, image, color, rast, pos):
+            return dr.antialias(color, rast, pos.detach(), TWO)[:, 2:-2, 2:-2].mean()
+
+        assert self.slope(loss) == pytest.approx(-self.SLOPE, rel=1e-3)
+
+    def test_attributes_keep_their_gradient(self):
+        attr = (4 * SQUARE[:, :1]).contiguous().requires_grad_()
+        pos = flat(4 * SQUARE).requires_grad_()
+        rast, _ = dr.rasterize(CONTEXT, pos, TWO, (16, 16))
+        color, _ = dr.interpolate(attr, rast, TWO)
+        dr.antialias(color, rast, pos, TWO).mean().backward()
+        (expected,) = torch.autograd.grad(dr.interpolate(attr, rast.detach(), TWO)[0].mean(), attr)
+        torch.testing.assert_close(attr.grad, expected)
+
+
+def test_the_derivative_in_colours_is_that_of_the_value():
+    pos = scenes.clip(scenes.CUBE.double())
+    rast, _ = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (6, 6))
+    color = torch.rand((1, 6, 6, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda c: dr.antialias(c, rast, pos, scenes.CUBE_FACES), color)
+
+
+def test_the_boost_is_a_factor():
+    grads = []
+    for boost in (1.0, 3.0):
+        pos = scenes.clip(scenes.CUBE).requires_grad_()
+        mask(pos, scenes.CUBE_FACES, pos_gradient_boost=boost)[:, 10:].sum().backward()
+        grads.append(pos.grad)
+    assert grads[0].abs().max() > 0.1
+    torch.testing.assert_close(grads[1], 3 * grads[0])
+
+
+def test_a_topology_that_is_kept_changes_nothing():
+    pos = scenes.clip(scenes.CUBE)
+    kept = dr.antialias_construct_topology_hash(scenes.CUBE_FACES)
+    torch.testing.assert_close(
+        mask(pos, scenes.CUBE_FACES, topology_hash=kept), mask(pos, scenes.CUBE_FACES), rtol=0, atol=0
+    )
+
+
+def test_ranges_are_images_of_their_own():
+    pos = scenes.clip(scenes.CUBE)
+    ranges = torch.tensor([[0, 12], [4, 4], [2, 0]], dtype=torch.int32)
+    rast, _ = dr.rasterize(CONTEXT, pos[0], scenes.CUBE_FACES, (24, 24), ranges=ranges)
+    color = (rast[..., 3:] > 0).float()
+    image = dr.antialias(color, rast, pos[0], scenes.CUBE_FACES)
+    for b, (first, count) in enumerate(ranges.tolist()):
+        torch.testing.assert_close(image[b], mask(pos, scenes.CUBE_FACES[first : first + count], (24, 24))[0])
+    forgotten = dr.antialias(color, rast.clone(), pos[0], scenes.CUBE_FACES)  # All of a range's ends are seen here.
+    torch.testing.assert_close(forgotten[2], image[2])
+
+
+def test_a_peeled_layer_has_outlines_of_its_own():
+    """A cube's back has the outline of its front; a square behind a smaller one has it only behind that."""
+    turned = scenes.CUBE @ scenes.rotation(torch.tensor([0.4, 0.6, 0.1])).T
+    for layer in range(2):
+        scale = torch.ones((), requires_grad=True)
+        pos = flat(scale * turned)
+        with dr.DepthPeeler(CONTEXT, pos, scenes.CUBE_FACES, (48, 48)) as peeler:
+            for _ in range(layer + 1):
+                rast, _ = peeler.rasterize_next_layer()
+        area = dr.antialias((rast[..., 3:] > 0).float(), rast, pos, scenes.CUBE_FACES).sum()
+        area.backward()
+        assert scale.grad.item() == pytest.approx(2 * area.item(), rel=0.05)
+    small, large = SQUARE, 1.5 * SQUARE + torch.tensor([0, 0, 0.5])
+    pos, tri = flat(torch.cat([small, large])), torch.cat([TWO, TWO + 4])
+    with dr.DepthPeeler(CONTEXT, pos, tri, (32, 32)) as peeler:
+        layers = [peeler.rasterize_next_layer()[0] for _ in range(2)]
+    back = dr.antialias((layers[1][..., 3:] > 0).float(), layers[1], pos, tri)
+    torch.testing.assert_close(back, mask(flat(small), TWO), atol=1e-6, rtol=0)  # Only behind the small one.
+
+
+def test_nothing_in_view_stays_as_it_is():
+    pos = scenes.clip(scenes.CUBE, shift=(0, 0, 5.0)).requires_grad_()
+    rast, _ = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (8, 8))
+    color = torch.rand(1, 8, 8, 3)
+    image = dr.antialias(color, rast, pos, scenes.CUBE_FACES)
+    torch.testing.assert_close(image, color)
+    image.sum().backward()
+
+
+COLOR = torch.zeros(1, 8, 8, 3)
+RAST = dr.rasterize(CONTEXT, scenes.TRIANGLE, scenes.ONE, (8, 8))[0]
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"color": COLOR[0]}, r"color has shape \(8, 8, 3\) and dtype float32; expected a tensor \(images"),
+        ({"color": COLOR[:, :4]}, r"shapes are color \(1, 4, 8, 3\), rast \(1, 8, 8, 4\)"),
+        ({"rast": RAST[..., :2]}, "rast has shape"),
+        ({"pos": scenes.TRIANGLE.expand(2, -1, -1)}, "expected as many images"),
+        ({"tri": scenes.ONE + 1}, "tri names rows 1 to 3"),
+        ({"topology_hash": scenes.ONE}, "expected what antialias_construct_topology_hash gave"),
+        ({"topology_hash": dr.antialias_construct_topology_hash(TWO)}, "topology_hash is of other triangles"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_line(changes, message):
+    given = {"color": COLOR, "rast": RAST, "pos": scenes.TRIANGLE, "tri": scenes.ONE}
+    with pytest.raises(rts.InputError, match=message) as error:
+        dr.antialias(**(given | changes))
+    assert "\n" not in str(error.value)
