@@ -135,7 +135,7 @@ def line(name: str, view: str, method: str, rows: list[dict]) -> str:
 
 
 def shown(name: str, pose: np.ndarray) -> np.ndarray:
-    """The first view (H, W, 3) of a mesh: black where it covers its target, red beside it, green where it is missing."""
+    """The first view (H, W, 3) of a mesh: black where it covers its target, red beside, green where it is missing."""
     part, view = silhouette_part(name), camera(eye(*VIEWS[0]))
     target = supersampled(part, view, SIZE, 4)[..., 3:]
     mask = supersampled(part.replace(transform=rts.rigid(pose)), view, SIZE, 4)[..., 3:]

@@ -6,12 +6,10 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from benchmarks.pages.kept import PAGES, number, written
 from benchmarks.pages.kept import kept as kept_file
-from benchmarks.pages.kept import number, written
-from benchmarks.paper.airplane import SPLATTERS
-from benchmarks.paper.blur import WAYS
 from benchmarks.paper.registry import EXPERIMENTS
-from benchmarks.paper.rows import kept
+from benchmarks.paper.rows import Row, kept
 from benchmarks.report import table
 
 
@@ -37,16 +35,16 @@ def times_on_page() -> dict[str, Any]:
     }
 
 
-def field_on_page(side: str, views: int, head: str, names: dict[str, str]) -> dict[str, Any]:
+def field_on_page(side: str, views: int, names: dict[str, str]) -> dict[str, Any]:
     """Numbers of a radiance field, from a table of its page.
 
     Args:
-        side: of the images, pixels, as text.
+        side: of the images, pixels, as in the table's first cell.
         views: number of them.
-        head: the first cell of the table.
         names: stage → the name of its line.
     """
-    columns, lines = written("radiance-field", head)
+    scene = "lego" if side == "100²" else "fern"
+    columns, lines = written("radiance-field", f"{scene} at {side}, {views} views")
     stages: dict[str, Any] = {}
     for stage, name in names.items():
         cells = dict(zip(columns, lines[name], strict=True))
@@ -60,29 +58,22 @@ def field_on_page(side: str, views: int, head: str, names: dict[str, str]) -> di
 
 
 def lego_on_page() -> dict[str, Any]:
-    names = {
-        "baseline": "NeRF, volume",
-        "fixed": "surface, fixed",
-        "finetuned": "surface fixed, network finetuned",
-        "joint": "surface and network, joint",
-    }
-    text = (written.__globals__["PAGES"] / "radiance-field.md").read_text()
-    volume, surface = re.search(r"(\d\.\d+) s by volume, (\d\.\d+) s by surface", text).groups()
-    found = field_on_page("100²", 25, "lego at 100², 25 views", names)
-    return found | {"seconds": {"volume": float(volume), "surface": float(surface)}}
+    """Numbers of lego at 100², with the times of a frame that the page's prose tells."""
+    names = {"baseline": "NeRF, volume", "fixed": "surface, fixed"}
+    names |= {"finetuned": "surface fixed, network finetuned", "joint": "surface and network, joint"}
+    times = re.search(r"([\d.]+) s by volume, ([\d.]+) s by surface", (PAGES / "radiance-field.md").read_text())
+    assert times is not None
+    seconds = {"volume": float(times[1]), "surface": float(times[2])}
+    return field_on_page("100²", 25, names) | {"seconds": seconds}
 
 
 def fern_on_page() -> dict[str, Any]:
-    names = {
-        "baseline": "fern at 126 × 168, 3 views: volume",
-        "fixed": "surface, fixed (161 × 145 × 128 in NDC)",
-        "finetuned": "finetuned",
-        "joint": "joint",
-    }
-    return field_on_page("126 × 168", 3, "", names)
+    """Numbers of fern."""
+    names = {"baseline": "NeRF, volume", "finetuned": "finetuned", "joint": "joint"}
+    return field_on_page("126 × 168", 3, names)
 
 
-ON_PAGES: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
+ON_PAGES: dict[str, tuple[str, Callable[[], Any]]] = {
     "silhouettes": ("poses", poses_on_page),
     "pose-speed": ("speed", times_on_page),
     "hand": ("stability", lambda: kept_file("hand")),
@@ -90,3 +81,87 @@ ON_PAGES: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
     "fern": ("radiance-field", fern_on_page),
 }
 """Experiments whose measurements at full size stand on a page of their own: that page, and their numbers."""
+
+
+def found(name: str) -> tuple[list[Row], str]:
+    """The rows of an experiment, and when it was run, at what size; a row "not run" where there is no result."""
+    experiment, result = EXPERIMENTS[name], kept(name)
+    if result is not None:
+        about = result["about"]
+        return experiment.rows(result["numbers"]), f"{about['size']}, {about['date']}"
+    if name in ON_PAGES:
+        page, numbers = ON_PAGES[name]
+        day = re.search(r"20\d\d-\d\d-\d\d", (PAGES / f"{page}.md").read_text())
+        return experiment.rows(numbers()), f"full, {day[0] if day else ''} [page]({page}.md)"
+    return [Row(experiment.place, "–", "–", "not run", f"`python -m benchmarks.paper {name} --keep`")], "–"
+
+
+def claims() -> str:
+    """All claims."""
+    lines = []
+    for name, experiment in EXPERIMENTS.items():
+        rows, when = found(name)
+        for row in rows:
+            place = f"{experiment.place} (`{name}`)"
+            lines.append([place, row.claim, row.number, row.ours, f"*{row.verdict}*", row.because or "–", when])
+    head = ["in the paper", "claim", "its number", "ours", "holds?", "because, beside", "size, date"]
+    return table(head, lines)
+
+
+def counted() -> str:
+    """A line: how many claims hold."""
+    verdicts = [row.verdict for name in EXPERIMENTS for row in found(name)[0]]
+    told = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    return f"Of {len(verdicts)} claims: {told}.\n"
+
+
+def conditions() -> str:
+    """The command of each result that is kept, with its time."""
+    lines = []
+    for name in EXPERIMENTS:
+        if (result := kept(name)) is not None:
+            about = result["about"]
+            lines.append([f"`{name}`", f"`{about['command']}`", about["date"], f"{about['user_seconds']:.0f}",
+                          f"{about['seconds']:.0f}"])  # fmt: skip
+    return table(["result", "its script", "date", "user seconds", "seconds"], lines)
+
+
+def airplane() -> str:
+    """The airplane's fits, by splatter and method."""
+    result = kept("airplane")
+    if result is None:
+        return "Not run yet.\n"
+    lines = []
+    for splatter, by in result["numbers"]["summary"].items():
+        for method, one in by.items():
+            cells = [f"{one['found']} of {one['starts']}", f"{one['iou']:.3f}", f"{one['loss']:.5f}"]
+            for level in ("within 5 %", "within 1 %"):
+                at = one[level]
+                cells.append(f"{at['steps']:.0f} / {at['seconds']:.2f} ({at['reached']})" if at["reached"] else "–")
+            title = {"lm": "Levenberg–Marquardt", "adam": "Adam"}[method]
+            lines.append([f"`{splatter}`", title, *cells, f"{one['step_ms']:.0f}"])
+    levels = [f"steps / s to {level} (starts)" for level in ("within 5 %", "within 1 %")]
+    return table(["splatter", "method", "found", "IoU", "loss", *levels, "ms a step"], lines)
+
+
+def blur() -> str:
+    """PSNR of textures by the way they were fitted, with mipmaps and without."""
+    result = kept("blur")
+    if result is None:
+        return "Not run yet.\n"
+    psnr = result["numbers"]["psnr"]
+    ways = list(psnr["mipmaps"])
+    lines = [[title, *(f"{psnr[kind][way]:.1f}" for way in ways), *theirs]
+             for kind, title, theirs in (("mipmaps", "with mipmaps", ("33.7", "33.2")),
+                                         ("none", "without", ("25.4", "28.3")))]  # fmt: skip
+    return table(["PSNR, dB", *(f"`{way}`" for way in ways), "the paper, sharp", "the paper, blurred"], lines)
+
+
+PAPER: dict[str, Callable[[], str]] = {
+    "paper": claims,
+    "paper-count": counted,
+    "paper-conditions": conditions,
+    "paper-airplane": airplane,
+    "paper-blur": blur,
+}
+"""Name of a mark → a function that makes its table."""

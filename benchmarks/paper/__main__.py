@@ -2,7 +2,7 @@
 
     python -m benchmarks.paper all --quick          # all of them, small
     python -m benchmarks.paper airplane blur -o out/paper
-    python -m benchmarks.paper hand --keep          # for the page docs/results/paper.md, by `python -m benchmarks.pages`
+    python -m benchmarks.paper hand --keep          # for docs/results/paper.md, which benchmarks.pages fills
 
 Each experiment writes its pictures and numbers into a folder of its own, with `row.json`: the paper's claims and
 numbers, ours, and whether they hold. An experiment whose data or packages are missing is left out, and says why.

@@ -70,7 +70,9 @@ def airplane() -> tuple[Any, dict[str, np.ndarray]]:
     block = len(texture) // TEXELS
     texture = texture.reshape(TEXELS, block, TEXELS, block, 3).mean((1, 3))
     theta |= {"vertices": normalised(theta["vertices"].astype(np.float64)), "texture": texture}
-    return part.surface, {name: theta[name].astype(np.float32) for name in ("vertices", "uv", "texture") if name in theta}
+    return part.surface, {
+        name: theta[name].astype(np.float32) for name in ("vertices", "uv", "texture") if name in theta
+    }
 
 
 def start(seed: int) -> dict[str, np.ndarray]:
@@ -83,7 +85,7 @@ def start(seed: int) -> dict[str, np.ndarray]:
         "zoom": np.array([ZOOMED * rng.choice([-1.0, 1.0])]),
         "background": np.full(3, 0.5),
         "direction": np.array([0.3, 1.0, 0.6]),
-        "brightness": np.full(3, 0.5),
+        "brightness": np.array([0.5]),
         "matrix": np.eye(3),
     }
 
@@ -95,7 +97,7 @@ def scene(unknowns: dict[str, Any]) -> tuple[list[rts.Part], rts.Camera]:
     light = {
         "ambient": np.full(3, AMBIENT, np.float32),
         "direction": unknowns["direction"],
-        "color": unknowns["brightness"],
+        "color": xp.concat([unknowns["brightness"]] * 3),
     }
     theta = known | {"light": light, "matrix": unknowns["matrix"]}
     corners = np.array([[-60, -60, -40], [60, -60, -40], [60, 60, -40], [-60, 60, -40]], np.float32)

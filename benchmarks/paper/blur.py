@@ -29,8 +29,8 @@ NEAR_BY, FAR_OFF, FOV = 1.5, 50.0, 43.6
 SHIFT = 0.25
 """How far off its centre the camera may look."""
 RATE, GREY = 0.01, 0.5
-WAVES, FINEST = 600, 150.0
-"""Waves that the texture is made of, and the most of them around the sphere, times 2π."""
+WAVES, FINEST = 600, 0.6
+"""Waves that the texture is made of, and the highest wave number, of that of the rows: 1 has a wave in two texels."""
 TRUSTED = np.radians(60.0)
 """Texels are judged up to this latitude: beyond, many of them share a place."""
 WAYS = {"none": ("none", 1), "multi": ("multi", 1), "visible": ("visible", 1), "visible, 2 × 2": ("visible", 2)}
@@ -45,13 +45,13 @@ class Size(NamedTuple):
     steps: int
 
 
-FULL, QUICK = Size(256, 128, 5000), Size(64, 48, 150)
+FULL, QUICK = Size(128, 64, 2500), Size(64, 32, 100)
 
 
 def earth(rows: int) -> np.ndarray:
     """A texture (rows, 2 rows, 3) float32: seas, land with coasts, and detail down to the texel; waves in space."""
     rng = np.random.default_rng(1)
-    wave = np.exp(rng.uniform(np.log(2.0), np.log(FINEST * rows / FULL.rows), WAVES))
+    wave = np.exp(rng.uniform(np.log(2.0), np.log(FINEST * rows), WAVES))
     ways = rng.normal(size=(WAVES, 3))
     ways *= (wave / np.linalg.norm(ways, axis=1))[:, None]
     around, up = np.meshgrid(2 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows), latitudes(rows))

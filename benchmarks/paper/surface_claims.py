@@ -20,9 +20,7 @@ def bspline_numbers(folder: Path) -> list[dict[str, Any]]:
 
 def bspline(numbers: list[dict[str, Any]]) -> list[Row]:
     adam = [r for r in numbers if r["method"] == "adam"]
-    told = "; ".join(
-        f"{r['method']}, {r['engine']}: IoU {r['iou']:.4f} after {r['iterations']}" for r in numbers
-    )
+    told = "; ".join(f"{r['method']}, {r['engine']}: IoU {r['iou']:.4f} after {r['iterations']}" for r in numbers)
     return [
         Row(
             "A cylinder becomes a chess piece by its silhouette, in 200 iterations",

@@ -153,7 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = options(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
     results = environment(PACKAGES)
-    results["command"] = shlex.join(["python", "-m", "benchmarks.speed.run", *(sys.argv[1:] if arguments is None else arguments)])
+    told = sys.argv[1:] if arguments is None else arguments
+    results["command"] = shlex.join(["python", "-m", "benchmarks.speed.run", *told])
     before = load_average()
     with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()) as progress:
         task = progress.add_task("", total=None)
