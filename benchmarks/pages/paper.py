@@ -35,44 +35,44 @@ def times_on_page() -> dict[str, Any]:
     }
 
 
-def field_on_page(side: str, views: int, names: dict[str, str]) -> dict[str, Any]:
-    """Numbers of a radiance field, from a table of its page.
+def field_on_page(head: str, side: str, views: int, names: dict[str, str]) -> dict[str, Any]:
+    """Numbers of a radiance field at one size, from a table of its page.
 
     Args:
-        side: of the images, pixels, as in the table's first cell.
+        head: the table's first cell.
+        side: of the images.
         views: number of them.
         names: stage → the name of its line.
     """
-    scene = "lego" if side == "100²" else "fern"
-    columns, lines = written("radiance-field", f"{scene} at {side}, {views} views")
+    columns, lines = written("radiance-field", head)
     stages: dict[str, Any] = {}
     for stage, name in names.items():
         cells = dict(zip(columns, lines[name], strict=True))
-        steps = cells["steps"].replace(",", "")
+        steps, used = cells["steps"].replace(",", ""), cells.get("fine evaluations a covered pixel")
         stages[stage] = {"psnr": number(cells["PSNR"]), "ssim": number(cells["SSIM"])}
         stages[stage]["steps"] = int(steps) if steps.isdigit() else 0
-        used = cells.get("fine evaluations a covered pixel")
         if used and stage != "baseline":
             stages[stage]["evaluations"] = number(used)
     return {"side": side, "views": views, "stages": stages}
 
 
 def lego_on_page() -> dict[str, Any]:
-    """Numbers of lego at 100², with the times of a frame that the page's prose tells."""
-    names = {"baseline": "NeRF, volume", "fixed": "surface, fixed"}
-    names |= {"finetuned": "surface fixed, network finetuned", "joint": "surface and network, joint"}
+    """Numbers of lego at two sizes, with the times of a frame that the page's prose tells."""
+    names = {"baseline": "NeRF, volume", "finetuned": "surface fixed, network finetuned"}
+    coarse = field_on_page("lego at 100², 25 views", "100²", 25, names | {"joint": "surface and network, joint"})
+    fine = field_on_page("lego at 400², 3 views", "400²", 3, FEW)
     times = re.search(r"([\d.]+) s by volume, ([\d.]+) s by surface", (PAGES / "radiance-field.md").read_text())
     assert times is not None
-    seconds = {"volume": float(times[1]), "surface": float(times[2])}
-    return field_on_page("100²", 25, names) | {"seconds": seconds}
+    return {"sizes": [coarse, fine], "seconds": {"volume": float(times[1]), "surface": float(times[2])}}
 
 
 def fern_on_page() -> dict[str, Any]:
     """Numbers of fern."""
-    names = {"baseline": "NeRF, volume", "finetuned": "finetuned", "joint": "joint"}
-    return field_on_page("126 × 168", 3, names)
+    return {"sizes": [field_on_page("fern at 126 × 168, 3 views", "126 × 168", 3, FEW)]}
 
 
+FEW = {"baseline": "NeRF, volume", "finetuned": "finetuned", "joint": "joint"}
+"""Stage → line, in the smaller tables of the page of radiance fields."""
 ON_PAGES: dict[str, tuple[str, Callable[[], Any]]] = {
     "silhouettes": ("poses", poses_on_page),
     "pose-speed": ("speed", times_on_page),
@@ -80,7 +80,7 @@ ON_PAGES: dict[str, tuple[str, Callable[[], Any]]] = {
     "lego": ("radiance-field", lego_on_page),
     "fern": ("radiance-field", fern_on_page),
 }
-"""Experiments whose measurements at full size stand on a page of their own: that page, and their numbers."""
+"""Experiments whose measurements stand on a page of their own: that page, and their numbers."""
 
 
 def found(name: str) -> tuple[list[Row], str]:
@@ -91,8 +91,7 @@ def found(name: str) -> tuple[list[Row], str]:
         return experiment.rows(result["numbers"]), f"{about['size']}, {about['date']}"
     if name in ON_PAGES:
         page, numbers = ON_PAGES[name]
-        day = re.search(r"20\d\d-\d\d-\d\d", (PAGES / f"{page}.md").read_text())
-        return experiment.rows(numbers()), f"full, {day[0] if day else ''} [page]({page}.md)"
+        return experiment.rows(numbers()), f"see [its page]({page}.md)"
     return [Row(experiment.place, "–", "–", "not run", f"`python -m benchmarks.paper {name} --keep`")], "–"
 
 

@@ -92,54 +92,68 @@ def spheres(numbers: list[dict[str, Any]]) -> list[Row]:
 # ---------------------------------------------------------------------------------------------------- radiance fields
 
 
+PAPER_STEPS = 5000
+
+
 def field_numbers(folder: Path) -> dict[str, Any]:
-    """Means of PSNR and SSIM by stage, of the smallest images; steps; evaluations and times of a frame."""
-    found: dict[str, Any] = {"stages": {}}
-    for name in ("baseline", "fixed", "finetuned", "joint"):
-        stage = json.loads((folder / f"{name}.json").read_text())
-        side = next(iter(stage["sides"]))
-        scores = stage["sides"][side]
-        found |= {"side": side, "views": len(scores["views"])}
-        row = {key: round(statistics.fmean(scores[key]), 3) for key in ("psnr", "ssim")}
-        if "evaluations" in scores:
-            row["evaluations"] = round(sum(scores["evaluations"]) / sum(scores["covered"]), 3)
-        found["stages"][name] = row | {"steps": stage.get("steps", 0)}
+    """Means of PSNR and SSIM by stage, for each size of images, with evaluations and steps; times of a frame."""
+    names = "baseline", "fixed", "finetuned", "joint"
+    stages = {name: json.loads((folder / f"{name}.json").read_text()) for name in names}
+    sizes = []
+    for side, scores in stages["baseline"]["sides"].items():
+        found = {name: _scored(stage, side) for name, stage in stages.items()}
+        sizes.append({"side": f"{side} pixels", "views": len(scores["views"]), "stages": found})
+    numbers: dict[str, Any] = {"sizes": sizes}
     if (folder / "times.json").exists():
         times = json.loads((folder / "times.json").read_text())
-        found["seconds"] = {key: round(statistics.median(times[key]), 4) for key in ("volume", "surface")}
-    return found
+        numbers["seconds"] = {key: round(statistics.median(times[key]), 4) for key in ("volume", "surface")}
+    return numbers
+
+
+def _scored(stage: dict[str, Any], side: str) -> dict[str, Any]:
+    scores = stage["sides"][side]
+    found = {key: round(statistics.fmean(scores[key]), 3) for key in ("psnr", "ssim")}
+    if "evaluations" in scores:
+        found["evaluations"] = round(sum(scores["evaluations"]) / sum(scores["covered"]), 3)
+    return found | {"steps": stage.get("steps", 0)}
 
 
 def field_rows(numbers: dict[str, Any], behind: float, gained: float, theirs: tuple[str, str]) -> list[Row]:
     """Rows of a scene: how far the surface is behind the volume, and what refining it gains, in the paper."""
-    stages = numbers["stages"]
-    volume, fixed, joint = (stages[name]["psnr"] for name in ("baseline", "finetuned", "joint"))
-    size = (
-        f"{numbers['views']} views at {numbers['side']} pixels, {stages['joint']['steps']:,} steps, networks of a "
-        "quarter of the paper's width² (those published at the paper's size are not at hand)"
-    )
-    ssim = " / ".join(f"{stages[name]['ssim']:.3f}" for name in ("baseline", "joint", "finetuned"))
+    quality, refined, near, better = [], [], [], []
+    for size in numbers["sizes"]:
+        stages, views = size["stages"], f"{size['side']}, {size['views']} views"
+        volume, fixed, joint = (stages[name]["psnr"] for name in ("baseline", "finetuned", "joint"))
+        ssim = " → ".join(f"{stages[name]['ssim']:.3f}" for name in ("baseline", "joint"))
+        quality.append(f"{volume:.2f} → {joint:.2f} dB ({signed(joint - volume)}), SSIM {ssim} ({views})")
+        refined.append(f"{fixed:.2f} → {joint:.2f} dB ({signed(joint - fixed)}) ({views})")
+        near.append(volume - joint <= behind + 0.1)
+        better.append(joint - fixed >= gained / 2)
+    steps = numbers["sizes"][0]["stages"]["joint"]["steps"]
     return [
         Row(
             "A surface light field nearly has the quality of the volume",
             f"{theirs[0]} dB (−{behind:.1f})",
-            f"{volume:.2f} → {joint:.2f} dB ({joint - volume:+.2f}); SSIM volume / joint / fixed {ssim}",
-            verdict(volume - joint <= behind + 0.1, joint > fixed),
-            size,
+            "; ".join(quality),
+            verdict(*near),
+            f"{steps:,} steps, {PAPER_STEPS:,} in the paper; networks half as wide: those of its size are not at hand",
         ),
         Row(
             "Refining the surface beside the network gains over a fixed surface",
             f"{theirs[1]} dB (+{gained:.1f})",
-            f"{fixed:.2f} → {joint:.2f} dB ({joint - fixed:+.2f})",
-            verdict(joint > fixed, joint - fixed >= gained / 2),
-            size,
+            "; ".join(refined),
+            verdict(*better),
         ),
     ]
 
 
+def signed(change: float) -> str:
+    return f"{change:+.2f}".replace("-", "−")
+
+
 def lego(numbers: dict[str, Any]) -> list[Row]:
     rows = field_rows(numbers, 0.3, 2.2, ("29.91 → 29.61", "27.44 → 29.61"))
-    used = numbers["stages"]["joint"]["evaluations"]
+    used = numbers["sizes"][0]["stages"]["joint"]["evaluations"]
     told = f"{128 / used:.0f} times fewer evaluations a covered pixel ({used:.2f} of two layers)"
     ratio = 0.0
     if "seconds" in numbers:
