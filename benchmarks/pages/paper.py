@@ -13,6 +13,54 @@ from benchmarks.paper.rows import Row, kept
 from benchmarks.report import table
 
 
+def derivatives_on_page() -> dict[str, dict[str, float]]:
+    """Numbers of derivatives: low-passed errors of three scenes."""
+    columns, lines = written("accuracy", "method", "A raw")
+    found = {}
+    for line, cells in lines.items():
+        name = re.sub(r"[`*]", "", line)
+        name += {"none": ", K = 1", "single": ", K = 1"}.get(name, "")
+        at = dict(zip(columns, cells, strict=True))
+        if at["A low-pass"]:
+            found[name] = {scene: number(at[f"{scene} low-pass"]) for scene in "ABC"}
+    return found
+
+
+def swept_on_page() -> list[dict[str, Any]]:
+    """Numbers of the swept sphere."""
+    columns, lines = written("topology", "swept sphere, 150 steps", keys=2)
+    found = []
+    for line, cells in lines.items():
+        task, motion = line.split(" | ")
+        for engine in ("torch", "jax"):
+            radii = [float(x) for x in cells[columns.index(f"radii, {engine}")].split(", ")]
+            task = re.sub(r"( \(|:).*", "", task)
+            found.append({"task": task, "motion": motion, "engine": engine, "steps": 150, "radii": radii})
+    return found
+
+
+def spheres_on_page() -> list[dict[str, Any]]:
+    """Numbers of the spheres."""
+    _, lines = written("topology", "200 spheres, 400 steps", keys=3)
+    names = "task", "motion", "engine"
+    return [
+        dict(zip(names, line.split(" | "), strict=True)) | {"steps": 400, "iou": number(cells[1])}
+        for line, cells in lines.items()
+    ]
+
+
+def splines_on_page() -> list[dict[str, Any]]:
+    """Numbers of the B-spline surface."""
+    _, lines = written("splines", "engine", "method", keys=2)
+    found = []
+    for line, cells in lines.items():
+        engine, method = line.split(" | ")
+        method = {"Adam": "adam", "Levenberg–Marquardt": "lm"}[method]
+        found.append({"engine": engine, "method": method, "side": 256, "iterations": int(cells[0]),
+                      "iou": number(cells[3])})  # fmt: skip
+    return found
+
+
 def poses_on_page() -> dict[str, Any]:
     """Numbers of the silhouettes, from the table of their page."""
     _, lines = written("poses", "mesh", "views", "method", keys=3)
@@ -74,9 +122,13 @@ def fern_on_page() -> dict[str, Any]:
 FEW = {"baseline": "NeRF, volume", "finetuned": "finetuned", "joint": "joint"}
 """Stage → line, in the smaller tables of the page of radiance fields."""
 ON_PAGES: dict[str, tuple[str, Callable[[], Any]]] = {
+    "derivatives": ("accuracy", derivatives_on_page),
     "silhouettes": ("poses", poses_on_page),
     "pose-speed": ("speed", times_on_page),
     "hand": ("stability", lambda: kept_file("hand")),
+    "bspline": ("splines", splines_on_page),
+    "swept": ("topology", swept_on_page),
+    "spheres": ("topology", spheres_on_page),
     "lego": ("radiance-field", lego_on_page),
     "fern": ("radiance-field", fern_on_page),
 }
