@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,13 @@ def bspline_numbers(folder: Path) -> list[dict[str, Any]]:
 
 def bspline(numbers: list[dict[str, Any]]) -> list[Row]:
     adam = [r for r in numbers if r["method"] == "adam"]
-    told = "; ".join(f"{r['method']}, {r['engine']}: IoU {r['iou']:.4f} after {r['iterations']}" for r in numbers)
+    names = {"adam": "Adam", "lm": "Levenberg–Marquardt"}
+    told = "; ".join(f"{names[r['method']]}, {r['engine']}: {r['iou']:.4f} in {r['iterations']}" for r in numbers)
     return [
         Row(
             "A cylinder becomes a chess piece by its silhouette, in 200 iterations",
             "200 iterations",
-            told,
+            f"IoU {told}",
             verdict(all(r["iou"] > 0.99 for r in adam), all(r["iterations"] <= 200 for r in adam)),
             f"images of {numbers[0]['side']}²; the paper's piece and camera are not given, ours are chosen",
         )
@@ -43,12 +44,22 @@ def implicit_numbers(section: str) -> Callable[[Path], list[dict[str, Any]]]:
     return numbers
 
 
+def between(values: Sequence[float], digits: int = 3) -> str:
+    """The range of some values."""
+    low, high = (f"{x:.{digits}f}" for x in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def fits(rows: list[dict[str, Any]]) -> str:
+    """How many fits there are, and what they differ in."""
+    ways = ", ".join(" and ".join(dict.fromkeys(r[key] for r in rows)) for key in ("motion", "engine"))
+    return f"{len(rows)} fits: {ways}" if len(rows) > 1 else ways
+
+
 def swept(numbers: list[dict[str, Any]]) -> list[Row]:
-    def radii(rows: list[dict[str, Any]]) -> str:
-        return "; ".join(
-            f"{r['radii'][0]:.3f}, {r['radii'][1]:.3f} ({r['task'].split(', ')[1]}, {r['motion']}, {r['engine']})"
-            for r in rows
-        )
+    def told(rows: list[dict[str, Any]]) -> str:
+        circle, sphere = (between([r["radii"][i] for r in rows]) for i in (0, 1))
+        return f"radii {circle} and {sphere}, of {TORUS[0]} and {TORUS[1]}, in {rows[0]['steps']} ({fits(rows)})"
 
     def found(row: dict[str, Any]) -> bool:
         return max(abs(a - b) for a, b in zip(row["radii"], TORUS, strict=True)) < 0.02
@@ -59,7 +70,7 @@ def swept(numbers: list[dict[str, Any]]) -> list[Row]:
         Row(
             "A swept sphere becomes a torus, through a change of topology, within 400 iterations",
             "400 iterations",
-            f"radii {radii(aside)}, of 0.6 and 0.25, in {aside[0]['steps']}",
+            told(aside),
             verdict(*(found(r) for r in aside)),
             "on 50³ points by the mean absolute error, as there; the camera is ours",
         )
@@ -69,7 +80,7 @@ def swept(numbers: list[dict[str, Any]]) -> list[Row]:
             Row(
                 "Seen along the axis it is trapped in a local minimum",
                 "words",
-                f"radii {radii(front)}",
+                told(front),
                 verdict(*(not found(r) for r in front)),
             )
         )
@@ -77,12 +88,11 @@ def swept(numbers: list[dict[str, Any]]) -> list[Row]:
 
 
 def spheres(numbers: list[dict[str, Any]]) -> list[Row]:
-    told = "; ".join(f"IoU {r['iou']:.3f} ({r['task']}, {r['motion']}, {r['engine']})" for r in numbers)
     return [
         Row(
             "200 spheres become a torus within 400 iterations",
             "400 iterations",
-            f"{told}, in {numbers[0]['steps']}",
+            f"IoU {between([r['iou'] for r in numbers])} in {numbers[0]['steps']} ({fits(numbers)})",
             verdict(*(r["iou"] > 0.95 for r in numbers)),
             "spheres smaller than a cell of the lattice remain as specks: nothing shows them",
         )
