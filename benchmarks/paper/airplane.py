@@ -16,7 +16,7 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +47,7 @@ class Course(NamedTuple):
     reason: str
 
 
-def fitted(residuals: rts.ImageResiduals, engine: str, method: str, seed: int, steps: int | None = None) -> Course:
+def fitted(residuals: Callable, engine: str, method: str, seed: int, steps: int | None = None) -> Course:
     """A fit from a start."""
     known, losses, seconds, trail = engine_named(engine), [], [], []
 
@@ -64,17 +64,15 @@ def fitted(residuals: rts.ImageResiduals, engine: str, method: str, seed: int, s
     begun = time.perf_counter()
     found = rts.fit(
         residuals, scene.arrays(engine, scene.start(seed)), method=method, steps=steps or STEPS[method],
-        tolerance=1e-5, callback=note, progress=False, **own,
+        loss=scene.LOSS, tolerance=1e-5, callback=note, progress=False, **own,
     )  # fmt: skip
     return Course(losses, seconds, trail, host(found.parameters), found.reason)
 
 
 def picture(unknowns: dict[str, np.ndarray], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Hard images of 4 × 4 samples a pixel: colours (H, W, 3), and the coverage (H, W) of the airplane alone."""
-    parts, camera = scene.scene({name: x.astype(np.float32) for name, x in unknowns.items()})
-    options: dict[str, Any] = {"splatter": "none", "layers": 1, "supersample": 4}
-    image = rts.render(parts, camera, size, **options)
-    return image[..., :3], rts.render(parts[0], camera, size, **options)[..., 3]
+    known = {name: x.astype(np.float32) for name, x in unknowns.items()}
+    return scene.image(known, size, splatter="none", layers=1, supersample=4)
 
 
 def overlap(unknowns: dict[str, np.ndarray], factor: int) -> float:
@@ -107,7 +105,7 @@ def run(engine: str, factor: int, splatters: Sequence[str], seeds: int) -> dict[
     """All fits; the methods take turns, so that others on the machine slow both."""
     courses = {}
     for splatter in splatters:
-        residuals = scene.residuals(factor, splatter, SPLATTERS[splatter])
+        residuals = scene.residuals(engine, factor, splatter, SPLATTERS[splatter])
         for method in STEPS:
             fitted(residuals, engine, method, 0, 2)  # Compiles.
         for seed in range(seeds):

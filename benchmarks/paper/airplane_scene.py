@@ -7,6 +7,7 @@ a matrix that is fitted along, and the loss is robust.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,7 +17,6 @@ import numpy as np
 import rts
 from benchmarks.meshes import DATA, normalised
 from rts.arrays.engines import engine_named
-from rts.diagnostics.example_shapes import QUAD
 from rts.shading.shaders import Lambert
 
 FOLDER = DATA / "ycb_airplane"
@@ -28,8 +28,8 @@ TURNED, SHIFTED, ZOOMED = np.radians(15.0), 0.15, 0.15
 """How far off starts are: an angle, a length (the airplane's radius is 1), and the logarithm of the field of view."""
 AMBIENT = 0.5
 TEXELS = 256
-F_SCALE = 0.1
-"""Where the robust loss turns from square to absolute, linear colours."""
+LOSS = rts.Loss("soft_l1", f_scale=0.1)
+"""The robust loss of differences of linear colours."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def start(seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def scene(unknowns: dict[str, Any]) -> tuple[list[rts.Part], rts.Camera]:
-    """The airplane before a plane of one colour, and the camera, for unknowns of any engine."""
+def scene(unknowns: dict[str, Any]) -> tuple[rts.Part, rts.Camera]:
+    """The airplane and the camera, for unknowns of any engine."""
     surface, known = airplane()
     xp = rts.namespace(unknowns["pose"])
     light = {
@@ -100,22 +100,22 @@ def scene(unknowns: dict[str, Any]) -> tuple[list[rts.Part], rts.Camera]:
         "color": xp.concat([unknowns["brightness"]] * 3),
     }
     theta = known | {"light": light, "matrix": unknowns["matrix"]}
-    corners = np.array([[-60, -60, -40], [60, -60, -40], [60, 60, -40], [-60, 60, -40]], np.float32)
-    table = {"vertices": corners, "color": unknowns["background"]}
-    camera = rts.Camera.look_at(
-        (0, 0, DISTANCE), (0, 0, 0), fov_y=FOV * xp.exp(unknowns["zoom"][0]), near=0.2, far=100.0
-    )
-    return [
-        rts.Part(surface, theta, Recolored(), rts.rigid(unknowns["pose"]), cull="back"),
-        rts.Part(rts.plugin("surfaces", "mesh")(QUAD), table, "unlit"),
-    ], camera
+    fov = FOV * xp.exp(unknowns["zoom"][0])
+    camera = rts.Camera.look_at((0, 0, DISTANCE), (0, 0, 0), fov_y=fov, near=0.2, far=100.0)
+    return rts.Part(surface, theta, Recolored(), rts.rigid(unknowns["pose"]), cull="back"), camera
 
 
-def residuals(factor: int, splatter: str, layers: int, **options: Any) -> rts.ImageResiduals:
-    """The robust difference of images from the photograph, as a function of the unknowns."""
-    target = photograph(factor)
-    options = {"loss": "soft_l1", "f_scale": F_SCALE} | options
-    return rts.ImageResiduals(scene, None, target.shape[:2], target, splatter=splatter, layers=layers, **options)
+def image(unknowns: dict[str, Any], size: tuple[int, int], **options: Any) -> Any:
+    """The airplane over the colour of the background (H, W, 3), and its coverage (H, W)."""
+    found = rts.render(*scene(unknowns), size, **options)
+    return found[..., :3] + (1 - found[..., 3:]) * unknowns["background"], found[..., 3]
+
+
+def residuals(engine: str, factor: int, splatter: str, layers: int) -> Callable[[dict[str, Any]], Any]:
+    """The difference of images from the photograph, as a function of the unknowns."""
+    target = engine_named(engine).constant(photograph(factor))
+    size = photograph(factor).shape[:2]
+    return lambda unknowns: image(unknowns, size, splatter=splatter, layers=layers)[0] - target
 
 
 def arrays(engine: str, unknowns: dict[str, np.ndarray]) -> dict[str, Any]:

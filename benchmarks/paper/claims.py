@@ -188,7 +188,7 @@ def airplane(numbers: dict[str, Any]) -> list[Row]:
     from benchmarks.paper.airplane_scene import start
 
     fits, unknowns = numbers["summary"], sum(x.size for x in start(0).values())
-    main = fits.get("visible", fits["multi"])
+    main = fits["multi"]
     known = {s: fits[s] for s in ("single", "multi", "visible") if s in fits}
 
     def told(key: str, unit: str = "") -> str:
