@@ -67,7 +67,7 @@ def earth(rows: int) -> np.ndarray:
 
 
 def latitudes(rows: int) -> np.ndarray:
-    """Of the texels' rows, from the upper one down, radians."""
+    """The latitudes (rows,) of the rows of texels, from the upper one down, radians."""
     return np.pi / 2 - np.pi * (np.arange(rows) + 0.5) / rows
 
 
@@ -101,7 +101,7 @@ def part(texture: Any, mip: bool) -> rts.Part:
 
 
 def psnr(texture: np.ndarray, truth: np.ndarray) -> float:
-    """Of the texels up to the trusted latitude, each by its area on the sphere; decibels."""
+    """Peak signal-to-noise of texels up to the trusted latitude, each by its area on the sphere; decibels."""
     up = latitudes(len(truth))
     weights = np.where(np.abs(up) < TRUSTED, np.cos(up), 0)
     error = ((texture.clip(0, 1).astype(np.float64) - truth) ** 2).mean((1, 2))
