@@ -43,7 +43,7 @@ MARKERS = {
 }
 """Name of a symbol in `chart_style` → matplotlib's marker."""
 INK, PALE = "#1f2937", "#6b7280"
-COLUMNS = 3
+COLUMNS = 2
 PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
 """Inches; `LINE_HEIGHT` is the height of a text line in the list under a panel."""
 CHARACTER_WIDTH = 0.075

@@ -1,6 +1,7 @@
 """Arrays on another device than the CPU: the same images and derivatives, results there, and few copies to the host.
 
-Every machine has one such device of torch, `elsewhere.DEVICE`; GPUs are tested where torch or jax has any.
+Every machine has one such device of torch, `elsewhere.DEVICE`; GPUs are tested where torch or jax has any. Other files
+test jax on the CPU.
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ class Place:
     """An engine and one of its devices.
 
     Args:
-        name: such as "torch-cuda" or "jax-cpu"; "torch-elsewhere" for `elsewhere.DEVICE`.
+        name: such as "torch-cuda" or "jax-cuda"; "torch-elsewhere" for `elsewhere.DEVICE`.
     """
 
     def __init__(self, name):
+        self.name = name
         self.engine, self.device = name.split("-")
         self.device = elsewhere.DEVICE.type if self.device == "elsewhere" else self.device
 
@@ -89,7 +91,7 @@ def _places():
     if importlib.util.find_spec("jax"):
         import jax
 
-        names += [f"jax-{name}" for name in ("cpu", "cuda") if name == "cpu" or jax.default_backend() == "gpu"]
+        names += ["jax-cuda"] * (jax.default_backend() == "gpu")
     return names
 
 
@@ -229,42 +231,30 @@ def needed(name):
 # --------------------------------------------------------------------------------------------------------- images
 
 QUICK = ("mesh", "sdf", "lit texture")
-"""Cases for `make test`, and for jax on the CPU, which other files test."""
+"""Cases for `make test`."""
+EVERY_CASE = [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in CASES]
 
 
-def in_places(name):
-    """A case in every place where it is tested."""
-    marks = [pytest.mark.thorough] * (name not in QUICK)
-    return [pytest.param(p, name, marks=marks, id=f"{p}-{name}") for p in PLACES if p != "jax-cpu" or name in QUICK]
-
-
-@pytest.mark.parametrize("place, name", [pair for name in CASES for pair in in_places(name)], indirect=["place"])
+@pytest.mark.parametrize("name", EVERY_CASE)
 def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     case = needed(name)
     tree = place.put(arrays_of(case))
     image, gradient, tangent = on_the_cpu(name)
     np.testing.assert_allclose(place.take(image_of(case, tree)), image, atol=1e-5)
-    value, slopes = place.gradient(loss_of(case, place.put(WEIGHTS)), tree)
+    weights = place.put(WEIGHTS)
+    elsewhere.copies.clear(), elsewhere.waits.clear()
+    value, slopes = place.gradient(loss_of(case, weights), tree)
+    # The host gets inputs of the sampler, and nothing else; loops along rays ask whether any ray is not done.
+    assert elsewhere.copies or place.name != "torch-elsewhere"
+    assert all(line.endswith(" _to_host") for line in elsewhere.copies), elsewhere.copies
+    loops = ("_repeated", "_cast_some") if name in ("sdf", "rays") else ()
+    assert all(line.endswith(loops) for line in elsewhere.waits) if loops else not elsewhere.waits, elsewhere.waits
     assert abs(float(place.take(value)) - (image * WEIGHTS).sum()) < 1e-3
     scale = max(np.linalg.norm(x) for x in leaves(gradient))
     for mine, other in zip(leaves(place.take(slopes)), leaves(gradient), strict=True):
         assert np.linalg.norm(mine - other) <= 1e-4 * max(np.linalg.norm(other), 1e-3 * scale)
     _, moved = place.tangent(lambda t: image_of(case, t), tree, place.put(direction(case)))
     assert np.linalg.norm(tangent) > 0 and relative_error(place.take(moved), tangent) < 1e-4
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in CASES])
-def test_the_host_gets_inputs_of_the_sampler_and_nothing_else(name):
-    case = needed(name)
-    with elsewhere.Device():
-        place = Place("torch-elsewhere")
-        tree = place.put(arrays_of(case))
-        elsewhere.copies.clear(), elsewhere.waits.clear()
-        place.gradient(loss_of(case, place.put(WEIGHTS)), tree)
-    assert all(line.endswith(" _to_host") for line in elsewhere.copies), elsewhere.copies
-    # Loops along rays ask whether any ray is not done.
-    loops = ("_repeated", "_cast_some") if name in ("sdf", "rays") else ()
-    assert all(line.endswith(loops) for line in elsewhere.waits) if loops else not elsewhere.waits, elsewhere.waits
 
 
 def test_views_of_one_call(place):

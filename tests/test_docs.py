@@ -97,6 +97,7 @@ def test_the_readme_is_short():
 
 GUIDE = {
     "loft": "third_plugin/rts_third_plugin/loft.py",
+    "ring": "third_plugin/rts_third_plugin/ring.py",
     "caster": "third_plugin/rts_third_plugin/caster.py",
     "toon": "third_plugin/rts_third_plugin/toon.py",
     "gauss5": "second_plugin/gauss5.py",

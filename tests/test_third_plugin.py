@@ -18,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent / "third_plugin"))  # Nothing insta
 
 from rts_third_plugin.caster import Caster
 from rts_third_plugin.loft import Loft
+from rts_third_plugin.ring import Ring
 from rts_third_plugin.toon import Toon
 
 pytestmark = pytest.mark.plugins
@@ -27,6 +28,12 @@ class TestLoft(SurfaceConformance):
     @pytest.fixture
     def part(self):
         return Loft.example()
+
+
+class TestRing(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return Ring.example()
 
 
 class TestCaster(SamplerConformance):
