@@ -90,13 +90,18 @@ def told(name: str, rows: list[Row]) -> str:
 
 
 def keep(name: str, folder: Path, found: dict[str, Any]) -> None:
-    """Copy numbers and pictures to where the page takes them from."""
+    """Copy numbers and pictures to where the page takes them from; pictures in 256 colours."""
+    from PIL import Image
+
     path_of(name).parent.mkdir(parents=True, exist_ok=True)
     path_of(name).write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
     IMAGES.mkdir(parents=True, exist_ok=True)
     for picture in EXPERIMENTS[name].pictures:
-        if (folder / picture).exists():
-            shutil.copyfile(folder / picture, IMAGES / f"{name}{Path(picture).suffix}")
+        source, target = folder / picture, IMAGES / f"{name}{Path(picture).suffix}"
+        if source.suffix == ".png" and source.exists():
+            Image.open(source).convert("RGB").quantize(256).save(target, optimize=True)
+        elif source.exists():
+            shutil.copyfile(source, target)
 
 
 def options(arguments: list[str] | None = None) -> argparse.Namespace:
