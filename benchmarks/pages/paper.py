@@ -162,8 +162,9 @@ def claims() -> str:
 def counted() -> str:
     """A line: how many claims hold."""
     verdicts = [row.verdict for name in EXPERIMENTS for row in found(name)[0]]
-    told = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
-    return f"Of {len(verdicts)} claims: {told}.\n"
+    words = {"holds": "hold", "in part": "hold in part", "does not": "do not hold", "not run": "were not run"}
+    told = ", ".join(f"{verdicts.count(verdict)} {word}" for verdict, word in words.items())
+    return f"Of {len(verdicts)} claims {told}.\n"
 
 
 def conditions() -> str:

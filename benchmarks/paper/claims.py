@@ -65,7 +65,7 @@ def derivatives(numbers: dict[str, dict[str, float]]) -> list[Row]:
             "picture",
             f"others here: {peers}" if peers else "–",
             "not run",
-            "these three are not measured here",
+            "these three are not measured: no GPU",
         ),
     ]
 
@@ -160,7 +160,7 @@ def speed(numbers: dict[str, Any]) -> list[Row]:
             "16 → 17 ms (1.06×)",
             told(pose),
             verdict(growth(pose) < growth(full), growth(pose) < 1.25),
-            "sampling does, on two cores; the differentiable part does not",
+            "finding the points does, on two cores",
         ),
     ]
     if "DEODR" in ms:
@@ -171,7 +171,7 @@ def speed(numbers: dict[str, Any]) -> list[Row]:
                 "588 and 306 ms beside 26",
                 f"{faster:.3g} times as fast as DEODR ({ms['DEODR'][-1]:.4g} ms beside {ms[pose][-1]:.3g})",
                 "not run",
-                "PyTorch3D, Redner and nvdiffrast need a GPU or do not install; beside DEODR on the same machine",
+                "PyTorch3D, Redner and nvdiffrast are not measured: no GPU. Beside DEODR on the same machine",
             )
         )
     return rows
