@@ -68,8 +68,8 @@ def directions(count: int, turn: float = 0.0) -> np.ndarray:
     return np.stack([np.cos(angle) * np.sqrt(1 - z * z), z, np.sin(angle) * np.sqrt(1 - z * z)], axis=1)
 
 
-def subject(name: str) -> Subject:
-    """Spot with its texture, or the bunny in a pattern of colours, its bounds' diagonal 2, and pictures of it."""
+def shape(name: str) -> rts.Part:
+    """Spot with its texture, or the bunny in a pattern of colours; its bounds' diagonal is 2."""
     path = DATA / ("meshes/spot/spot_triangulated.obj" if name == "spot" else "meshes/bunny.obj")
     part = rts.load(path)[0]
     vertices = np.asarray(part.theta["vertices"], np.float64)
@@ -80,9 +80,15 @@ def subject(name: str) -> Subject:
         theta["texture"] = rts.load_image(DATA / "meshes/spot/spot_texture.png")[..., :3]
     else:
         theta["colors"] = (0.5 + 0.35 * np.sin(9 * vertices + np.array([0, 2, 4]))).astype(np.float32)
-    part = part.replace(theta=theta, shader="lambert")
+    return part.replace(theta=theta, shader="lambert")
+
+
+def subject(name: str) -> Subject:
+    """A shape, and pictures of it."""
+    part = shape(name)
+    vertices = part.theta["vertices"]
     distance = 1.05 * np.linalg.norm(vertices, axis=1).max() / np.sin(np.radians(FOV / 2))
-    mesh = trimesh.Trimesh(theta["vertices"], part.surface.faces, process=False)
+    mesh = trimesh.Trimesh(vertices, part.surface.faces, process=False)
     eyes, others = distance * directions(VIEWS), distance * directions(HELD_OUT, 1.0) * [1, -1, 1]
     return Subject(mesh, pictures(part, eyes), pictures(part, others))
 

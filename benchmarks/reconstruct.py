@@ -4,6 +4,8 @@ The pictures are those of `benchmarks.many_views`, 24 to fit and 8 held out, wri
 photographs, 100 to fit and 25 held out:
 
     python -m benchmarks.reconstruct --shapes spot bunny lego -o out/reconstruct
+    python -m benchmarks.reconstruct --shapes spot --surface isosurface -o out/isosurface
+    python -m benchmarks.reconstruct --shapes spot bunny --quick --light -o out/light # how far off the albedo
 
 Needs the models of the folder that RTS_DATA names, `rts-reconstruct` (`make apps`), and, to count the faces that meet
 others, pymeshlab.
@@ -21,7 +23,7 @@ import trimesh
 from PIL import Image
 
 import rts
-from benchmarks.many_views import chamfer, subject
+from benchmarks.many_views import chamfer, shape, subject
 
 EVERY, EVERY_LEGO = 4, 5
 """Every so many views, one is held out."""
@@ -80,6 +82,25 @@ def crossing(mesh: trimesh.Trimesh) -> float:
     return 100 * meshes.current_mesh().selected_face_number() / len(mesh.faces)
 
 
+def albedo_off(found: Any, name: str) -> float:
+    """Percent by which the colours of a reconstruction are off a shape's albedo, in views that were held out.
+
+    It is the mean absolute difference of linear colours over the mean of the albedo. The scale of each channel, which
+    no picture tells, is that of the median.
+    """
+    truth = shape(name)
+    theta = {**truth.theta, "vertices": found.pictures.world.inside(truth.theta["vertices"]).astype(np.float32)}
+    parts = [truth.replace(theta=theta, shader="unlit"), found.model._replace(light=None).part]
+    colors = []
+    for view in found.pictures.held_out:
+        pair = [np.asarray(rts.render(part, view.camera, view.size, splatter="none")) for part in parts]
+        colors.append(np.stack([x[(pair[0][..., 3] == 1) & (pair[1][..., 3] == 1)][:, :3] for x in pair]))
+    known, own = np.concatenate(colors, axis=1)
+    own = np.where(own <= 0.04045, own / 12.92, ((own + 0.055) / 1.055) ** 2.4)
+    own *= np.median(known, axis=0) / np.median(own, axis=0)
+    return 100 * float(np.abs(own - known).mean() / known.mean())
+
+
 def run(name: str, folder: Path, options: dict[str, Any]) -> None:
     """Reconstruct a shape, and print a line."""
     import rts_reconstruct
@@ -89,7 +110,13 @@ def run(name: str, folder: Path, options: dict[str, Any]) -> None:
         truth, every = written_lego(views), EVERY_LEGO
     else:
         truth, every = written(name, views), EVERY
+    light = options.pop("light")
     found = rts_reconstruct.reconstruct(views, folder / name, held_out=every, **options)
+    if light:
+        apart = rts_reconstruct.reconstruct(views, folder / name, held_out=every, light=True, resume=True, **options)
+        assert apart.model.light is not None
+        print(f"{name}: albedo off by {albedo_off(found, name):.1f} % as seen, {albedo_off(apart, name):.1f} % apart;")
+        print(f"the light:\n{np.round(apart.model.light, 2)}\nPSNR {apart.psnr:.1f} dB")
     vertices = found.pictures.world.outside(found.model.vertices)
     mesh = trimesh.Trimesh(vertices, found.model.faces, process=False)
     away = "" if truth is None else f", chamfer {chamfer(mesh, truth):.3f} %"
@@ -100,7 +127,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", nargs="*", default=["spot", "bunny", "lego"])
     parser.add_argument("--start", default="ball")
+    parser.add_argument("--surface", default="mesh")
+    parser.add_argument("--light", action="store_true")
+    parser.add_argument("--quick", action="store_true")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/reconstruct"))
     options = parser.parse_args()
-    for shape in options.shapes:
-        run(shape, options.output, {"start": options.start})
+    for each in options.shapes:
+        run(each, options.output, {name: getattr(options, name) for name in ("start", "surface", "light", "quick")})

@@ -19,7 +19,7 @@ def reconstruct(
     ],
     out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("reconstruction"),
     start: Annotated[str, typer.Option(help="ball, hull (of alpha or masks), or a file of a mesh.")] = "ball",
-    surface: Annotated[str, typer.Option(help="mesh, or subdivision: smooth, by fewer control points.")] = "mesh",
+    surface: Annotated[str, typer.Option(help="mesh; isosurface: holes may open; or subdivision: smooth.")] = "mesh",
     steps: Annotated[int | None, typer.Option(help="Steps of the shape; 1300.", show_default=False)] = None,
     size: Annotated[int | None, typer.Option(help="Longer side of pictures, at most; 256.", show_default=False)] = None,
     batch: Annotated[int, typer.Option(help="Pictures in a step.")] = 4,
@@ -28,6 +28,9 @@ def reconstruct(
     ] = None,
     held_out: Annotated[int, typer.Option(help="Hold out every so many views, to measure only; 0 for none.")] = 8,
     fit_cameras: Annotated[bool, typer.Option("--fit-cameras", help="Fit the poses of cameras, too.")] = False,
+    light: Annotated[
+        bool, typer.Option("--light", help="Tell light from colours, and write colours as in even light.")
+    ] = False,
     background: Annotated[
         str | None, typer.Option(help="R,G,B from 0 to 1, of pictures without alpha and masks; else that of borders.")
     ] = None,
@@ -59,6 +62,7 @@ def reconstruct(
             texture=texture,
             held_out=held_out,
             fit_cameras=fit_cameras,
+            light=light,
             background=None if background is None else _colour(background),
             quick=quick,
             seed=seed,

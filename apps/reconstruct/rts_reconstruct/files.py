@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import tempfile
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 import rts
+from rts_reconstruct.light import decoded
 from rts_reconstruct.measures import Measured
 from rts_reconstruct.model import Model
 from rts_reconstruct.pictures import Pictures
@@ -47,7 +49,7 @@ def _write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[str]:
         (folder / "mesh.obj").write_text(_obj(vertices, model, colors), encoding="utf-8")
         linear = _bytes(decoded(colors))  # glTF's colours are linear, OBJ's are as pictures have them.
         mesh = trimesh.Trimesh(vertices, model.faces, vertex_colors=linear, process=False)
-        mesh.export(folder / "mesh.glb", tree_postprocessor=_lit_already)
+        mesh.export(folder / "mesh.glb", tree_postprocessor=_lit_already if model.light is None else None)
         return ["mesh.obj", "mesh.glb"]
     picture = Image.fromarray(_bytes(model.atlas.texture))
     picture.save(folder / "texture.png")
@@ -58,7 +60,7 @@ def _write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[str]:
     material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
     visual = TextureVisuals(uv=model.atlas.uv[rows[:, 1]], material=material)
     mesh = trimesh.Trimesh(vertices[rows[:, 0]], corners, visual=visual, process=False)
-    mesh.export(folder / "mesh.glb", tree_postprocessor=_lit_already)
+    mesh.export(folder / "mesh.glb", tree_postprocessor=_lit_already if model.light is None else None)
     return ["mesh.obj", "mesh.glb", *TEXTURE_FILES]
 
 
@@ -73,6 +75,18 @@ def _lit_already(tree: dict[str, Any]) -> None:
     for material in tree["materials"]:
         material.setdefault("extensions", {})["KHR_materials_unlit"] = {}
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
+
+
+def write_light(path: Path, model: Model) -> list[Path]:
+    """Write the factors of the model's light, with the names of their functions; a model without leaves no file."""
+    if model.light is None:
+        path.unlink(missing_ok=True)  # Of an earlier run.
+        return []
+    names = "1", "x", "y", "z", "xy", "yz", "zx", "x² - y²", "3z² - 1"
+    table = {name: [round(float(x), 5) for x in row] for name, row in zip(names, model.light, strict=True)}
+    about = "irradiance of a unit normal (x, y, z) in the world of the cameras: sum of functions times red, green, blue"
+    path.write_text(json.dumps({"about": about, "irradiance": table}, indent=1, ensure_ascii=False), encoding="utf-8")
+    return [path]
 
 
 def write_cameras(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
@@ -139,8 +153,3 @@ def write_table(path: Path, rows: Sequence[Measured]) -> None:
 
 def _bytes(values: np.ndarray) -> np.ndarray:
     return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
-
-
-def decoded(encoded: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB-encoded ones (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import rts
+from rts_reconstruct.light import Lit
 
 NEAREST = 3
 """The old vertices from which a new one has its colour."""
@@ -32,7 +33,8 @@ class Atlas(NamedTuple):
 class Model(NamedTuple):
     """A mesh (V, 3), (T, 3) with colours (V, 3) or an atlas; poses (B, 6) of the world before each camera.
 
-    Vertices are in the world of `Pictures`, colours sRGB-encoded, poses in the order of `Pictures.numbers`.
+    Vertices are in the world of `Pictures`, colours sRGB-encoded, poses in the order of `Pictures.numbers`. `light`
+    (9, 3) is that of `light.irradiance`; None where colours have it in them.
     """
 
     vertices: np.ndarray
@@ -40,13 +42,18 @@ class Model(NamedTuple):
     colors: np.ndarray
     poses: np.ndarray
     atlas: Atlas | None = None
+    light: np.ndarray | None = None
 
     @property
     def part(self) -> rts.Part:
-        """The mesh as a part, in its colours."""
+        """The mesh as a part, in its colours and its light."""
         if self.atlas is None:
-            return colored(rts.Mesh(self.faces), self.vertices, self.colors)
-        return textured(surface_of(self), self.vertices, self.atlas.uv, self.atlas.texture)
+            part = colored(rts.Mesh(self.faces), self.vertices, self.colors)
+        else:
+            part = textured(surface_of(self), self.vertices, self.atlas.uv, self.atlas.texture)
+        if self.light is None:
+            return part
+        return part.replace(theta={**part.theta, "irradiance": self.light}, shader=Lit(part.shader))
 
 
 def carried(model: Model, vertices: np.ndarray, faces: np.ndarray) -> Model:
@@ -61,7 +68,7 @@ def carried(model: Model, vertices: np.ndarray, faces: np.ndarray) -> Model:
 
 def colored(surface: Any, vertices: Any, colors: Any) -> rts.Part:
     """A mesh with colours (V, 3), which need no light."""
-    return rts.Part(surface, {"vertices": vertices, "colors": colors}, "unlit")
+    return rts.Part(surface, {"vertices": vertices, "colors": colors}, rts.plugin("shaders", "unlit")())
 
 
 def textured(surface: Any, vertices: Any, uv: Any, texture: Any) -> rts.Part:

@@ -11,6 +11,7 @@ import numpy as np
 import rts
 from rts.diagnostics.command_tools import output_folder, writing
 from rts_reconstruct import files, job, measures, pictures, posing, stages, texturing
+from rts_reconstruct.light import decoded
 from rts_reconstruct.model import Model
 from rts_reconstruct.report import write_report
 from rts_reconstruct.saved import Saved
@@ -90,6 +91,7 @@ def reconstruct(
     texture: int | None = None,
     held_out: int = 8,
     fit_cameras: bool = False,
+    light: bool = False,
     background: Any = None,
     quick: bool = False,
     seed: int = 0,
@@ -100,8 +102,8 @@ def reconstruct(
     """Fit a mesh with colours to photographs with cameras, and write it.
 
     Three stages fit vertices and their colours, each on a finer mesh, which is moved apart where it passes through
-    itself; a last one fits a texture. Colours have the light
-    of the pictures in them. The mesh is written after each stage, so that an interruption leaves the last one.
+    itself; a last one fits a texture. Colours have the light of the pictures in them, unless `light` is True. The mesh
+    is written after each stage, so that an interruption leaves the last one.
 
     Where pictures have alpha, it tells where the object is. Where they have masks alone, these do. Pictures that have
     neither need a plain background; colours alone are compared then.
@@ -112,8 +114,9 @@ def reconstruct(
         views: file or folder, as `rts.load_views` takes it; or a list of views with sRGB-encoded images.
         out: the folder to write into.
         start: "ball"; "hull", the visual hull of alpha or masks; or the path of a mesh in the world of the cameras.
-        surface: "mesh"; or "subdivision", for stages that fit the cage of a Loop subdivision surface, which is smooth
-            between its fewer control points. The files hold a fine mesh of it.
+        surface: "mesh"; "isosurface", for stages that fit values on a lattice, whose surface may change its topology,
+            and a last one that fits the mesh of it; or "subdivision", for stages that fit the cage of a Loop
+            subdivision surface, which is smooth between its fewer control points. The files hold a fine mesh of it.
         steps: the steps of all stages of the shape, by default 1300; the texture takes a fifth as many on top.
         size: pixels; longer sides of pictures are made at most so long, by default 256.
         batch: the number of pictures in a step.
@@ -121,6 +124,9 @@ def reconstruct(
         held_out: every so many views, one is held out and only measured; 0 for none.
         fit_cameras: True to fit the poses of cameras, too, and write them; those of views held out are fitted to the
             finished mesh, since fitted cameras and mesh may have moved together.
+        light: True to tell light and colours apart in the end, and write colours as in even light, and the light. It is
+            one environment, of spherical harmonics to the second order, whose mean irradiance is 1, since pictures do
+            not tell bright light from bright colours. Near points are taken to be of one material, but for edges.
         background: (3,) encoded colour of pictures without alpha and masks; None for that of their borders.
         quick: True for a first look: smaller defaults, and a quarter of the faces.
         seed: of the order of pictures.
@@ -142,10 +148,9 @@ def reconstruct(
     _check(
         steps=(steps, 3), size=(size, 8), batch=(batch, 1), texture=(texture, 0), held_out=(held_out, 0), seed=(seed, 0)
     )
-    if surface not in ("mesh", "subdivision"):
-        raise rts.InputError(f"surface is {surface!r:.60}; expected 'mesh' or 'subdivision'")
-    if surface == "subdivision":
-        rts.plugin("surfaces", "subdivision")  # Refused now where OpenSubdiv is missing.
+    if surface not in ("mesh", "subdivision", "isosurface"):
+        raise rts.InputError(f"surface is {surface!r:.60}; expected 'mesh', 'subdivision' or 'isosurface'")
+    rts.plugin("surfaces", surface)  # Refused now where OpenSubdiv is missing.
     if 0 < texture < 16:
         raise rts.InputError(f"texture is {texture}; expected at least 16 texels a side, or 0 for vertex colours")
     folder = output_folder(out)
@@ -155,7 +160,7 @@ def reconstruct(
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
     poses = np.zeros((len(shots.numbers), 6), np.float32)
     model = Model(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), grey, poses)
-    settings = stages.Settings(batch, seed, fit_cameras, surface == "subdivision", progress)
+    settings = stages.Settings(batch, seed, fit_cameras, surface, progress)
     plan = [(s._replace(faces=int(defaults["faces"] * s.faces)), max(1, round(s.share * steps))) for s in stages.STAGES]
     with writing(folder):
         (folder / "checkpoint").mkdir(parents=True, exist_ok=True)
@@ -172,7 +177,7 @@ def reconstruct(
     finally:
         if run.watch is not None:
             run.watch.end()
-    return run.finish()
+    return run.finish(light)
 
 
 def _linear(view: rts.View) -> rts.View:
@@ -180,7 +185,7 @@ def _linear(view: rts.View) -> rts.View:
 
     def image() -> np.ndarray:
         encoded = view.image
-        return np.concatenate([files.decoded(encoded[..., :3]), encoded[..., 3:]], axis=-1)
+        return np.concatenate([decoded(encoded[..., :3]), encoded[..., 3:]], axis=-1)
 
     return rts.View(view.camera, image, view.size, name=view.name)
 
@@ -245,7 +250,7 @@ class _Run:
         def report(step: int, loss: float, now: Any) -> bool:
             if self.watch is not None and time.perf_counter() - self._looked >= PAUSE_S:
                 vertices, faces, colors = now()
-                stop = self.watch.step(before + step, loss, vertices, faces, files.decoded(colors))
+                stop = self.watch.step(before + step, loss, vertices, faces, decoded(colors))
                 self._looked = time.perf_counter()
                 self.stopped = self.stopped or bool(stop)
             return self.stopped
@@ -262,10 +267,12 @@ class _Run:
                 self.files = files.write_mesh(self.folder, model, self.pictures)
                 self.saved.write(model, self.losses, self.seconds)
 
-    def finish(self) -> Reconstruction:
-        """Measure all views, and write the rest."""
+    def finish(self, light: bool) -> Reconstruction:
+        """Tell light from colours, if asked to; measure all views, and write the rest."""
         if self.settings.cameras and self.pictures.held_out:
             self.model = posing.posed(self.model, self.pictures, self.settings)
+        if light:
+            self.model = job.shared(lambda: texturing.in_even_light(self.model))
         rows = measures.measured(self.model, self.pictures)
         psnr = measures.mean_of(rows, "psnr", bool(self.pictures.held_out))
         assert psnr is not None
@@ -274,6 +281,7 @@ class _Run:
             return found
         with writing(self.folder):
             self.files = files.write_mesh(self.folder, self.model, self.pictures)
+            self.files += files.write_light(self.folder / "light.json", self.model)
             if self.settings.cameras:
                 self.files += files.write_cameras(self.folder, self.model, self.pictures)
             table, turning, report = (self.folder / name for name in ("views.csv", "turntable.gif", "report.html"))

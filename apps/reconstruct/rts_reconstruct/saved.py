@@ -36,7 +36,7 @@ class Saved:
 
     def write(self, model: Model, losses: list[list[float]], seconds: float) -> None:
         """Keep the model after a stage; `losses` has a list for each stage so far."""
-        arrays = {name: x for name, x in model._asdict().items() if name != "atlas"}
+        arrays = {name: x for name, x in model._asdict().items() if name != "atlas" and x is not None}
         if model.atlas is not None:
             arrays |= {f"atlas_{name}": x for name, x in model.atlas._asdict().items()}
         about = json.dumps({"identity": self.identity, "losses": losses, "seconds": seconds})

@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 import rts
+from rts_reconstruct.isosurface import Values
 from rts_reconstruct.job import shared
 from rts_reconstruct.model import Model, carried, colored, moved_camera
 from rts_reconstruct.pictures import Pictures
@@ -31,6 +32,7 @@ class Stage(NamedTuple):
         shape: the learning rate of the shape.
         colors: that of colours.
         poses: that of cameras.
+        lattice: points along each axis where an isosurface is fitted; 0 for a mesh there, too, made of the isosurface.
     """
 
     faces: int
@@ -39,12 +41,13 @@ class Stage(NamedTuple):
     shape: float
     colors: float
     poses: float
+    lattice: int
 
 
 STAGES = (
-    Stage(5_000, 0.3, 40, 0.1, 0.02, 0.002),
-    Stage(20_000, 0.3, 40, 0.05, 0.02, 0.001),
-    Stage(30_000, 0.4, 20, 0.01, 0.005, 0.0003),
+    Stage(5_000, 0.3, 40, 0.1, 0.02, 0.002, 40),
+    Stage(20_000, 0.3, 40, 0.05, 0.02, 0.001, 72),
+    Stage(30_000, 0.4, 20, 0.01, 0.005, 0.0003, 0),
 )
 
 
@@ -55,14 +58,14 @@ class Settings(NamedTuple):
         batch: the number of views in a step.
         seed: of the order of views.
         cameras: True to fit cameras.
-        smooth: True for subdivision surfaces, False for meshes.
+        surface: "mesh", "subdivision" or "isosurface".
         progress: True to show progress; None for only on a terminal.
     """
 
     batch: int
     seed: int
     cameras: bool
-    smooth: bool
+    surface: str
     progress: bool | None
 
 
@@ -80,25 +83,19 @@ def fitted(
         checkpoint: the file of the fit's state, or None.
         report: called as (step, loss, vertices, faces, colors); a true result stops the fit.
     """
-    model = remeshed(model, stage.faces // FACES if settings.smooth else stage.faces)
-    steps_of = rts.LargeSteps(model.faces, len(model.vertices), stage.smoothness)
-    surface = limit_of(model.faces) if settings.smooth else rts.Mesh(model.faces)
-    start = {"shape": torch.tensor(steps_of.encode(model.vertices)), "colors": torch.tensor(model.colors)}
-    rates = {"shape": stage.shape, "colors": stage.colors}
+    shape = _shape(model, pictures, stage, settings)
+    start = dict(shape.start)
+    rates = {"shape": stage.shape * shape.rate, "colors": stage.colors}
     if settings.cameras:
         start["poses"], rates["poses"] = torch.tensor(model.poses), stage.poses
     residuals = rts.ViewResiduals(
-        lambda p: colored(surface, steps_of.decode(p["shape"]), p["colors"]),
+        shape.part,
         pictures.views,
         batch=min(settings.batch, len(pictures.views)),
         seed=settings.seed,
         cameras=moved_camera if settings.cameras else None,
         background=None if pictures.outlined else pictures.background,
     )
-
-    def vertices_of(p: Any) -> np.ndarray:
-        return np.asarray(steps_of.decode(p["shape"].detach()), np.float32)
-
     fit = rts.fit(
         residuals,
         start,
@@ -106,15 +103,46 @@ def fitted(
         learning_rate=rates,
         validate_every=steps,
         checkpoint=checkpoint,
-        callback=lambda step, p, loss: report(
-            step, loss, lambda: (vertices_of(p), model.faces, p["colors"].detach().numpy())
-        ),
+        callback=lambda step, p, loss: report(step, loss, lambda: shape.mesh(p)),
         progress=settings.progress,
     )
-    best = fit.parameters
-    poses = best["poses"].numpy() if settings.cameras else model.poses
-    found = Model(vertices_of(best), model.faces, best["colors"].numpy(), poses)
-    return tessellated(found) if settings.smooth else found, fit.history
+    poses = fit.parameters["poses"].numpy() if settings.cameras else model.poses
+    found = Model(*shape.mesh(fit.parameters), poses)
+    return tessellated(found) if settings.surface == "subdivision" else found, fit.history
+
+
+def _shape(model: Model, pictures: Pictures, stage: Stage, settings: Settings) -> Vertices | Values:
+    """The surface that a stage fits, in the shape of the model."""
+    if settings.surface == "isosurface" and stage.lattice:
+        # Cameras that are off would cut too much away.
+        hull = pictures if pictures.outlined and not settings.cameras else None
+        return shared(lambda: Values(model, stage.lattice, hull))
+    smooth = settings.surface == "subdivision"
+    return Vertices(remeshed(model, stage.faces // FACES if smooth else stage.faces), stage.smoothness, smooth)
+
+
+class Vertices:
+    """The vertices of a mesh, or of the cage of a subdivision surface, and their colours.
+
+    Attributes:
+        start: the parameters at first.
+        rate: 1, a factor on the learning rate of "shape".
+    """
+
+    rate = 1.0
+
+    def __init__(self, model: Model, smoothness: float, smooth: bool):
+        self._steps, self._faces = rts.LargeSteps(model.faces, len(model.vertices), smoothness), model.faces
+        self._surface = limit_of(model.faces) if smooth else rts.Mesh(model.faces)
+        self.start = {"shape": torch.tensor(self._steps.encode(model.vertices)), "colors": torch.tensor(model.colors)}
+
+    def part(self, p: Any) -> rts.Part:
+        """The surface as a part."""
+        return colored(self._surface, self._steps.decode(p["shape"]), p["colors"])
+
+    def mesh(self, p: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices, faces and colours of the mesh or cage."""
+        return self._steps.decode(p["shape"].detach()).numpy(), self._faces, p["colors"].detach().numpy()
 
 
 def remeshed(model: Model, faces: int) -> Model:

@@ -18,6 +18,8 @@ RADIUS = 0.57
 """The ball's radius, as a share of that of a ball that all cameras see."""
 LATTICE, REACH = 64, 1.1
 """Points of a hull's lattice along each axis, and how far it reaches from the origin."""
+CLOSED = 5
+"""The width of a window, in points of the lattice; gaps of a hull that it does not fit into are filled."""
 
 
 def start(kind: str | Path, pictures: Pictures) -> trimesh.Trimesh:
@@ -62,18 +64,9 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
             "start is 'hull', which needs to know where the object is; the pictures have neither alpha nor masks: "
             "add masks, or start from 'ball' or a mesh"
         )
-    axis = np.linspace(-REACH, REACH, LATTICE)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    least, seen = np.ones(len(points)), np.zeros(len(points), int)
-    for view in pictures.views:
-        alpha = view.image[..., 3]
-        x, y = np.moveaxis(np.asarray(view.camera.project(points, view.size)), -1, 0)[:2]
-        inside = visible(view, points)
-        found = scipy.ndimage.map_coordinates(alpha, [y[inside] - 0.5, x[inside] - 0.5], order=1, mode="nearest")
-        least[inside] = np.minimum(least[inside], found)
-        seen += inside
-    least[seen < 2] = 0  # Space that nobody looks into is no object.
-    values = scipy.ndimage.gaussian_filter(least.reshape((LATTICE,) * 3), 0.7)
+    # A mesh whose thin tunnels close has walls that cross, and cannot lose the tunnel.
+    least = scipy.ndimage.grey_closing(least_alpha(pictures, LATTICE), size=(CLOSED,) * 3)
+    values = scipy.ndimage.gaussian_filter(least, 0.7)
     labels, count = cast(Any, scipy.ndimage.label(values > 0.5))
     if count == 0:
         raise rts.InputError(
@@ -86,6 +79,27 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
     found = surface.extract({"values": values.astype(np.float32)})
     mesh = trimesh.Trimesh(found.vertices, found.faces)
     return max(mesh.split(only_watertight=False), key=lambda piece: len(piece.faces))
+
+
+def lattice_points(count: int) -> np.ndarray:
+    """The points (count³, 3) of a lattice that reaches as far as a hull's."""
+    axis = np.linspace(-REACH, REACH, count)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def least_alpha(pictures: Pictures, count: int) -> np.ndarray:
+    """The least alpha (count, count, count) of the views that see a lattice's points; 0 where fewer than two do."""
+    points = lattice_points(count)
+    least, seen = np.ones(len(points)), np.zeros(len(points), int)
+    for view in pictures.views:
+        alpha = view.image[..., 3]
+        x, y = np.moveaxis(np.asarray(view.camera.project(points, view.size)), -1, 0)[:2]
+        inside = visible(view, points)
+        found = scipy.ndimage.map_coordinates(alpha, [y[inside] - 0.5, x[inside] - 0.5], order=1, mode="nearest")
+        least[inside] = np.minimum(least[inside], found)
+        seen += inside
+    least[seen < 2] = 0  # Space that nobody looks into is no object.
+    return least.reshape((count,) * 3)
 
 
 def visible(view: rts.View, points: np.ndarray) -> np.ndarray:

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 import torch
+import trimesh
 import xatlas
 
 import rts
+from rts_reconstruct import light
 from rts_reconstruct.job import shared
 from rts_reconstruct.model import Atlas, Model, moved_camera, surface_of, textured
 from rts_reconstruct.pictures import Pictures
@@ -38,6 +40,22 @@ def _baked(model: Model, size: int) -> Model:
     corners = model.faces[np.arange(len(faces))]  # Faces keep their order; their corners have rows of the map.
     assert np.array_equal(rows[faces], corners), "the atlas has another order of faces"
     return model._replace(atlas=Atlas(uv, faces, texture.astype(np.float32)))
+
+
+def in_even_light(model: Model) -> Model:
+    """The model whose light is apart from its colours, which then are as in even light; see `light.fitted`."""
+    normals = np.asarray(trimesh.Trimesh(model.vertices, model.faces, process=False).vertex_normals)
+    known = light.fitted(model.vertices, normals, model.colors)
+    colors, atlas = light.even(model.colors, normals, known), model.atlas
+    if atlas is not None:
+        rows = np.zeros(len(atlas.uv), int)
+        rows[atlas.faces.reshape(-1)] = model.faces.reshape(-1)
+        picture = _flat(atlas.uv, atlas.faces, normals[rows].astype(np.float32), len(atlas.texture))
+        ways = _spread(picture[..., :3], picture[..., 3] < 0.5).reshape(-1, 3)
+        ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
+        texture = light.even(atlas.texture.reshape(-1, 3), ways, known)
+        atlas = atlas._replace(texture=texture.reshape(atlas.texture.shape))
+    return model._replace(colors=colors, atlas=atlas, light=known.astype(np.float32))
 
 
 def _flat(uv: np.ndarray, faces: np.ndarray, colors: np.ndarray, size: int) -> np.ndarray:

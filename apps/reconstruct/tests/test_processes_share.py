@@ -17,9 +17,10 @@ ENVIRONMENT = {
 }
 
 
-def ran(photos, out, *launcher):
+def ran(photos, out, surface, *launcher):
     """The arrays of a reconstruction, which runs in processes of its own."""
     words = [sys.executable, *launcher, "-m", "rts", "reconstruct", str(photos), "-o", str(out), *WORDS]
+    words += ["--surface", surface]
     run = subprocess.run(words, env={**os.environ, **ENVIRONMENT}, capture_output=True, text=True, timeout=540)
     assert run.returncode == 0, run.stderr
     assert run.stdout.count("PSNR") == 1, run.stdout  # The first process alone speaks.
@@ -27,10 +28,11 @@ def ran(photos, out, *launcher):
         return {name: data[name] for name in data.files if name != "about"}, (out / "views.csv").read_text()
 
 
-def test_two_processes_give_the_mesh_of_one(tmp_path):
+@pytest.mark.parametrize("surface", ["mesh", "isosurface"])
+def test_two_processes_give_the_mesh_of_one(tmp_path, surface):
     photos = written(tmp_path / "photos")
-    one, table = ran(photos, tmp_path / "one")
-    two, again = ran(photos, tmp_path / "two", "-m", "torch.distributed.run", "--nproc-per-node", "2")
+    one, table = ran(photos, tmp_path / "one", surface)
+    two, again = ran(photos, tmp_path / "two", surface, "-m", "torch.distributed.run", "--nproc-per-node", "2")
     assert set(one) == set(two) and "atlas_texture" in one
     for name in one:
         np.testing.assert_allclose(two[name], one[name], atol=1e-5, err_msg=name)

@@ -98,13 +98,15 @@ def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
 
 
 @pytest.mark.thorough
-def test_an_interrupted_run_leaves_a_mesh_and_goes_on_as_if_it_had_not_been(tmp_path, no_pause):
-    whole = rts_reconstruct.reconstruct(views(), tmp_path / "whole", **TINY)
+@pytest.mark.parametrize("surface", ["mesh", "isosurface"])
+def test_an_interrupted_run_leaves_a_mesh_and_goes_on_as_if_it_had_not_been(tmp_path, no_pause, surface):
+    options = TINY | {"surface": surface}
+    whole = rts_reconstruct.reconstruct(views(), tmp_path / "whole", **options)
     with pytest.raises(KeyboardInterrupt):
-        rts_reconstruct.reconstruct(views(), tmp_path / "out", watch=Watching(interrupt=5), **TINY)
+        rts_reconstruct.reconstruct(views(), tmp_path / "out", watch=Watching(interrupt=5), **options)
     first = (tmp_path / "out/mesh.obj").read_text()
     watch = Watching()
-    again = rts_reconstruct.reconstruct(views(), tmp_path / "out", watch=watch, resume=True, **TINY)
+    again = rts_reconstruct.reconstruct(views(), tmp_path / "out", watch=watch, resume=True, **options)
     assert watch.calls[0][0] in (3, 4, 5)
     np.testing.assert_array_equal(again.model.vertices, whole.model.vertices)
     np.testing.assert_array_equal(again.model.atlas.texture, whole.model.atlas.texture)
@@ -189,7 +191,7 @@ def test_bad_input_is_one_line(folder, tmp_path):
     out = ["-o", tmp_path / "out"]
     assert "expected a whole number, at least 3" in told(folder, *out, "--steps", 0)
     assert "expected three numbers, such as 1,1,1" in told(folder, *out, "--background", "red")
-    assert "expected 'mesh' or 'subdivision'" in told(folder, *out, "--surface", "isosurface")
+    assert "expected 'mesh', 'subdivision' or 'isosurface'" in told(folder, *out, "--surface", "nurbs")
     assert "no file none.obj" in told(folder, *out, "--start", "none.obj")
     assert "at least 16 texels" in told(folder, *out, "--texture", 3)
     assert "left to fit; expected at least two" in told(folder, *out, "--held-out", 1)

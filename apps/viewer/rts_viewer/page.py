@@ -55,6 +55,7 @@ class Page:
         self.url, self.gui = url(host, port), self._server.gui
         self._meshes: dict[str, Any] = {}
         self._frustums: list[Any] = []
+        self._lock = threading.Lock()
         self._up = np.array([0.0, 1.0, 0.0])
         self._sphere: tuple[np.ndarray, float] | None = None
         if self._server.get_port() != port:  # Taken since it was tried.
@@ -68,6 +69,8 @@ class Page:
 
     def close(self) -> None:
         """End the server; browsers show that the connection is lost."""
+        with self._lock:  # Frustums that are still to come are left out: a server that has ended takes none.
+            self._frustums = []
         with _quiet():
             if any(thread.is_alive() for thread in self._threads):
                 self._server.stop()
@@ -89,9 +92,10 @@ class Page:
 
     def hide(self) -> None:
         """Take all meshes and cameras off the page."""
-        for handle in (*self._meshes.values(), *self._frustums):
-            handle.remove()
-        self._meshes, self._frustums = {}, []
+        with self._lock:
+            for handle in (*self._meshes.values(), *self._frustums):
+                handle.remove()
+            self._meshes, self._frustums = {}, []
 
     def look(self, vertices: np.ndarray) -> None:
         """Turn all browsers, and those that come, to the object of these vertices (V, 3), from the right and above."""
@@ -134,11 +138,11 @@ class Page:
         places = np.stack([place for _, _, place in poses])
         spread = np.median(np.linalg.norm(places - places.mean(axis=0), axis=1))
         scale = FRUSTUM * float(spread or np.linalg.norm(places[0]) or 1)
-        threading.Thread(target=self._add_frustums, args=(list(views), poses, scale), daemon=True).start()
+        arguments = list(views), poses, scale, self._frustums
+        threading.Thread(target=self._add_frustums, args=arguments, daemon=True).start()
 
-    def _add_frustums(self, views: Sequence[rts.View], poses: Sequence[tuple], scale: float) -> None:
+    def _add_frustums(self, views: Sequence[rts.View], poses: Sequence[tuple], scale: float, own: list[Any]) -> None:
         width: Any = {"thickness": 2.0, "thickness_units": "screen"}
-        own = self._frustums
         for number, (view, (K, R, place)) in enumerate(zip(views, poses, strict=True)):
             height, across = view.size
             fov, turn = 2 * np.arctan(height / (2 * K[1, 1])), self._turn(R.T).wxyz
@@ -148,9 +152,10 @@ class Page:
                 picture = small(np.asarray(view.image), PICTURE)
             except rts.InputError:  # The picture is gone; where it was taken from is known.
                 picture = None
-            if own is not self._frustums:  # Hidden meanwhile.
-                return
-            own.append(self._server.scene.add_camera_frustum(f"/cameras/{number}", **shape, image=picture, **width))
+            with self._lock:
+                if own is not self._frustums:  # Hidden, or closed, meanwhile.
+                    return
+                own.append(self._server.scene.add_camera_frustum(f"/cameras/{number}", **shape, image=picture, **width))
 
 
 @contextlib.contextmanager

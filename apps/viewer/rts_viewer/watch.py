@@ -166,8 +166,9 @@ class Watch:
         self._going.set()
         with self._changed:
             self._changed.notify()
+        with self._lock:  # The page is not in the middle of a state, and `_send` shows no other.
+            self._page.close()
         self._sender.join(timeout=5)
-        self._page.close()
 
     # ------------------------------------------------------------------------------------------------ inside
 
@@ -223,6 +224,8 @@ class Watch:
                 return
             start = time.perf_counter()
             with self._lock:
+                if self._closing.is_set():
+                    return
                 if newest is not None and shown is not None and history is self._history:  # No fit began meanwhile.
                     self._show(shown, newest, steps, losses)
             self._closing.wait(max(PAUSE, SHARE * (time.perf_counter() - start)))

@@ -134,6 +134,26 @@ def test_stop_ends_a_fit_even_a_paused_one(paused):
         assert watch.step(0, 1.0, vertices, faces) is False
 
 
+def test_pictures_that_are_read_while_the_page_closes_are_left_out(monkeypatch):
+    failures, reading, gone = [], threading.Event(), threading.Event()
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    known = view((0, 0, 3))
+
+    def late():
+        reading.set()
+        gone.wait(30)
+        return known.image
+
+    before = set(threading.enumerate())
+    with watching() as watch:
+        watch.begin([rts.View(known.camera, late, known.size)])
+        assert reading.wait(30)
+    gone.set()
+    for thread in set(threading.enumerate()) - before:
+        thread.join(30)
+    assert not failures, failures[0].exc_value
+
+
 def test_the_slider_goes_back_and_following_goes_on():
     vertices, faces, _ = ball()
     with watching() as watch:
