@@ -163,8 +163,8 @@ def counted() -> str:
     """A line: how many claims hold."""
     verdicts = [row.verdict for name in EXPERIMENTS for row in found(name)[0]]
     words = {"holds": "hold", "in part": "hold in part", "does not": "do not hold", "not run": "were not run"}
-    told = ", ".join(f"{verdicts.count(verdict)} {word}" for verdict, word in words.items())
-    return f"Of {len(verdicts)} claims {told}.\n"
+    told = "; ".join(f"{word}: {verdicts.count(verdict)}" for verdict, word in words.items())
+    return f"Of {len(verdicts)} claims, {told}.\n"
 
 
 def conditions() -> str:

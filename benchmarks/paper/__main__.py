@@ -90,17 +90,13 @@ def told(name: str, rows: list[Row]) -> str:
 
 
 def keep(name: str, folder: Path, found: dict[str, Any]) -> None:
-    """Copy numbers and pictures to where the page takes them from; pictures in 256 colours."""
-    from PIL import Image
-
+    """Copy numbers and pictures to where the page takes them from."""
     path_of(name).parent.mkdir(parents=True, exist_ok=True)
     path_of(name).write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
     IMAGES.mkdir(parents=True, exist_ok=True)
     for picture in EXPERIMENTS[name].pictures:
         source, target = folder / picture, IMAGES / f"{name}{Path(picture).suffix}"
-        if source.suffix == ".png" and source.exists():
-            Image.open(source).convert("RGB").quantize(256).save(target, optimize=True)
-        elif source.exists():
+        if source.exists():
             shutil.copyfile(source, target)
 
 

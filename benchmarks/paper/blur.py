@@ -173,7 +173,7 @@ def draw(path: Path, truth: np.ndarray, textures: dict, courses: dict, shown: li
         axes.imshow(encode_srgb(texture[cut].clip(0, 1)))
         axes.set_title(title, fontsize=8)
         axes.axis("off")
-    figure.savefig(path, dpi=80)
+    figure.savefig(path, dpi=72)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
