@@ -183,7 +183,7 @@ def draw(path: Path, courses: dict[tuple[str, str, int], Course], factor: int) -
         axes.grid(alpha=0.3, which="both")
     for axes in grid[1, len(splatters) :]:
         axes.axis("off")
-    figure.savefig(path, dpi=66)
+    figure.savefig(path, dpi=62)
 
 
 def frames(courses: dict[tuple[str, str, int], Course], factor: int, count: int = 16) -> list[np.ndarray]:
