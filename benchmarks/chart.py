@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import table
+from rts import Adaptive
 from rts_compare import compare
 from rts_compare.builtin_scenes import BUILTIN
 from rts_compare.chart_style import label, samples_label, side_length
-from rts_compare.comparison import file_name
+from rts_compare.comparison import SUPERSAMPLE, file_name
 from rts_compare.html_page import write_page
 from rts_compare.moving_scenes import MODES
 from rts_compare.pareto_front import LEVELS, best_within, timed
@@ -31,6 +32,8 @@ from rts_compare.png_chart import draw
 
 RESULTS = Path(__file__).parent / "results"
 IMAGES = Path(__file__).parent.parent / "docs/images/results"
+MORE = {"thin wires": [Adaptive(4, thin=True), Adaptive(8, thin=True)]}
+"""Values of `supersample` that are measured on some scenes alone, by scene."""
 
 
 def options() -> argparse.Namespace:
@@ -53,7 +56,9 @@ def main() -> None:
         path = args.output / f"{file_name(scene)}.json"
         if not args.draw:
             print(scene, flush=True)
-            data = compare(scene, output=args.kept, truths=args.kept).data
+            data = compare(
+                scene, supersample=[*SUPERSAMPLE, *MORE.get(scene, [])], output=args.kept, truths=args.kept
+            ).data
             path.write_text(json.dumps(rounded(data), separators=(",", ":")) + "\n")
         found.append(json.loads(path.read_text()))
         draw(found[-1], images / f"{path.stem}.png")

@@ -32,13 +32,15 @@ QUADS = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (
 MESH = rts.Mesh([t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))])
 
 
-def image(corners: torch.Tensor, colors: torch.Tensor, turn: torch.Tensor, size: int, **options: Any) -> torch.Tensor:
+def image(
+    corners: torch.Tensor, colors: torch.Tensor, turn: torch.Tensor, size: int, camera: rts.Camera, **options: Any
+) -> torch.Tensor:
     """The turned cube in size² pixels."""
     part = rts.Part(MESH, {"vertices": corners, "colors": colors}, "unlit", transform=turn)
-    return rts.render(part, CAMERA, (size, size), **options)
+    return rts.render(part, camera, (size, size), **options)
 
 
-def fitted(size: int, samples: Any, seed: int, steps: int) -> tuple[float, float]:
+def fitted(size: int, samples: Any, seed: int, steps: int, camera: rts.Camera = CAMERA) -> tuple[float, float]:
     """The mean distance of corners before and after a fit."""
     rng = np.random.default_rng(seed)
     true, colors = torch.tensor(CORNERS - 0.5), torch.tensor(CORNERS)
@@ -49,8 +51,8 @@ def fitted(size: int, samples: Any, seed: int, steps: int) -> tuple[float, float
     falling = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: DECAY ** (step / steps))
     for vector in Rotation.random(steps, rng).as_rotvec():
         turn = rts.rigid(torch.tensor([*vector, 0, 0, 0], dtype=torch.float32))
-        target = image(true, colors, turn, size, supersample=8, splatter="none")
-        loss = (image(found, guess, turn, size, supersample=samples) - target).square().mean()
+        target = image(true, colors, turn, size, camera, supersample=8, splatter="none")
+        loss = (image(found, guess, turn, size, camera, supersample=samples) - target).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -2,11 +2,16 @@
 
 Errors are of `rts_compare.stability` (low-passed relative L2 of the derivative image), against derivatives of 24 × 24
 points a pixel, since 8 × 8 of that table are themselves off by 0.08, 0.14 and 0.23 for wires. Times are processor time
-of a render and its derivative. Costs are processor time of pose iterations, with `thin` and without, in turns.
+of a render and its derivative. Costs are processor time of pose iterations, with `thin` and without, in turns. False
+marks are pixels of meshes without thin things that `thin` makes active. The cube is one of 2 × 2 pixels in images of
+8², fitted as `benchmarks.small_images` does.
 
     python -m benchmarks.thin
     python -m benchmarks.thin --mitsuba 4 16 64
+    python -m benchmarks.thin --truths 8 16
     python -m benchmarks.thin --cost
+    python -m benchmarks.thin --false-marks
+    python -m benchmarks.thin --cube
 """
 
 from __future__ import annotations
@@ -23,8 +28,9 @@ import torch
 
 import rts
 from benchmarks.camera import camera
-from benchmarks.meshes import kept_mesh
+from benchmarks.meshes import MESHES, kept_mesh
 from benchmarks.report import table
+from benchmarks.small_images import fitted
 from rts_compare import scene_shapes
 from rts_compare.failures import failure_scenes
 from rts_compare.failures.method_renderers import renderer
@@ -136,6 +142,16 @@ def errors(output: Path, spp: list[int]) -> str:
     return table(["samples", *made], rows)
 
 
+def noise(output: Path, points: list[int]) -> str:
+    """The table of estimated errors of true derivatives, of so many points a pixel along each side."""
+    plain, rows = Method("1", {"splatter": "visible", "layers": 2}), []
+    for n in points:
+        context = Context(samples=n, folder=output / "truths")
+        found = [Derivative(make).numbers(plain, context)["truth_error"] for make in SCENES.values()]
+        rows.append([f"{n} × {n}", *(f"{x:.2f}" for x in found)])
+    return table(["points", *SCENES], rows)
+
+
 def draw(path: Path) -> None:
     """The scenes as pictures, by what is sampled."""
     import matplotlib
@@ -180,16 +196,59 @@ def cost(output: Path, rounds: int) -> str:
     return table(["faces", "image", "cull", "Adaptive(4), ms", "thin, ms", "thin"], rows)
 
 
+def false_marks(output: Path, sizes: tuple[int, ...] = (128, 256, 512)) -> str:
+    """The table of active pixels of the benchmarks' meshes, without `thin`, and of those that it adds."""
+    rows = []
+    for name in MESHES:
+        vertices, faces = kept_mesh(name, output)
+        for cull in ("none", "back"):
+            part, cells = rts.Part(rts.Mesh(faces), {"vertices": vertices}, cull=cull), []
+            for side in sizes:
+                plain, thin = (
+                    rts.sample(part, camera(), (side, side), supersample=rts.Adaptive(4, thin=thin), layers=1).fine
+                    for thin in (False, True)
+                )
+                assert plain is not None and thin is not None
+                added = np.count_nonzero((thin.pixel >= 0) & (plain.pixel < 0))
+                cells.append(f"{np.count_nonzero(plain.pixel >= 0)}, +{added}")
+            rows.append([f"{len(faces):,}", cull, *cells])
+    return table(["faces", "cull", *(f"{side}²" for side in sizes)], rows)
+
+
+def cube(steps: int, seeds: int) -> str:
+    """The table of how far corners of a cube of 2 × 2 pixels are off after a fit, in edges."""
+    distance = 8 / (4 * np.tan(np.radians(22.5)))
+    far, rows = rts.Camera.look_at((0, 0, distance), (0, 0, 0), fov_y=45), []
+    for name in ("Adaptive(4)", "Adaptive(4, thin)"):
+        found = [fitted(8, SAMPLES[name], seed, steps, far) for seed in range(seeds)]
+        rows.append([name, *(f"{np.mean(x):.3f}" for x in zip(*found, strict=True))])
+    return table(["samples", "off at the start", "at the end"], rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/thin"))
     parser.add_argument("--mitsuba", type=int, nargs="*", default=[], metavar="SPP")
+    parser.add_argument(
+        "--truths", type=int, nargs="*", default=[], metavar="POINTS", help="errors of the truth itself"
+    )
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--false-marks", action="store_true")
+    parser.add_argument("--cube", action="store_true")
+    parser.add_argument("--steps", type=int, default=1500, help="of a fit of the cube")
+    parser.add_argument("--seeds", type=int, default=2, help="of fits of the cube")
     given = parser.parse_args()
     (given.output / "truths").mkdir(parents=True, exist_ok=True)
-    if given.cost:
-        print(cost(given.output, given.rounds))
+    if given.truths or given.cost or given.false_marks or given.cube:
+        if given.truths:
+            print(noise(given.output, given.truths))
+        if given.cost:
+            print(cost(given.output, given.rounds))
+        if given.false_marks:
+            print(false_marks(given.output))
+        if given.cube:
+            print(cube(given.steps, given.seeds))
         return
     print(errors(given.output, given.mitsuba))
     draw(given.output / "thin.png")

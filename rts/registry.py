@@ -233,6 +233,12 @@ def instance(group: str, chosen: Any) -> Any:
     return _defaults[group, chosen]
 
 
+def name_of(group: str, plugin: Any) -> str:
+    """The name under which `instance` made a plugin, such as "raster"; the name of its class for any other object."""
+    names = (name for (own, name), made in _defaults.items() if own == group and made is plugin)
+    return next((name for name in names if isinstance(name, str)), type(plugin).__qualname__)
+
+
 def survey() -> list[PluginInfo]:
     """The details of every registered plugin, in order of group and name."""
     return [info for group in GROUPS for info in plugins(group, details=True)]

@@ -209,6 +209,18 @@ def test_a_wire_before_another_part_is_seen(first):
         np.testing.assert_array_equal(*both)
 
 
+def test_unless_asked_nothing_looks_between_samples():
+    class Refusing(rts.plugin("samplers", "raster")):
+        def between(self, *_):
+            raise AssertionError("it was asked")
+
+    for supersample in (1, 2, Adaptive(4)):
+        images = [render(wire_part(), supersample, sampler=sampler) for sampler in (Refusing(), "raster")]
+        np.testing.assert_array_equal(*images)
+    with pytest.raises(AssertionError, match="it was asked"):
+        render(wire_part(), Adaptive(4, thin=True), sampler=Refusing())
+
+
 def test_without_thin_things_images_are_the_same_to_the_last_bit():
     for shader in ("unlit", "lambert"):
         images = [
@@ -255,15 +267,42 @@ def test_explain_counts_pixels_with_something_between_samples():
     assert rts.explain(scene(), CAMERA, SIZE, supersample=Adaptive(4, thin=True))[0].between == 0
 
 
-def test_samplers_that_do_not_tell_change_nothing():
-    pytest.importorskip("rts_backends.embree.sampler")
-    if "embree" not in rts.plugins("samplers"):
-        pytest.skip("embree is not installed")
-    part = wire_part()
-    images = [render(part, Adaptive(4, thin=thin), sampler="embree") for thin in (True, False)]
-    np.testing.assert_array_equal(*images)
-    sampled = rts.sample(part, flat_camera(), PIXELS, supersample=Adaptive(4, thin=True), sampler="embree")
+class Mute(rts.plugin("samplers", "reference")):
+    """A sampler of triangles that does not tell."""
+
+    between = rts.TriangleSampler.between
+
+
+def test_samplers_that_do_not_tell_change_nothing_and_say_so():
+    part, mute = wire_part(), Mute()
+    plain = render(part, Adaptive(4), sampler=mute)
+    with pytest.warns(rts.errors.InputWarning, match=r"the sampler Mute does not tell .* of Mesh\(2 faces\); give"):
+        np.testing.assert_array_equal(render(part, Adaptive(4, thin=True), sampler=mute), plain)
+    with pytest.warns(rts.errors.InputWarning, match="does not tell"):
+        sampled = rts.sample(part, flat_camera(), PIXELS, supersample=Adaptive(4, thin=True), sampler=mute)
     assert sampled.between is None
+
+
+def test_auto_takes_a_sampler_that_tells(monkeypatch):
+    pytest.importorskip("rts_backends.embree.sampler")
+    monkeypatch.setattr("rts.sampling.auto.STATIC_FACES", 2)
+    torch = pytest.importorskip("torch")
+    part, camera = wire_part(), flat_camera().map(lambda x: torch.tensor(x, dtype=torch.float32))
+
+    def found(supersample):
+        (choice,) = rts.explain(part, camera, PIXELS, supersample=supersample)
+        return choice.sampler, choice.between
+
+    assert found(Adaptive(4)) == ("embree", None)
+    sampler, count = found(Adaptive(4, thin=True))
+    assert sampler == "raster" and count > 0
+    images = [
+        rts.render(part, camera, PIXELS, supersample=Adaptive(4, thin=True), sampler=sampler)
+        for sampler in ("auto", "raster")
+    ]
+    np.testing.assert_array_equal(*map(to_numpy, images))
+    with pytest.warns(rts.errors.InputWarning, match="the sampler embree does not tell"):
+        rts.render(rts.prepare(part), camera, PIXELS, supersample=Adaptive(4, thin=True))
 
 
 def test_a_wrong_thin_is_refused():

@@ -547,6 +547,16 @@ def test_a_prepared_part_counts_as_static(few):
     assert [type(s).__name__ for s in handle.samplers] == ["Embree", "Raster"]
 
 
+def test_prepared_parts_are_explained_by_the_sampler_that_they_have(few):
+    sampler_class("embree")
+    parts = [part_of(*icosphere(1)), part_of(*icosphere(0))]
+    for sampler, names in (("auto", ["embree", "raster"]), ("reference", ["reference"] * 2)):
+        choices = rts.explain(rts.prepare(parts, sampler), CAMERA)
+        assert [c.sampler for c in choices] == names and "prepared" in choices[0].reason
+    own = sampler_class("reference")()
+    assert rts.explain(rts.prepare(parts[0], own), CAMERA)[0].sampler == type(own).__name__
+
+
 def test_each_part_is_explained_in_order(few):
     ellipsoid = Part(Ellipsoid(), {"center": np.zeros(3, np.float32), "radii": np.ones(3, np.float32)})
     choices = rts.explain([part_of(*icosphere(0)), ellipsoid], CAMERA)

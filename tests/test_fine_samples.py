@@ -78,6 +78,40 @@ def test_batches_give_the_same(target):
     np.testing.assert_allclose(to_numpy(batched), np.stack(expected), atol=2e-5)
 
 
+@pytest.mark.parametrize("share", [1, 1e-3])
+def test_compiled_programs_have_little_room_for_few_outlines_and_all_for_many(share, monkeypatch):
+    jax = pytest.importorskip("jax")
+    rooms = []
+
+    def noting(pixels, grid, room, *more):
+        rooms.append(room)
+        return strips.lay_out(pixels, grid, room, *more)
+
+    monkeypatch.setattr("rts.sampling.fine_samples.FEW", share)
+    weights = np.random.default_rng(0).random((*SIZE, 4), np.float32)
+
+    def image(move):
+        return render(rts.Part(MESH(FACES), {"vertices": BALL + move}, "lambert"), Adaptive(3))
+
+    def loss(move):
+        return (image(move) * weights).sum()
+
+    move = arrays("jax", np.array([0.1, 0.05, 0.2]))
+    expected = image(move), jax.grad(loss)(move), jax.jacfwd(image)(move)
+    monkeypatch.setattr("rts.sampling.fine_samples.lay_out", noting)
+    program = jax.jit(image)
+    program(move).block_until_ready()
+    # The first layout has little room; a second one has room for all.
+    assert len(rooms) == (1 if share == 1 else 2) and rooms[0].cells == np.ceil(share * rooms[-1].cells)
+    found = program(move), jax.jit(jax.grad(loss))(move), jax.jit(jax.jacfwd(image))(move)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * np.abs(b).max())
+    several = jax.jit(jax.vmap(jax.value_and_grad(loss)))(jax.numpy.stack([move, -move]))
+    for n, own in enumerate((move, -move)):
+        for a, b in zip(several, jax.value_and_grad(loss)(own), strict=True):
+            np.testing.assert_allclose(a[n], b, rtol=1e-4, atol=1e-4 * np.abs(b).max())
+
+
 def test_as_many_layers_as_count():
     found, expected = (render(scene(), Adaptive(3), layers=k) for k in ("auto", 6))
     np.testing.assert_allclose(found, expected, atol=1e-6)

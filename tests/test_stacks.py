@@ -282,6 +282,10 @@ def test_outlines_behind_glass_have_fine_samples():
     images = [rts.render(parts, CAMERA, (32, 32), layers=3, supersample=s) for s in (1, 4, rts.Adaptive(4))]
     assert np.abs(images[0] - images[1]).max() > 0.1
     np.testing.assert_allclose(images[2], images[1], atol=1e-5)
+    # With one layer nothing is hidden.
+    with pytest.warns(rts.errors.LayersWarning):
+        finer, adaptive = (rts.render(parts, CAMERA, (32, 32), layers=1, supersample=s) for s in (4, rts.Adaptive(4)))
+    np.testing.assert_allclose(adaptive, finer, atol=1e-5)
 
 
 def test_lines_of_crossing_move_as_depths_say():

@@ -93,14 +93,13 @@ def ratios() -> str:
         for (sampler, engine), ms in times.items():
             if engine == "torch" and sampler != "raster" and ("raster", "torch") in times:
                 samplers[sampler].append(ms / times["raster", "torch"])
-            if engine == "jax" and (sampler, "torch") in times:
+            if engine == "jax" and samples.isdecimal() and (sampler, "torch") in times:
                 engines[samples].append(ms / times[sampler, "torch"])
     ours = ", ".join(f"`{n}` {statistics.median(r):.2g} times" for n, r in sorted(samplers.items()))
     jax = ", ".join(f"{statistics.median(engines[s]):.2g} times with {n}" for s, n in SAMPLES.items() if s in engines)
     return _items(
         f"*Samplers*, beside the time of `raster`, medians over settings: {ours}. `toy` is an example plugin.",
-        f"*jax*, compiled, beside the time of torch: {jax}. A compiled program has room for outlines everywhere, "
-        "unless `capacity` says how many there are.",
+        f"*jax*, compiled, beside the time of torch: {jax}. Samples at outlines: the table below.",
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import CheckedPart, check_scene
 from rts.contracts.records import Sampled, Samples
+from rts.registry import name_of
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive, missed
@@ -22,6 +23,9 @@ from rts.shading.unused_entries import Observed, likely_name, shaded_by, unread
 
 FEW = 32
 """Pixels along each side of the image that shows what shaders read."""
+
+PREPARED = "parts of rts.prepare keep the sampler that they were prepared with"
+"""The reason for the sampler of prepared parts."""
 
 
 def explain(
@@ -36,7 +40,7 @@ def explain(
     """Explain which sampler `sampler="auto"` chooses for each part, and count samples if a size is given.
 
     Args:
-        parts: as in `rts.render`.
+        parts: as in `rts.render`; parts of `rts.prepare` have the sampler that they were prepared with.
         camera: as in `rts.render`.
         size: (height, width) in pixels; None to count nothing.
         splatter: as in `rts.render`.
@@ -59,10 +63,13 @@ def explain(
         if None in shaded:
             seen_to_read = _observed(checked, camera, size)
             shaded = [b if a is None else a for a, b in zip(shaded, seen_to_read, strict=True)]
-    choices = [
-        choose(part, static=is_static(part, seen))._replace(remarks=tuple(_remarks(part, seen, own)))
-        for part, own in zip(checked, shaded, strict=True)
-    ]
+    if isinstance(parts, Prepared):
+        choices = [Choice(name_of("rts.samplers", sampler), PREPARED) for sampler in parts.samplers]
+    else:
+        thin = isinstance(supersample, Adaptive) and supersample.thin
+        choices = [choose(part, static=is_static(part, seen), thin=thin) for part in checked]
+    remarks = [tuple(_remarks(part, seen, own)) for part, own in zip(checked, shaded, strict=True)]
+    choices = [choice._replace(remarks=own) for choice, own in zip(choices, remarks, strict=True)]
     if sampled is None:
         return choices
     coarse = map(_count, sampled.samples)

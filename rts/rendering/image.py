@@ -16,13 +16,14 @@ from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.plugin_base import promised
-from rts.rendering.samples import coarse_scene, sampled_scene, with_fine
+from rts.rendering.samples import Finer, coarse_scene, finer, sampled_scene
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_fine_splats, to_splats
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.empty_images import why_empty
 from rts.sampling.prepared import Prepared
+from rts.sampling.strips import Layout
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
@@ -58,7 +59,8 @@ def render(
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent. It has C or C + 1 channels if the image has C and alpha.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
-            for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. Samples
+            for the worst case, layers × cells; with `rts.Adaptive` also for few outlines, in a fast branch of the
+            program. If a third of the cells are covered, pass a third of layers × cells. Samples
             beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them. If the
             image is rendered in bands, each band has this capacity. With `rts.Adaptive` the fine samples have as many
             rows again, `layers` for each fine cell of active pixels and their aprons. Pixels that find no room stay
@@ -99,6 +101,8 @@ def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: Re
     if settings.contrast is not None:
         return _of_contrast(scene, size, context, settings)
     bands, reader = settings.bands(size), settings.reader
+    if settings.side is None and settings.capacity is None:
+        return _with_few_outlines(scene, size, context, settings)
     if len(bands) == 1:
         sampled = _sampled(scene, scene.camera, size, settings)
         return splatted(sampled, scene, scene.camera, context, reader)
@@ -125,6 +129,21 @@ def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: Rend
     return sampled
 
 
+def _with_few_outlines(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
+    """The image with fine samples at outlines; traced programs have a branch of its own for an image with few."""
+    refined = finer(scene, scene.camera, size, settings, settles=True)
+    few, drawn = refined.few(), partial(splatted, scene=scene, window=scene.camera, context=context)
+    if few is None:
+        return drawn(refined.sampled(), splatter=settings.reader)
+    # The coarse samples are evaluated and shaded once, for both branches.
+    splats = to_splats(refined.coarse, scene.parts, scene.camera, scene.camera, context)
+
+    def image(layout: Layout | None) -> Array:
+        return drawn(refined.sampled(layout), splatter=settings.reader, splats=splats)
+
+    return context.engine.choose(few.dropped == 0, lambda: image(few), lambda: image(None))
+
+
 def _of_contrast(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The image with fine samples at outlines, and at contrasts between the colours of coarse samples."""
     coarse = coarse_scene(scene, scene.camera, size, settings)
@@ -135,8 +154,8 @@ def _of_contrast(scene: Scene, size: tuple[int, int], context: Context, settings
             f"contrast of Adaptive is {settings.contrast}, and colours are traced; give None: what is sampled cannot "
             f"depend on values that are not known yet"
         )
-    sampled = with_fine(scene, scene.camera, size, coarse, settings, scene.hidden_by(settings.splatter), colors)
-    return splatted(sampled, scene, scene.camera, context, settings.reader, splats)
+    refined = Finer(scene, scene.camera, size, coarse, settings, scene.hidden_by(settings.splatter), colors)
+    return splatted(refined.sampled(), scene, scene.camera, context, settings.reader, splats)
 
 
 @uncompiled

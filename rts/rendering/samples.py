@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,17 +14,19 @@ from rts.arrays.engines import is_traced, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Hidden, Request, Sampled
-from rts.errors import InputError
+from rts.contracts.surface import TriangleSurface
+from rts.errors import InputError, InputWarning, warn
 from rts.plugin_base import promised
+from rts.registry import name_of
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.fine_samples import Where, fine_samples
+from rts.sampling.fine_samples import Where, few_laid_out, fine_samples
 from rts.sampling.hidden import HiddenRule, with_layers_that_count, without_hidden
 from rts.sampling.merging import merge
 from rts.sampling.prepared import Prepared
 from rts.sampling.sample_checks import check_samples
-from rts.sampling.strips import FineGrid, at_cells
+from rts.sampling.strips import FineGrid, Layout, at_cells
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
@@ -91,9 +93,17 @@ def sampled_scene(
     hidden, side = scene.hidden_by(settings.splatter, settles), settings.side
     if side is not None:
         return _on_one_grid(scene, camera, size, settings, side, hidden)
+    return finer(scene, camera, size, settings, settles).sampled()
+
+
+def finer(
+    scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings, settles: bool = False
+) -> Finer:
+    """The coarse samples of an `Adaptive`, to which fine ones are to be added; see `sampled_scene`."""
+    hidden = scene.hidden_by(settings.splatter, settles)
     # Outlines lie on the fine grid alone, unless its capacity is exceeded.
     coarse = _on_one_grid(scene, camera, size, settings, 1, hidden, exits=settings.capacity is not None)
-    return with_fine(scene, camera, size, coarse, settings, hidden)
+    return Finer(scene, camera, size, coarse, settings, hidden)
 
 
 def coarse_scene(scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
@@ -117,7 +127,7 @@ def _on_one_grid(
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     exits = exits and "exit" in reader.reads and gradient
     request = Request(capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin)
-    taken = partial(_taken, scene, grid, request)
+    taken = partial(_taken, scene.telling(settings.thin), grid, request)
     if settings.layers == "auto":
         sampled = with_layers_that_count(taken, hidden, scene.opaque)
     else:
@@ -139,6 +149,12 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidde
             check_samples(own, grid.size if listed is None else tuple(listed.shape), sampler)
         else:
             own = at_cells(check_samples(own, grid.size, sampler), listed, request.capacity)
+        if request.between and listed is None and own.between is None and isinstance(part.surface, TriangleSurface):
+            warn(
+                f"thin of Adaptive is True, and the sampler {name_of('rts.samplers', sampler)} does not tell what lies "
+                f"between samples of {part.surface!r}; give sampler='raster' (to rts.prepare, if it built the parts)",
+                InputWarning,
+            )
         samples.append(own)
     sampled = merge(samples, count)
     # Traced arrays have the shape of the worst case anyway.
@@ -147,27 +163,61 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidde
     return without_hidden(sampled, hidden.decide)
 
 
-def with_fine(
-    scene: Scene,
-    camera: Camera,
-    size: tuple[int, int],
-    coarse: Sampled,
-    settings: RenderSettings,
-    hidden: HiddenRule | None,
-    colors: np.ndarray | None = None,
-) -> Sampled:
-    """Coarse samples, and fine ones at outlines and, if `colors` (N, 4) of coarse samples are given, at contrasts."""
-    adaptive, splatter = settings.supersample, settings.splatter
-    assert isinstance(adaptive, Adaptive)
-    cells = FineGrid(size, adaptive.samples, settings.apron)
-    grid = Grid.sampled(scene, camera, (cells.side * size[0], cells.side * size[1]), cells.apron)
-    where = Where(adaptive, adaptive.dilates(scene.parts), scene.opaque, colors)
-    reads, gradient = settings.reader.reads, scene.context.engine.differentiates
-    flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
+class Finer(NamedTuple):
+    """Coarse samples, with what is needed to add fine ones at outlines and, with colours, at contrasts.
 
-    def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
-        request = Request(capacity, listed, facing="facing" in reads, exits="exit" in reads and gradient)
-        return _taken(scene, grid, request, count, hidden)
+    Attributes:
+        scene: the scene.
+        camera: the camera of the window of the image.
+        size: (height, width) of the window.
+        coarse: one sample a pixel.
+        settings: the settings, with an `Adaptive`.
+        hidden: the rule for hidden samples; None to keep all.
+        colors: (N, 4) of the coarse samples, to measure contrast; None to ignore it.
+    """
 
-    fine = fine_samples(coarse, cells, where, taken, hidden, settings.layers, settings.capacity, flat)
-    return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
+    scene: Scene
+    camera: Camera
+    size: tuple[int, int]
+    coarse: Sampled
+    settings: RenderSettings
+    hidden: HiddenRule | None
+    colors: np.ndarray | None = None
+
+    @property
+    def adaptive(self) -> Adaptive:
+        """The user's settings of outlines."""
+        assert isinstance(self.settings.supersample, Adaptive)
+        return self.settings.supersample
+
+    @property
+    def cells(self) -> FineGrid:
+        """The sizes of the image and of its fine cells."""
+        return FineGrid(self.size, self.adaptive.samples, self.settings.apron)
+
+    @property
+    def where(self) -> Where:
+        """The rule by which pixels are active."""
+        return Where(self.adaptive, self.adaptive.dilates(self.scene.parts), self.scene.opaque, self.colors)
+
+    def few(self) -> Layout | None:
+        """The layout of traced samples in little room, see `few_laid_out`; None if a capacity sets the room."""
+        given = self.settings.capacity is not None or self.settings.layers == "auto"
+        return None if given else few_laid_out(self.coarse, self.cells, self.where)
+
+    def sampled(self, layout: Layout | None = None) -> Sampled:
+        """The coarse samples with fine ones; `layout` as in `fine_samples`."""
+        scene, settings, coarse, cells = self.scene, self.settings, self.coarse, self.cells
+        height, width = self.size
+        grid = Grid.sampled(scene, self.camera, (cells.side * height, cells.side * width), cells.apron)
+        reads, gradient = settings.reader.reads, scene.context.engine.differentiates
+        splatter = settings.splatter
+        flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
+
+        def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
+            request = Request(capacity, listed, facing="facing" in reads, exits="exit" in reads and gradient)
+            return _taken(scene.telling(settings.thin), grid, request, count, hidden)
+
+        given = settings.layers, settings.capacity, flat, layout
+        fine = fine_samples(coarse, cells, self.where, taken, self.hidden, *given)
+        return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from rts.arrays.engines import Context, context_of_scene
@@ -10,6 +11,7 @@ from rts.arrays.trees import Tree
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
 from rts.contracts.splatter import Splatter
+from rts.sampling.auto import Auto
 from rts.sampling.hidden import HiddenRule, hidden_by
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import warn_of_winding
@@ -68,6 +70,11 @@ class Scene(NamedTuple):
     def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenRule | None:
         """The rule that tells which samples are hidden; None to keep all. See `rts.sampling.hidden.hidden_by`."""
         return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
+
+    def telling(self, thin: bool) -> Scene:
+        """The scene itself; with `thin`, "auto" takes samplers that tell what lies between samples."""
+        samplers = [replace(s, thin=True) if thin and isinstance(s, Auto) else s for s in self.samplers]
+        return self._replace(samplers=samplers) if thin else self
 
     def chosen(self) -> list[Sampler]:
         """The sampler that samples each part."""

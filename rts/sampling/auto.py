@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from rts import registry
@@ -45,8 +46,14 @@ class Choice(NamedTuple):
     remarks: tuple[str, ...] = ()
 
 
-def choose(part: Part, *, static: bool) -> Choice:
-    """The sampler for a part. `static` is True if its triangles stay the same from call to call."""
+def choose(part: Part, *, static: bool, thin: bool = False) -> Choice:
+    """The sampler for a part.
+
+    Args:
+        part: the part.
+        static: True if its triangles stay the same from call to call.
+        thin: True if the sampler has to tell what lies between samples; see `Adaptive`.
+    """
     surface = part.surface
     if not isinstance(surface, TriangleSurface):
         return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
@@ -58,6 +65,9 @@ def choose(part: Part, *, static: bool) -> Choice:
         return Choice("raster", f"{surface!r} does not say how many triangles it has (`face_count`)")
     if faces < STATIC_FACES:
         return Choice("raster", f"{faces} triangles are drawn faster than rays find them (below {STATIC_FACES})")
+    if thin:
+        reason = f"{faces} triangles that stay would suit embree; thin=True asks for raster, which tells of thin things"
+        return Choice("raster", reason)
     try:
         registry.plugin("rts.samplers", "embree")
     except PluginError as error:
@@ -71,15 +81,23 @@ def is_static(part: Part, camera: Camera) -> bool:
     return constant and engine_of(part, camera).differentiates
 
 
+@dataclass(frozen=True)
 class Auto(Sampler):
-    """A sampler that passes each part to the sampler that `choose` names."""
+    """A sampler that passes each part to the sampler that `choose` names.
+
+    Attributes:
+        thin: True to choose among samplers that tell what lies between samples; see `Adaptive`.
+    """
+
+    thin: bool = False
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""
-        choice = choose(part, static=camera is None or is_static(part, camera))
+        choice = choose(part, static=camera is None or is_static(part, camera), thin=self.thin)
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
         return check_sampler(choice.sampler)
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
-        return self.suited(part, camera).sample(part, camera, size, layers, request)
+        chosen = replace(self, thin=self.thin or request.between)
+        return chosen.suited(part, camera).sample(part, camera, size, layers, request)

@@ -92,6 +92,10 @@ class Room(NamedTuple):
     columns: int
     cells: int
 
+    def share(self, of_all: float) -> Room:
+        """A share of the room."""
+        return Room(math.ceil(of_all * self.columns), math.ceil(of_all * self.cells))
+
 
 def rounded(count: int) -> int:
     """The least 2ⁿ or 3·2ⁿ that is at least `count` and 16: few shapes, so that compiled programs are reused."""
@@ -277,7 +281,7 @@ class HiddenInStrips:
         """
         from rts.sampling import strips_loops
 
-        marked, place = np.zeros((len(among), among[0].size), bool), self.layout.place
+        marked, place = np.zeros((len(among), math.prod(among.shape[1:])), bool), self.layout.place
         arguments = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, marked
         parallel(strips_loops.scatter, len(marks) * len(place), *arguments, work=marks.size)
         marked = marked.reshape(among.shape)
