@@ -20,7 +20,7 @@ BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || co
 SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++ $(BROWSER)
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
-.PHONY: check demo docs test test-all test-xla apps warmup lint types wheel oldest clean system
+.PHONY: check demo docs paper test test-all test-xla apps warmup lint types wheel oldest clean system
 
 check: lint types docs test test-all test-xla apps wheel oldest
 
@@ -51,6 +51,11 @@ docs: warmup $(VENV)/.docs
 	mkdir -p build/pictures
 	echo '{"KernelManager": {"transport": "ipc"}}' > build/pictures/jupyter_nbconvert_config.json
 	cd build/pictures && $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml
+
+# Every figure and table of the paper, small, into out/paper; and the page of them, from the results of full size.
+paper: warmup
+	$(BIN)/python -m benchmarks.paper all --quick
+	$(BIN)/python -m benchmarks.pages
 
 # Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 warmup: system $(VENV)/.test $(VENV)/.warm

@@ -9,13 +9,14 @@ from benchmarks.pages import charts
 from benchmarks.pages.__main__ import DOCS, MARKED, filled
 from benchmarks.pages.headline import HEADLINES, ratio
 from benchmarks.pages.kept import kept, number
+from benchmarks.pages.paper import PAPER
 from benchmarks.pages.tables import TABLES
 
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = DOCS / "results"
-MARKS = TABLES | HEADLINES
+MARKS = TABLES | HEADLINES | PAPER
 ADVICE = "Run `python -m benchmarks.pages`."
 
 

@@ -14,7 +14,7 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -99,7 +99,7 @@ def variants(names: list[str], folder: Path) -> Iterator[tuple[scenes.Scene, Ref
             yield other, against
 
 
-def options() -> argparse.Namespace:
+def options(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/accuracy"))
     parser.add_argument("--scenes", nargs="+", choices=scenes.SCENES, default=list(scenes.SCENES))
@@ -107,7 +107,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--no-peers", action="store_true", help="without DEODR and Mitsuba")
     parser.add_argument("--spp", nargs="+", type=int, default=list(SPP), help="samples a pixel of Mitsuba")
     parser.add_argument("--truth", type=Path, default=Path("out/truth"), help="where truths are kept")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     if args.quick:
         args.scenes, args.spp = list(QUICK), [n for n in args.spp if n <= 4]
     return args
@@ -162,8 +162,8 @@ def measure(plan: list[Plan], say: Callable[[str], None], done: Callable[[], Non
     return results, images
 
 
-def main() -> None:
-    args = options()
+def main(arguments: Sequence[str] | None = None) -> None:
+    args = options(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
     skipped: set[str] = set()
     with Progress() as progress:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from benchmarks.pages import charts
 from benchmarks.pages.headline import HEADLINES
+from benchmarks.pages.paper import PAPER
 from benchmarks.pages.tables import TABLES
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -43,7 +44,7 @@ def main() -> None:
     stale = []
     for page in sorted(DOCS.rglob("*.md")):
         text = page.read_text()
-        new = filled(text, TABLES | HEADLINES)
+        new = filled(text, TABLES | HEADLINES | PAPER)
         if new != text:
             stale.append(page.name)
             if not check:

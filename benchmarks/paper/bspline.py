@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -156,12 +157,12 @@ def draw(path: Path, rows: list[dict], trails: dict, target: np.ndarray, side: i
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/bspline"))
     parser.add_argument("--engines", nargs="+", default=None, help="default torch and jax")
     parser.add_argument("--quick", action="store_true")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     engines = args.engines or (["torch"] if args.quick else ["torch", "jax"])
     run(args.output, 128 if args.quick else 256, engines)
 

@@ -16,6 +16,7 @@ import argparse
 import contextlib
 import io
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -345,12 +346,12 @@ def draw(found: dict[str, Any], path: Path) -> None:
     plt.close(figure)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/hand"))
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--quick", action="store_true")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
     factors, steps = (QUICK_FACTORS, QUICK_STEPS) if args.quick else (FACTORS, STEPS)
     found = measured(KeptMeasurements(args.output / ".hand.jsonl"), factors, 1 if args.quick else args.seeds, steps)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -470,14 +470,14 @@ def line(row: dict[str, Any]) -> str:
     )
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/implicit"))
     parser.add_argument("--engines", nargs="+", choices=("torch", "jax"), default=None, help="default torch and jax")
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=None, help="default both")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
     parser.add_argument("--quick", action="store_true")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     engines = args.engines or (["torch"] if args.quick else ["torch", "jax"])
     motions = args.motions or list(MOTIONS[:1] if args.quick else MOTIONS)
     for section in args.only:

@@ -480,7 +480,7 @@ def draw(path: Path, scene: Scene, folder: Path, side: str, chosen: Sequence[int
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/snerf"))
     parser.add_argument("--scene", choices=("lego", "fern"), default="lego")
@@ -498,7 +498,7 @@ def main() -> None:
     parser.add_argument("--resume", action="store_true", help="go on from checkpoints, keep stages that are done")
     parser.add_argument("--times", action="store_true", help="measure frames, too")
     parser.add_argument("--quick", action="store_true", help="few steps and views, a coarse lattice")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     if args.quick:
         args.steps, args.views, args.fineness, args.every, args.sides = 100, 2, 0.5, 50, [100]
     scene = lego(args.sides, args.fineness, args.finest) if args.scene == "lego" else fern(args.factor, args.fineness)

@@ -14,7 +14,7 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -124,7 +124,7 @@ def load_average() -> str:
     return f"{one:.1f} ({fifteen:.1f})"
 
 
-def options() -> argparse.Namespace:
+def options(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/speed"))
     parser.add_argument("--only", nargs="+", choices=tables.SECTIONS, default=list(tables.SECTIONS))
@@ -133,7 +133,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help=f"{' and '.join(QUICK_MESHES)}, 256², three turns")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="without DEODR and Mitsuba")
     parser.add_argument("--mitsuba", action="store_true", help="with Mitsuba, which takes most of the time")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     args.meshes = args.meshes or list(QUICK_MESHES if args.quick else MESHES)
     args.sizes = args.sizes or list(QUICK_SIZES if args.quick else (256, 512))
     args.rounds = QUICK_ROUNDS if args.quick else ROUNDS
@@ -149,11 +149,12 @@ def write(results: dict, folder: Path) -> None:
             chart(results[name], folder / f"{name}.png")
 
 
-def main() -> None:
-    args = options()
+def main(arguments: Sequence[str] | None = None) -> None:
+    args = options(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
     results = environment(PACKAGES)
-    results["command"] = shlex.join(["python", "-m", "benchmarks.speed.run", *sys.argv[1:]])
+    told = sys.argv[1:] if arguments is None else arguments
+    results["command"] = shlex.join(["python", "-m", "benchmarks.speed.run", *told])
     before = load_average()
     with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()) as progress:
         task = progress.add_task("", total=None)
