@@ -5,18 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.pages import charts
-from benchmarks.pages.__main__ import DOCS, MARKED, filled
-from benchmarks.pages.headline import HEADLINES, ratio
+from benchmarks.pages import charts, measured
+from benchmarks.pages.__main__ import DOCS, MARKED, filled, marks
+from benchmarks.pages.headline import ratio
 from benchmarks.pages.kept import kept, number
-from benchmarks.pages.paper import PAPER
-from benchmarks.pages.tables import TABLES
 
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = DOCS / "results"
-MARKS = TABLES | HEADLINES | PAPER
+MARKS = marks()
 ADVICE = "Run `python -m benchmarks.pages`."
 
 
@@ -40,6 +38,29 @@ def test_a_changed_figure_is_noticed():
     text = "Before.\n\n<!-- table: a -->\n\n| 1 |\n\n<!-- end -->\n\nAfter.\n"
     assert filled(text, {"a": lambda: "| 1 |\n"}) == text
     assert "| 2 |" in filled(text, {"a": lambda: "| 2 |\n"})
+
+
+UNKEPT = ("history", "index")
+"""Pages whose tables are prose: what was measured once with code that is gone, and the list of the pages."""
+
+
+def test_every_table_of_results_is_kept():
+    for page in PAGES.glob("*.md"):
+        if page.stem not in UNKEPT:
+            assert not list(measured.in_markdown(MARKED.sub("", page.read_text()))), page.name
+
+
+def test_tables_that_a_script_prints_replace_those_of_its_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(measured, "FOLDER", tmp_path)
+    first, second = measured.Measured(["a", "b"], [["1", "[2], \\| 3"]]), measured.Measured(["c"], [["4"], ["5"]])
+    measured.keep("page", [first, second, first])
+    assert measured.kept("page") == [first, second, first]
+    changed = measured.Measured(["a", "b"], [["6", "7"], ["8", "9"]])
+    assert measured.take(f"Before\n{changed}\nbetween\n\n{first}\n", "page") == 2
+    assert measured.kept("page") == [changed, second, first]
+    assert measured.marks()["page/2"]() == str(second)
+    with pytest.raises(ValueError, match=r"no table of page has the columns \['d'\]"):
+        measured.take("| d |\n|---|\n| 1 |\n", "page")
 
 
 def test_ratios_are_of_the_fastest_other():

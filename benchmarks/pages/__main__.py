@@ -3,8 +3,9 @@
 A page holds prose and marked tables. A mark is a line `<!-- table: NAME -->`; the table, or list, reaches to the line
 `<!-- end -->`. This command fills each of them anew and draws the charts of the first page. Prose is left as it is:
 
-    python -m benchmarks.pages            # tables and charts
-    python -m benchmarks.pages --check    # changes nothing; names what is out of date, and ends with 1
+    python -m benchmarks.pages                                       # tables and charts
+    python -m benchmarks.pages --check                               # changes nothing; ends with 1 if any is out of date
+    python -m benchmarks.pages --take out/large_steps.md large-steps # the tables that a script printed, to their page
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from benchmarks.pages import charts
+from benchmarks.pages import charts, measured
 from benchmarks.pages.headline import HEADLINES
 from benchmarks.pages.paper import PAPER
 from benchmarks.pages.tables import TABLES
 
 DOCS = Path(__file__).parents[2] / "docs"
-MARKED = re.compile(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL)
+MARKED = re.compile(r"<!-- table: ([\w/-]+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
 def filled(text: str, tables: Mapping[str, Callable[[], str]]) -> str:
@@ -37,14 +38,22 @@ def filled(text: str, tables: Mapping[str, Callable[[], str]]) -> str:
     return MARKED.sub(lambda mark: f"<!-- table: {mark[1]} -->\n\n{tables[mark[1]]().strip()}\n\n<!-- end -->", text)
 
 
+def marks() -> dict[str, Callable[[], str]]:
+    """Names of marks → functions that make their tables."""
+    return TABLES | HEADLINES | PAPER | measured.marks()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="change nothing, tell what is out of date")
-    check = parser.parse_args().check
-    stale = []
+    parser.add_argument("--take", nargs=2, metavar=("FILE", "PAGE"), help="take tables of a Markdown file for a page")
+    args = parser.parse_args()
+    check, stale = args.check, []
+    if args.take:
+        print(f"took {measured.take(Path(args.take[0]).read_text(), args.take[1])} tables")
     for page in sorted(DOCS.rglob("*.md")):
         text = page.read_text()
-        new = filled(text, TABLES | HEADLINES | PAPER)
+        new = filled(text, marks())
         if new != text:
             stale.append(page.name)
             if not check:

@@ -1,4 +1,4 @@
-"""The JSON files of benchmarks/results, and tables that pages hold as they were written."""
+"""The JSON files of benchmarks/results."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from benchmarks.pages import measured
 from rts_compare.builtin_scenes import BUILTIN
 from rts_compare.comparison import file_name
 
@@ -39,26 +40,18 @@ def outcome(row: str, method: str) -> Mapping:
 
 
 def written(page: str, *head: str, keys: int = 1) -> tuple[list[str], dict[str, list[str]]]:
-    """A table that stands on a page without JSON.
+    """A table of `measured`, by the texts of its first columns.
 
     Args:
         page: name of the page, without ".md".
-        head: texts of the table's first cells, such as "256², ms".
+        head: names of the table's first columns, such as "256², ms".
         keys: how many cells name a line.
 
     Returns:
         The names of its other columns; and the name of each line, cells joined by " | " → its other cells, as text.
     """
-    lines = iter((PAGES / f"{page}.md").read_text().splitlines())
-    columns = next(line for line in lines if line.startswith("| " + " | ".join(head) + " |"))
-    next(lines)
-    found = {}
-    for line in lines:
-        if not line.startswith("|"):
-            break
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        found[" | ".join(cells[:keys])] = cells[keys:]
-    return [cell.strip() for cell in columns.strip("|").split("|")][keys:], found
+    found = next(t for t in measured.kept(page) if tuple(t.header[: len(head)]) == head)
+    return found.header[keys:], {" | ".join(row[:keys]): row[keys:] for row in found.rows}
 
 
 def number(text: str) -> float:
