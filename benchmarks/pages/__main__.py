@@ -4,7 +4,7 @@ A page holds prose and marked tables. A mark is a line `<!-- table: NAME -->`; t
 `<!-- end -->`. This command fills each of them anew and draws the charts of the first page. Prose is left as it is:
 
     python -m benchmarks.pages                                       # tables and charts
-    python -m benchmarks.pages --check                               # changes nothing; ends with 1 if any is out of date
+    python -m benchmarks.pages --check                               # changes nothing; ends with 1 if anything is stale
     python -m benchmarks.pages --take out/large_steps.md large-steps # the tables that a script printed, to their page
 """
 
