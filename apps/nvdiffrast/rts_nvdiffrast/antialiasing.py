@@ -19,6 +19,7 @@ from rts.plugin_api.operations import take
 from rts_nvdiffrast.checks import (
     check_corners,
     check_devices,
+    check_finite,
     check_floats,
     check_rast,
     check_triangles,
@@ -52,7 +53,8 @@ def antialias(
 
     Args:
         color: (B, H, W, C), shaded at the pixels of `rast`; float32 or float64.
-        rast: (B, H, W, 4), the first result of `rasterize`, which also tells how many samples its context wants.
+        rast: (B, H, W, 4), the first result of `rasterize`, which also tells how many samples its context wants: the
+            very tensor that `interpolate` got. With a copy, a slice or `rast.detach()` motion counts twice.
         pos: as in `rasterize`.
         tri: as in `rasterize`.
         topology_hash: the result of `antialias_construct_topology_hash` for `tri`; None to look for one.
@@ -62,14 +64,15 @@ def antialias(
         (B, H, W, C). Pixels away from outlines are those of `color`.
 
     Raises:
-        InputError: an argument is of another type, shape or dtype, images differ in number, or tensors are on several
-            devices.
+        InputError: an argument is of another type, shape or dtype, images differ in number, positions are NaN
+            or infinite, or tensors are on several devices.
     """
     color = check_floats("color", color, ("images", "height", "width", "channels"))
     rast, tri = check_rast(rast), check_triangles(tri)
     pos = check_floats("pos", pos, ("images", "vertices", 4), ("vertices", 4))
     check_devices(color=color, rast=rast, pos=pos, tri=tri)
     check_corners(tri, pos.shape[-2], "pos")
+    check_finite(pos)
     if color.shape[:3] != rast.shape[:3] or (pos.ndim == 3 and len(pos) != len(rast)):
         shapes = ", ".join(f"{n} {tuple(x.shape)}" for n, x in (("color", color), ("rast", rast), ("pos", pos)))
         raise InputError(f"shapes are {shapes}; expected as many images, and color and rast of one size")
@@ -78,7 +81,11 @@ def antialias(
     elif not isinstance(topology_hash, Topology) or len(topology_hash.faces) != len(tri):
         given = described(topology_hash) if not isinstance(topology_hash, Topology) else "is of other triangles"
         raise InputError(f"topology_hash {given}; expected what antialias_construct_topology_hash gave for tri")
-    drawn = getattr(rast, DRAWN, None) or Drawn(SAMPLES, _shown_ranges(rast) if pos.ndim == 2 else None, 0)
+    drawn = getattr(rast, DRAWN, None) or Drawn(SAMPLES, _shown_ranges(rast), 0)
+    if pos.ndim == 3:
+        drawn = drawn._replace(ranges=None)
+    elif drawn.ranges is None:
+        drawn = drawn._replace(ranges=np.tile([[0, len(tri)]], (len(rast), 1)))
     values, motions = [], []
     for b, image in enumerate(images(pos, topology_hash, drawn.ranges)):
         value, motion = _image(color[b], rast[b].detach(), image, drawn)
@@ -89,8 +96,7 @@ def antialias(
         return value
     if rast.requires_grad and value.requires_grad:
         value = _WithoutMotion.apply(value, rast)
-    motion = torch.stack(motions)
-    return value + pos_gradient_boost * (motion - motion.detach())
+    return _WithMotion.apply(value, torch.stack(motions), pos_gradient_boost)
 
 
 def _shown_ranges(rast: torch.Tensor) -> np.ndarray:
@@ -128,6 +134,19 @@ class _WithoutMotion(torch.autograd.Function):
         with torch.enable_grad():
             (share,) = torch.autograd.grad(value, rast, g, retain_graph=True, allow_unused=True)
         return g, None if share is None else -share
+
+
+class _WithMotion(torch.autograd.Function):
+    """An image itself, whose gradient also goes to another image, times a factor."""
+
+    @staticmethod
+    def forward(ctx: Any, value: torch.Tensor, motion: torch.Tensor, factor: float) -> torch.Tensor:
+        ctx.factor = factor
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
+        return g, ctx.factor * g, None
 
 
 class _Shaded(NamedTuple):

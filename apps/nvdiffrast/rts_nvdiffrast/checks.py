@@ -21,7 +21,10 @@ def described(x: Any) -> str:
 
 
 def check_floats(name: str, x: Any, shape: tuple[int | str, ...], *others: tuple[int | str, ...]) -> torch.Tensor:
-    """A tensor of floats of one of some shapes, in which words stand for any number; others are refused."""
+    """A tensor of floats of one of some shapes, others are refused.
+
+    Words in a shape stand for any number from 1; "vertices" may be none.
+    """
     shapes = (shape, *others)
     if isinstance(x, torch.Tensor) and x.dtype in FLOATS and any(_fits(tuple(x.shape), s) for s in shapes):
         return x
@@ -30,8 +33,17 @@ def check_floats(name: str, x: Any, shape: tuple[int | str, ...], *others: tuple
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
-    pairs = zip(shape, expected, strict=False)
-    return len(shape) == len(expected) and all(isinstance(e, str) or n == e for n, e in pairs)
+    fits = (
+        n == e or (isinstance(e, str) and (n > 0 or e == "vertices")) for n, e in zip(shape, expected, strict=False)
+    )
+    return len(shape) == len(expected) and all(fits)
+
+
+def check_finite(pos: torch.Tensor) -> None:
+    """Refuse positions that are NaN or infinite."""
+    wrong = (~pos.detach().isfinite()).nonzero()
+    if len(wrong):
+        raise InputError(f"pos{wrong[0].tolist()} is NaN or infinite ({len(wrong)} such numbers); expected finite ones")
 
 
 def check_triangles(tri: Any) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 import rts
 from rts import InputError
 from rts.plugin_api.operations import take
-from rts_nvdiffrast.checks import check_corners, check_devices, check_floats, check_triangles, described
+from rts_nvdiffrast.checks import check_corners, check_devices, check_finite, check_floats, check_triangles, described
 from rts_nvdiffrast.interpolation import scattered
 from rts_nvdiffrast.triangles import Image, Topology, images
 
@@ -99,8 +100,8 @@ def rasterize(
         have a derivative in `pos`. `rast_db` has ∂u/∂X, ∂u/∂Y, ∂v/∂X, ∂v/∂Y, per pixel, with a derivative in `pos`.
 
     Raises:
-        InputError: an argument is of another type, shape or dtype, a triangle names no vertex, a range no triangles, or
-            tensors are on several devices.
+        InputError: an argument is of another type, shape or dtype, a triangle names no vertex, a range no triangles,
+            positions are NaN or infinite, or tensors are on several devices.
     """
     return _layer(_checked(glctx, pos, tri, resolution, ranges), 0, grad_db)
 
@@ -160,8 +161,9 @@ def _checked(glctx: Any, pos: Any, tri: Any, resolution: Any, ranges: Any) -> _G
     tri = check_triangles(tri)
     check_devices(pos=pos, tri=tri)
     check_corners(tri, pos.shape[-2], "pos")
+    check_finite(pos)
     try:
-        height, width = (int(n) for n in resolution)
+        height, width = (operator.index(n) for n in resolution)
     except (TypeError, ValueError):
         height = width = 0
     if height < 1 or width < 1:
@@ -172,10 +174,10 @@ def _checked(glctx: Any, pos: Any, tri: Any, resolution: Any, ranges: Any) -> _G
 def _ranges(ranges: Any, count: int) -> np.ndarray:
     """Ranges (B, 2) of `count` triangles, on the host."""
     integers = isinstance(ranges, torch.Tensor) and not ranges.is_floating_point() and ranges.dtype != torch.bool
-    if not integers or ranges.ndim != 2 or ranges.shape[1] != 2:
+    if not integers or ranges.ndim != 2 or ranges.shape[1] != 2 or not len(ranges):
         raise InputError(f"pos is (vertices, 4) and ranges {described(ranges)}; expected a tensor (images, 2) of int32")
     checked = ranges.cpu().numpy()
-    if len(checked) and (checked.min() < 0 or checked.sum(axis=1).max() > count):
+    if checked.min() < 0 or checked.sum(axis=1).max() > count:
         raise InputError(f"ranges are {checked.tolist()}; expected first triangles and counts within {count} triangles")
     return checked
 

@@ -1,12 +1,13 @@
 """Scripts that were written for nvdiffrast on a GPU, run as they are on the CPU.
 
 The one place where names of others are replaced. `nvdiffrast.torch` becomes `rts_nvdiffrast.torch`. Calls of torch that
-name a CUDA device get the CPU in its place. Waiting for a GPU does nothing. Compiling extensions for CUDA ends the
-script with one line.
+name a CUDA device get the CPU in its place. Waiting for a GPU does nothing. Compiling an extension ends the script
+with one line.
 """
 
 from __future__ import annotations
 
+import contextlib
 import runpy
 import sys
 import time
@@ -36,16 +37,17 @@ class _OnTheCpu(TorchFunctionMode):
         name = getattr(func, "__name__", "")
         if name in ("cuda", "pin_memory") and args and isinstance(args[0], torch.Tensor):
             return args[0]
-        kwargs = {k: _cpu(v) if k in ("device", "map_location") else v for k, v in (kwargs or {}).items()}
+        kwargs = {k: _cpu(v) if k == "device" else v for k, v in (kwargs or {}).items()}
         kwargs.pop("pin_memory", None)
         if name == "to" and len(args) > 1:
-            first = torch.device("cpu") if type(args[1]) is int else _cpu(args[1])
-            args = (args[0], first, *args[2:])
+            args = (args[0], _cpu(args[1]), *args[2:])
         return func(*args, **kwargs)
 
 
 def _cpu(x: Any) -> Any:
-    """A device as an argument of torch: the CPU in place of a GPU; anything else as it is."""
+    """A device as an argument of torch: the CPU in place of a GPU, also by its number; anything else as it is."""
+    if type(x) is int:
+        return torch.device("cpu")
     if isinstance(x, torch.device):
         return torch.device("cpu") if x.type == "cuda" else x
     return "cpu" if isinstance(x, str) and x.partition(":")[0] == "cuda" else x
@@ -66,6 +68,13 @@ class _Event:
     def elapsed_time(self, end: _Event) -> float:
         """Milliseconds from this event to another."""
         return 1e3 * (end._time - self._time)
+
+
+class _Nothing(contextlib.nullcontext):
+    """`torch.cuda.device`, which changes nothing."""
+
+
+_generator, _load = torch.Generator, torch.load
 
 
 class _Missing(ModuleType):
@@ -93,11 +102,16 @@ def _replace_modules() -> None:
     package.__path__ = []
     package.__version__ = "0.4.0"  # pyright: ignore[reportAttributeAccessIssue]
     sys.modules.update({"nvdiffrast": package, "nvdiffrast.torch": rts_nvdiffrast.torch})
-    sys.modules.update({name: _Missing(name) for name in MISSING})
+    for name in MISSING:
+        sys.modules[name] = _Missing(name)
+    torch.utils.cpp_extension = sys.modules["torch.utils.cpp_extension"]  # pyright: ignore[reportAttributeAccessIssue]
     for name in IGNORED:
         setattr(torch.cuda, name, lambda *_, **__: None)
     torch.cuda.Event = _Event  # pyright: ignore[reportAttributeAccessIssue]
     torch.cuda.current_device = lambda: 0
+    torch.cuda.device = _Nothing  # pyright: ignore[reportAttributeAccessIssue]
+    torch.Generator = lambda device="cpu": _generator(_cpu(device))  # pyright: ignore[reportAttributeAccessIssue]
+    torch.load = lambda f, map_location=None, **options: _load(f, map_location="cpu", **options)
     torch.set_default_tensor_type = _set_default_tensor_type
     torch.set_default_device = lambda device: None
 

@@ -51,7 +51,7 @@ def texture(
         mip_level_bias: (B, h, w), added to the mipmap so chosen. Without `uv_da`, it is the mipmap itself.
         mip: Mipmaps from `texture_construct_mip`, or a list of mipmaps 1, 2, … of your own, like `tex` but each half
             as high and wide as the one before. By default, they are made from `tex`.
-        filter_mode: "nearest", "linear", "linear-mipmap-nearest" (bilinear on the nearest mipmap),
+        filter_mode: "nearest", "linear", "linear-mipmap-nearest" (bilinear on one mipmap, the level rounded down),
             "linear-mipmap-linear" (on two mipmaps), or "auto". That is the last with `uv_da` or `mip_level_bias`, and
             "linear" without.
         boundary_mode: Beyond the texture, "wrap" repeats it, "clamp" repeats its outer texels, "zero" is 0. "cube" is
@@ -117,7 +117,7 @@ def _chosen(level: Tensor | None, last: int, nearest: bool, device: torch.device
         return torch.zeros((1, 1, 1, 1), dtype=torch.int64, device=device), None
     level = level.clamp(0, last)[..., None]
     if nearest:
-        return level.detach().round().long().clamp(0, last), None
+        return level.detach().floor().long().clamp(0, last), None
     lower = level.detach().floor().long().clamp(0, last - 1)
     upper_share = level - lower
     return torch.cat([lower, lower + 1], -1), torch.cat([1 - upper_share, upper_share], -1)

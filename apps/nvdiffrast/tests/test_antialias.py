@@ -196,6 +196,24 @@ def test_a_peeled_layer_has_outlines_of_its_own():
     torch.testing.assert_close(back, mask(flat(small), TWO), atol=1e-6, rtol=0)  # Only behind the small one.
 
 
+def test_positions_of_one_image_and_of_ranges_are_alike():
+    """The shape of `pos` says which, whatever `rasterize` was given."""
+    pos, whole = scenes.clip(scenes.CUBE), torch.tensor([[0, 12]], dtype=torch.int32)
+    batch = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (24, 24))[0]
+    ranges = dr.rasterize(CONTEXT, pos[0], scenes.CUBE_FACES, (24, 24), ranges=whole)[0]
+    color = (batch[..., 3:] > 0).float()
+    images = [dr.antialias(color, r, p, scenes.CUBE_FACES) for r in (batch, ranges) for p in (pos, pos[0])]
+    for image in images[1:]:
+        torch.testing.assert_close(image, images[0])
+
+
+def test_infinite_colours_stay():
+    pos = scenes.clip(scenes.CUBE).requires_grad_()
+    rast, _ = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (24, 24))
+    color = torch.where(rast[..., 3:] > 0, 1.0, torch.inf)
+    assert dr.antialias(color, rast, pos, scenes.CUBE_FACES)[0, 0, 0] == torch.inf
+
+
 def test_nothing_in_view_stays_as_it_is():
     pos = scenes.clip(scenes.CUBE, shift=(0, 0, 5.0)).requires_grad_()
     rast, _ = dr.rasterize(CONTEXT, pos, scenes.CUBE_FACES, (8, 8))
@@ -217,6 +235,8 @@ RAST = dr.rasterize(CONTEXT, scenes.TRIANGLE, scenes.ONE, (8, 8))[0]
         ({"rast": RAST[..., :2]}, "rast has shape"),
         ({"pos": scenes.TRIANGLE.expand(2, -1, -1)}, "expected as many images"),
         ({"tri": scenes.ONE + 1}, "tri names rows 1 to 3"),
+        ({"pos": scenes.TRIANGLE * torch.inf}, r"pos\[0, 0, .\] is NaN or infinite"),
+        ({"color": COLOR[..., :0]}, r"color has shape \(1, 8, 8, 0\)"),
         ({"topology_hash": scenes.ONE}, "expected what antialias_construct_topology_hash gave"),
         ({"topology_hash": dr.antialias_construct_topology_hash(TWO)}, "topology_hash is of other triangles"),
     ],

@@ -83,7 +83,7 @@ def one_pixel(levels, uv, uv_da, bias, filter_mode):
     footprint = np.stack([coordinates(uv + 1e-30j * step).imag / 1e-30 for step in steps]) * size
     level = np.clip(np.log2(np.linalg.svd(footprint, compute_uv=False)[0]) + bias, 0, len(levels) - 1)
     if filter_mode == "linear-mipmap-nearest":
-        return bilinear(levels[int(np.round(level))])
+        return bilinear(levels[int(np.floor(level))])
     lower, upper = int(np.floor(level)), int(np.ceil(level))
     return (1 - (level - lower)) * bilinear(levels[lower]) + (level - lower) * bilinear(levels[upper])
 

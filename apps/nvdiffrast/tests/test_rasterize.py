@@ -174,6 +174,13 @@ class TestArguments:
             ({"tri": scenes.ONE[0]}, r"tri has shape \(3,\)"),
             ({"resolution": 16}, r"resolution is 16; expected \(height, width\)"),
             ({"resolution": (16, 0)}, r"resolution is \(16, 0\)"),
+            ({"resolution": (8.9, 16)}, r"resolution is \(8.9, 16\)"),
+            ({"pos": scenes.TRIANGLE * torch.nan}, r"pos\[0, 0, 0\] is NaN or infinite"),
+            ({"pos": scenes.TRIANGLE[:0]}, r"pos has shape \(0, 3, 4\)"),
+            (
+                {"pos": scenes.TRIANGLE[0], "ranges": torch.zeros((0, 2), dtype=torch.int32)},
+                r"ranges has shape \(0, 2\)",
+            ),
             ({"pos": scenes.TRIANGLE[0]}, "ranges is NoneType"),
             ({"pos": scenes.TRIANGLE[0], "ranges": torch.tensor([[0, 2]])}, "counts within 1 triangles"),
             ({"pos": scenes.TRIANGLE[0], "ranges": torch.tensor([0, 1])}, r"ranges has shape \(2,\)"),

@@ -26,6 +26,11 @@ tri = torch.arange(3, dtype=torch.int32).reshape(1, 3).cuda()
 colors = torch.ones([3, 1]).to("cuda", non_blocking=True).to(0).pin_memory().to(device=device)
 net = torch.nn.Linear(1, 1).cuda().to(device)
 start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+torch.save(tri, "tri.pt")
+with torch.cuda.device(0):
+    assert torch.equal(torch.load("tri.pt", map_location="cuda"), tri)
+assert torch.zeros(2, device=torch.cuda.current_device()).device.type == "cpu"
+assert torch.rand(2, generator=torch.Generator(device="cuda")).shape == (2,)
 start.record()
 rast, _ = rasterize(context, pos, tri, resolution=[size, size])
 image = net(dr.interpolate(colors[None], rast, tri)[0]) + torch.zeros(1, device=device, pin_memory=False)
@@ -37,6 +42,7 @@ assert pathlib.Path(sys.argv[0]).name == "script.py" and beside.VALUE == 3 and _
 print(image.shape[1], pos.grad.device, pos.grad.abs().max() > 0)
 """
 EXTENSION = "import torch.utils.cpp_extension as e\ne.load(name='a', sources=['a.cu'])\n"
+DOTTED = "import torch.utils.cpp_extension\ntorch.utils.cpp_extension.load(name='a', sources=['a.cu'])\n"
 FROM = "from torch.utils.cpp_extension import load\nload(name='a', sources=['a.cu'])\n"
 
 
@@ -54,7 +60,7 @@ def test_a_script_runs_as_it_is(tmp_path):
     assert done.stdout.strip() == "12 cpu tensor(True)"
 
 
-@pytest.mark.parametrize("script", [EXTENSION, FROM])
+@pytest.mark.parametrize("script", [EXTENSION, DOTTED, FROM])
 def test_an_extension_for_cuda_is_named_in_one_line(tmp_path, script):
     (tmp_path / "script.py").write_text(script)
     done = run(tmp_path, "run", "script.py")

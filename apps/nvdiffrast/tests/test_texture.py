@@ -54,7 +54,7 @@ def one_pixel(levels, uv, uv_da, bias, filter_mode, boundary, last=None):
     level = np.log2(np.linalg.svd(footprint, compute_uv=False)[0]) + bias
     level = np.clip(level, 0, len(levels) - 1)
     if filter_mode == "linear-mipmap-nearest":
-        return bilinear(levels[int(np.round(level))], *uv, boundary)
+        return bilinear(levels[int(np.floor(level))], *uv, boundary)
     lower, upper = int(np.floor(level)), int(np.ceil(level))
     share = level - lower
     return (1 - share) * bilinear(levels[lower], *uv, boundary) + share * bilinear(levels[upper], *uv, boundary)
