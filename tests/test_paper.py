@@ -45,7 +45,7 @@ def test_an_experiment_without_its_data_is_left_out_and_says_why(tmp_path, monke
 
 
 def test_a_script_that_knows_torch_alone_is_left_out_with_jax(tmp_path):
-    with pytest.raises(command.NotRun, match="benchmarks.paper.hand knows torch alone, not jax"):
+    with pytest.raises(command.NotRun, match="benchmarks.paper.hand has no option for the engine jax"):
         command.run("hand", tmp_path, quick=True, engine="jax")
 
 
@@ -53,8 +53,8 @@ def test_verdicts_count_the_parts_that_hold():
     assert [verdict(True, True), verdict(True, False), verdict(False, False)] == ["holds", "in part", "does not"]
 
 
-@pytest.mark.parametrize(("after", "told"), [(33.2, "holds"), (33.6, "in part"), (34.2, "does not")])
-def test_a_change_of_the_papers_sign_and_size_holds(after, told):
+@pytest.mark.parametrize(("after", "told"), [(33.2, "holds"), (33.6, "holds"), (34.2, "holds"), (32.6, "does not")])
+def test_a_loss_as_small_as_the_papers_holds(after, told):
     psnr = {"mipmaps": {"none": 33.7, "multi": after}, "none": {"none": 25.4, "multi": 28.3}}
     rows = claims.blur({"steps": 1, "side": 2, "rows": 3, "psnr": psnr})
     assert [row.verdict for row in rows] == [told, "holds"]

@@ -49,18 +49,6 @@ def spheres_on_page() -> list[dict[str, Any]]:
     ]
 
 
-def splines_on_page() -> list[dict[str, Any]]:
-    """Numbers of the B-spline surface."""
-    _, lines = written("splines", "engine", "method", keys=2)
-    found = []
-    for line, cells in lines.items():
-        engine, method = line.split(" | ")
-        method = {"Adam": "adam", "Levenberg–Marquardt": "lm"}[method]
-        found.append({"engine": engine, "method": method, "side": 256, "iterations": int(cells[0]),
-                      "iou": number(cells[3])})  # fmt: skip
-    return found
-
-
 def poses_on_page() -> dict[str, Any]:
     """Numbers of the silhouettes, from the table of their page."""
     _, lines = written("poses", "mesh", "views", "method", keys=3)
@@ -109,9 +97,10 @@ def lego_on_page() -> dict[str, Any]:
     names = {"baseline": "NeRF, volume", "finetuned": "surface fixed, network finetuned"}
     coarse = field_on_page("lego at 100², 25 views", "100²", 25, names | {"joint": "surface and network, joint"})
     fine = field_on_page("lego at 400², 3 views", "400²", 3, FEW)
-    times = re.search(r"([\d.]+) s by volume, ([\d.]+) s by surface", (PAGES / "radiance-field.md").read_text())
+    times = re.search(r"([\d.]+) s by volume,.* (\d+) times less", (PAGES / "radiance-field.md").read_text())
     assert times is not None
-    return {"sizes": [coarse, fine], "seconds": {"volume": float(times[1]), "surface": float(times[2])}}
+    volume, ratio = float(times[1]), float(times[2])
+    return {"sizes": [coarse, fine], "seconds": {"volume": volume, "surface": volume / ratio}}
 
 
 def fern_on_page() -> dict[str, Any]:
@@ -126,7 +115,6 @@ ON_PAGES: dict[str, tuple[str, Callable[[], Any]]] = {
     "silhouettes": ("poses", poses_on_page),
     "pose-speed": ("speed", times_on_page),
     "hand": ("stability", lambda: kept_file("hand")),
-    "bspline": ("splines", splines_on_page),
     "swept": ("topology", swept_on_page),
     "spheres": ("topology", spheres_on_page),
     "lego": ("radiance-field", lego_on_page),

@@ -42,7 +42,7 @@ def arguments_of(experiment: Experiment, folder: Path, quick: bool, engine: str 
     if engine is not None and experiment.engine is not None:
         found += [experiment.engine, engine]
     elif engine not in (None, "torch"):
-        raise NotRun(f"{experiment.script} knows torch alone, not {engine}")
+        raise NotRun(f"{experiment.script} has no option for the engine {engine}")
     return found
 
 

@@ -91,7 +91,9 @@ def blur(numbers: dict[str, Any]) -> list[Row]:
         others = ", ".join(f"`{n}` {found[n]:.1f}" for n in found if n not in ("none", "multi"))
         ours = f"{found['none']:.1f} → {found['multi']:.1f} dB ({change:+.1f}); {others}"
         told = f"{before} → {after} dB ({theirs:+.1f})"
-        row = Row(claim, told, ours, verdict(change * theirs > 0, alike(change, theirs)), why)
+        # A little loss is at most as large as the paper's, but for a factor; a gain is of its size.
+        held = change >= theirs / ALIKE if theirs < 0 else alike(change, theirs)
+        row = Row(claim, told, ours, verdict(held), why)
         rows.append(row._replace(number=told.replace("-", "−"), ours=ours.replace("(-", "(−")))
     return rows
 
@@ -101,7 +103,7 @@ def blur(numbers: dict[str, Any]) -> list[Row]:
 
 def silhouette_numbers(folder: Path) -> dict[str, Any]:
     """Mesh → method → how many runs succeed, of how many; medians of angles and steps of these."""
-    (path,) = folder.glob("pose_joint_*.json")
+    path = max(folder.glob("pose_joint_*.json"), key=lambda p: p.stat().st_mtime)
     found: dict[str, Any] = {}
     for key, rows in json.loads(path.read_text()).items():
         mesh, _, method = key.split(", ")
@@ -152,28 +154,37 @@ def speed(numbers: dict[str, Any]) -> list[Row]:
             "The time of an iteration grows slowly with the mesh",
             "16 → 26 ms (1.6×), 2.5K to 2M, V100",
             told(full),
-            verdict(growth(full) < 4, faces[-1] > 100 * faces[0]),
-            meshes,
+            verdict(growth(full) < 4),
+            f"by `visible`; {meshes}",
         ),
         Row(
             "RtS-pose hardly depends on the mesh",
             "16 → 17 ms (1.06×)",
             told(pose),
-            verdict(growth(pose) < growth(full), growth(pose) < 1.25),
-            "finding the points does, on two cores",
+            verdict(growth(pose) < 1.25),
+            "by `visible`; finding the points does depend on it, on two cores",
         ),
     ]
     if "DEODR" in ms:
-        faster = ms["DEODR"][-1] / ms[pose][-1]
+        faster = ms["DEODR"][-1] / ms[full][-1]
         rows.append(
             Row(
                 "Up to 20 times as fast as PyTorch3D and Redner on the largest mesh",
                 "588 and 306 ms beside 26",
-                f"{faster:.3g} times as fast as DEODR ({ms['DEODR'][-1]:.4g} ms beside {ms[pose][-1]:.3g})",
+                f"{faster:.3g} times as fast as DEODR ({ms['DEODR'][-1]:.4g} ms beside {ms[full][-1]:.3g})",
                 "not run",
-                "PyTorch3D, Redner and nvdiffrast are not measured: no GPU. Beside DEODR on the same machine",
+                "PyTorch3D and Redner are not measured: no GPU. Beside DEODR on the same machine",
             )
         )
+    rows.append(
+        Row(
+            "Within twice the time of nvdiffrast, and RtS-pose is faster on the largest mesh",
+            "16, 18, 26 ms (RtS-pose 17) beside 7, 9, 19",
+            "–",
+            "not run",
+            "nvdiffrast is not measured: no GPU",
+        )
+    )
     return rows
 
 
@@ -214,8 +225,9 @@ def airplane(numbers: dict[str, Any]) -> list[Row]:
             "picture",
             f"Levenberg–Marquardt / Adam, medians: {told('steps')} of the lowest loss",
             verdict(*(r < 1 for r in ratios("steps")), main["lm"]["within 1 %"]["reached"] > 0),
-            f"from starts 15°, 0.15 of the radius and 15 % of the field of view off, {size}; Adam at the best of three "
-            "rates",
+            f"from starts 15°, 0.15 of the radius and 15 % of the field of view off, {size}; Adam at 0.05, the largest "
+            "of three rates tried; Levenberg–Marquardt ends at 50 steps. Medians are over other starts for each "
+            "method, and at looser bounds Adam is ahead",
         ),
         Row(
             "The two take similar time in all",
@@ -234,7 +246,8 @@ def airplane(numbers: dict[str, Any]) -> list[Row]:
         Row(
             "Several layers have a limited effect on poses",
             "picture",
-            "median IoU with the outline in the photograph: " + ", ".join(f"`{s}` {ious[s]:.3f}" for s in known),
+            "median IoU with the outline in the photograph, the better of both methods: "
+            + ", ".join(f"`{s}` {ious[s]:.3f}" for s in known),
             verdict(max(ious[s] for s in known) - min(ious[s] for s in known) < 0.02),
         ),
     ]
@@ -272,7 +285,9 @@ def hand(numbers: dict[str, Any]) -> list[Row]:
             "picture",
             f"error at the end, best rate: {best['single']:.4f} (one layer), {best['multi, K = 2']:.4f} (`multi`), "
             f"{best['visible']:.4f} (`visible`)",
-            verdict(best["multi, K = 2"] < best["single"], sum(more[f] < one[f] for f in slower) > len(slower) / 2),
+            verdict(best["multi, K = 2"] < best["single"], all(more[f] < one[f] for f in slower)),
+            f"`multi` ends lower at {sum(more[f] < one[f] for f in slower)} of the {len(slower)} rates that one layer "
+            "bears; errors after 100 steps, three seeds",
         ),
         Row(
             "With one layer it is unstable at higher learning rates; several are necessary",

@@ -255,8 +255,14 @@ class Engine(Plugin):
 
         An engine that `branches` chooses when a compiled program runs; others have to know the value. For the gradient
         `rare` may run again, so that programs need no room for its intermediate arrays where `usual` runs.
+
+        Raises:
+            EngineError: the value is traced, and the engine has no branches.
         """
-        return usual() if self.known(which) else rare()
+        value = self.known(which)
+        if value is None:
+            raise EngineError(f"{self.name} has no branches in compiled programs; expected a value that is known")
+        return usual() if value else rare()
 
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
         """The gradient (N, C) of a function of rows (N, C) of which each value (N,) depends on its own row alone.

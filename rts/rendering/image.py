@@ -59,8 +59,8 @@ def render(
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent. It has C or C + 1 channels if the image has C and alpha.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
-            for the worst case, layers × cells; with `rts.Adaptive` also for few outlines, in a fast branch of the
-            program. If a third of the cells are covered, pass a third of layers × cells. Samples
+            for the worst case, layers × cells; with `rts.Adaptive` and a number of layers also for few outlines, in a
+            fast branch of the program. If a third of the cells are covered, pass a third of layers × cells. Samples
             beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them. If the
             image is rendered in bands, each band has this capacity. With `rts.Adaptive` the fine samples have as many
             rows again, `layers` for each fine cell of active pixels and their aprons. Pixels that find no room stay

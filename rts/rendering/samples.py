@@ -201,7 +201,7 @@ class Finer(NamedTuple):
         return Where(self.adaptive, self.adaptive.dilates(self.scene.parts), self.scene.opaque, self.colors)
 
     def few(self) -> Layout | None:
-        """The layout of traced samples in little room, see `few_laid_out`; None if a capacity sets the room."""
+        """The layout of traced samples in little room, see `few_laid_out`; None with a capacity, or layers "auto"."""
         given = self.settings.capacity is not None or self.settings.layers == "auto"
         return None if given else few_laid_out(self.coarse, self.cells, self.where)
 

@@ -13,7 +13,7 @@ import trimesh
 import rts
 from rts_reconstruct.model import Model
 from rts_reconstruct.pictures import Pictures
-from rts_reconstruct.starts import REACH, lattice_points, least_alpha
+from rts_reconstruct.starts import REACH, lattice_points, least_alpha, nothing_in_common
 
 WIDTH, RADIUS = 1.5, 4
 """Width and reach of the Gaussian by which a value's change moves its neighbours, in cells."""
@@ -89,5 +89,7 @@ def _color(theta: Any, points: Any) -> Any:
 def _outside(pictures: Pictures, count: int) -> np.ndarray:
     """Distances (count, count, count) beyond the visual hull and a cell around it; −∞ within."""
     hull: Any = scipy.ndimage.binary_dilation(least_alpha(pictures, count) > 0.5, np.ones((3, 3, 3)))
+    if not hull.any():
+        raise nothing_in_common()
     away = scipy.ndimage.distance_transform_edt(~hull, sampling=2 * REACH / (count - 1))
     return np.where(hull, -np.inf, np.asarray(away))

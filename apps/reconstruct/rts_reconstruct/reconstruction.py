@@ -101,7 +101,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Fit a mesh with colours to photographs with cameras, and write it.
 
-    Three stages fit vertices and their colours, each on a finer mesh, which is moved apart where it passes through
+    Three stages fit the shape and its colours, each on a finer mesh, which is moved apart where it passes through
     itself; a last one fits a texture. Colours have the light of the pictures in them, unless `light` is True. The mesh
     is written after each stage, so that an interruption leaves the last one.
 

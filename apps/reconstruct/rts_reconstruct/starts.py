@@ -57,6 +57,13 @@ def _of_file(path: str | Path, pictures: Pictures) -> trimesh.Trimesh:
     return mesh
 
 
+def nothing_in_common() -> rts.InputError:
+    """The error of masks whose visual hull is empty."""
+    return rts.InputError(
+        "the masks have no point in common; expected masks, or alpha, of one object, and cameras that fit them"
+    )
+
+
 def _hull(pictures: Pictures) -> trimesh.Trimesh:
     """The largest piece of the space that no mask excludes (Laurentini 1994), by marching cubes."""
     if not pictures.outlined:
@@ -69,9 +76,7 @@ def _hull(pictures: Pictures) -> trimesh.Trimesh:
     values = scipy.ndimage.gaussian_filter(least, 0.7)
     labels, count = cast(Any, scipy.ndimage.label(values > 0.5))
     if count == 0:
-        raise rts.InputError(
-            "the masks have no point in common; expected masks, or alpha, of one object, and cameras that fit them"
-        )
+        raise nothing_in_common()
     largest = 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
     values = np.where(scipy.ndimage.binary_dilation(labels == largest), values, 0)
     bounds = (-REACH,) * 3, (REACH,) * 3
