@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import threading
+import signal
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -43,7 +44,9 @@ def view(
     check_address(host, port)
     meshes = [triangles_of(part) for part in rts.load(model, surface=surface)]
     seen = [] if views is None else rts.load_views(views)
-    page = Page(port, host, model.name)
+    page, stopped = Page(port, host, model.name), []
+    # An exception in place of a mark may be lost: where Python has nobody to give it to, as in finalizers.
+    before = signal.signal(signal.SIGINT, lambda *_: stopped.append(True))
     try:
         page.turn_up(np.eye(3)["xyz".index(up)])
         page.cameras(seen)
@@ -53,8 +56,8 @@ def view(
         faces = sum(len(mesh.faces) for mesh in meshes)
         what = f"{model.name}, {faces} triangles" + (f", {len(seen)} cameras" if seen else "")
         Console(soft_wrap=True, highlight=False).print(escape(f"{page.url} shows {what}; Ctrl-C ends it"))
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        pass
+        while not stopped:
+            time.sleep(0.1)
     finally:
+        signal.signal(signal.SIGINT, before)
         page.close()
