@@ -74,7 +74,14 @@ class _Nothing(contextlib.nullcontext):
     """`torch.cuda.device`, which changes nothing."""
 
 
-_generator, _load = torch.Generator, torch.load
+class _Generator(torch.Generator):
+    """`torch.Generator` on the CPU; a class, since scripts name it in annotations, too."""
+
+    def __new__(cls, device: Any = "cpu") -> _Generator:
+        return super().__new__(cls, device=_cpu(device))  # pyright: ignore[reportCallIssue]
+
+
+_load = torch.load
 
 
 class _Missing(ModuleType):
@@ -110,7 +117,7 @@ def _replace_modules() -> None:
     torch.cuda.Event = _Event  # pyright: ignore[reportAttributeAccessIssue]
     torch.cuda.current_device = lambda: 0
     torch.cuda.device = _Nothing  # pyright: ignore[reportAttributeAccessIssue]
-    torch.Generator = lambda device="cpu": _generator(_cpu(device))  # pyright: ignore[reportAttributeAccessIssue]
+    torch.Generator = _Generator
     torch.load = lambda f, map_location=None, **options: _load(f, map_location="cpu", **options)
     torch.set_default_tensor_type = _set_default_tensor_type
     torch.set_default_device = lambda device: None

@@ -30,7 +30,8 @@ torch.save(tri, "tri.pt")
 with torch.cuda.device(0):
     assert torch.equal(torch.load("tri.pt", map_location="cuda"), tri)
 assert torch.zeros(2, device=torch.cuda.current_device()).device.type == "cpu"
-assert torch.rand(2, generator=torch.Generator(device="cuda")).shape == (2,)
+generator: torch.Generator | None = torch.Generator(device="cuda").manual_seed(1)
+assert torch.rand(2, generator=generator).shape == (2,) and isinstance(generator, torch.Generator)
 start.record()
 rast, _ = rasterize(context, pos, tri, resolution=[size, size])
 image = net(dr.interpolate(colors[None], rast, tri)[0]) + torch.zeros(1, device=device, pin_memory=False)
