@@ -116,6 +116,8 @@ def worker(steps: int) -> None:
     rts.fit(residuals, p, steps=steps, validate_every=steps, callback=lambda *_: times.append(time.perf_counter()))
     if int(os.environ.get("RANK", 0)) == 0:
         print(f"median step {1e3 * np.median(np.diff(times[5:-1])):.0f} ms")
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 if __name__ == "__main__":

@@ -71,3 +71,5 @@ if __name__ == "__main__":
     if int(os.environ.get("RANK", 0)) == 0:
         np.savez(RESULT, history=fit.history, **{name: x.numpy() for name, x in fit.parameters.items()})
     print(f"process {os.environ.get('RANK', 0)}: {fit.loss!r} after {residuals.count} pictures, {fit.reason}")
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()

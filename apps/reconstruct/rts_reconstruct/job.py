@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,7 @@ def join() -> bool:
     """Join the job of `torchrun`, if there is one. Returns True in its first process, and where there is no job."""
     if "RANK" in os.environ and not torch.distributed.is_initialized():
         torch.distributed.init_process_group("gloo")
+        atexit.register(torch.distributed.destroy_process_group)  # Without it torch may abort where a process ends.
     return first()
 
 
