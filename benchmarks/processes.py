@@ -93,6 +93,7 @@ def ended(folder: Path, times: int) -> None:
 def worker(steps: int) -> None:
     """Fit spot, and print the median time of a step, in the first process."""
     import torch
+    import torch.distributed.nn  # Before the group is made, see docs/guides/many_views.md.
     import trimesh
 
     import rts

@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import torch
+import torch.distributed.nn  # Before the group is made, see docs/guides/many_views.md.
 from helpers import icosphere
 
 import rts

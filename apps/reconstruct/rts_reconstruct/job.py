@@ -9,12 +9,16 @@ from typing import Any
 
 import torch
 
+# Forward derivatives import this module. Its default arguments would hold a group that was made before.
+import torch.distributed.nn
+
 
 def join() -> bool:
     """Join the job of `torchrun`, if there is one. Returns True in its first process, and where there is no job."""
     if "RANK" in os.environ and not torch.distributed.is_initialized():
+        # torch may abort a process whose group still has threads when it ends.
         torch.distributed.init_process_group("gloo")
-        atexit.register(torch.distributed.destroy_process_group)  # Without it torch may abort where a process ends.
+        atexit.register(torch.distributed.destroy_process_group)
     return first()
 
 
