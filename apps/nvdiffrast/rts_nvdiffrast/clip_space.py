@@ -66,7 +66,7 @@ def _used(pos: torch.Tensor, tri: np.ndarray) -> np.ndarray:
     """Clip z and w (2, U) of the vertices that triangles name, in float64."""
     used = np.zeros(len(pos), bool)
     used[tri.reshape(-1)] = True
-    return pos[:, 2:].detach().cpu().numpy()[used].astype(np.float64).T
+    return np.ascontiguousarray(pos[:, 2:].detach().cpu().numpy()[used].T, np.float64)
 
 
 def _slope(z: np.ndarray, w: np.ndarray) -> tuple[float, float] | None:

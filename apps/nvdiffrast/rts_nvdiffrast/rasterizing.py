@@ -187,10 +187,10 @@ def _layer(given: _Geometry, layer: int, grad_db: bool) -> tuple[torch.Tensor, t
     shown = torch.stack([_triangles(image, given.size, layer) for image in given.images]).to(given.pos.device)
     (height, width), pixels = given.size, (shown.reshape(-1) >= 0).nonzero()[:, 0]
     triangle = shown.reshape(-1)[pixels].long()
-    rows = given.tri.index_select(0, triangle).long()
+    rows = given.tri.T.index_select(1, triangle).long()
     if given.ranges is None:
-        rows = rows + (pixels // (height * width) * given.pos.shape[1])[:, None]
-    corners = take(given.pos.reshape(-1, 4), rows.reshape(-1)).reshape(-1, 3, 4)
+        rows = rows + pixels // (height * width) * given.pos.shape[1]
+    corners = take(given.pos.reshape(-1, 4), rows.reshape(-1)).reshape(3, -1, 4)
     uv, db, depth = _barycentrics(corners, pixels % width, pixels // width % height, given.size)
     values = torch.cat([uv, depth[:, None], triangle[:, None].to(uv.dtype) + 1], dim=1)
     rast, rast_db = (scattered(x, pixels, shown.shape) for x in (values, db if grad_db else db.detach()))
@@ -213,28 +213,35 @@ def _triangles(image: Image, size: tuple[int, int], layer: int) -> torch.Tensor:
 def _barycentrics(
     corners: torch.Tensor, column: torch.Tensor, row: torch.Tensor, size: tuple[int, int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """U and v (P, 2), their changes from pixel to pixel (P, 4), and z/w (P,) of corners (P, 3, 4) at some pixels.
+    """U and v (P, 2), their changes from pixel to pixel (P, 4), and z/w (P,) of corners (3, P, 4) at some pixels.
 
     Edge functions in homogeneous coordinates relative to the pixel, so that few digits cancel; in float64 where the
     device has it.
     """
     dtype = corners.dtype
-    x, y, z, w = (corners if corners.device.type == "mps" else corners.double()).unbind(dim=2)
+    # Each component of each corner (P,) by itself: that takes half the time of columns.
+    x, y, z, w = (corners if corners.device.type == "mps" else corners.double()).permute(2, 0, 1).contiguous()
     height, width = size
-    px, py = ((2 * column + 1).to(x.dtype) / width - 1)[:, None], ((2 * row + 1).to(x.dtype) / height - 1)[:, None]
+    px, py = (2 * column + 1).to(x.dtype) / width - 1, (2 * row + 1).to(x.dtype) / height - 1
     x, y = x - px * w, y - py * w
-    # Of the next corner, and of the one after it.
-    (x1, y1, w1), (x2, y2, w2) = ((x.roll(s, 1), y.roll(s, 1), w.roll(s, 1)) for s in (-1, 1))
-    weight, along_x, along_y = x1 * y2 - y1 * x2, y1 * w2 - w1 * y2, w1 * x2 - x1 * w2
-    total = weight.sum(dim=1, keepdim=True)
-    total = torch.where(total == 0, torch.ones_like(total), total)
-    bary = weight / total
-    across = (along_x - bary * along_x.sum(dim=1, keepdim=True)) / total * (2 / width)
-    up = (along_y - bary * along_y.sum(dim=1, keepdim=True)) / total * (2 / height)
-    db = torch.stack([across[:, 0], up[:, 0], across[:, 1], up[:, 1]], dim=1)
-    still = bary.detach()
-    depth = ((still * z.detach()).sum(dim=1) / (still * w.detach()).sum(dim=1)).clamp(-1, 1)
-    return bary[:, :2].to(dtype), db.to(dtype), depth.to(dtype)
+    following = (1, 2), (2, 0), (0, 1)
+    weight = [x[i] * y[j] - y[i] * x[j] for i, j in following]
+    along_x = [y[i] * w[j] - w[i] * y[j] for i, j in following]
+    along_y = [w[i] * x[j] - x[i] * w[j] for i, j in following]
+    total, total_x, total_y = (a + b + c for a, b, c in (weight, along_x, along_y))
+    inverse = 1 / torch.where(total == 0, 1.0, total)
+    u, v = weight[0] * inverse, weight[1] * inverse
+    across, up = inverse * (2 / width), inverse * (2 / height)
+    changes = [
+        (along[k] - b * of) * by
+        for k, b in enumerate((u, v))
+        for along, of, by in ((along_x, total_x, across), (along_y, total_y, up))
+    ]
+    uv, db = torch.stack([u, v], dim=1), torch.stack(changes, dim=1)
+    a, b = u.detach(), v.detach()
+    c = weight[2].detach() * inverse.detach()
+    depth = (z[0] * a + z[1] * b + z[2] * c).detach() / (w[0] * a + w[1] * b + w[2] * c).detach()
+    return uv.to(dtype), db.to(dtype), depth.clamp(-1, 1).to(dtype)
 
 
 def set_log_level(level: int) -> None:
