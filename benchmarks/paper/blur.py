@@ -33,8 +33,16 @@ WAVES, FINEST = 600, 0.6
 """Waves that the texture is made of, and the highest wave number, of that of the rows: 1 has a wave in two texels."""
 TRUSTED = np.radians(60.0)
 """Texels are judged up to this latitude: beyond, many of them share a place."""
-WAYS = {"none": ("none", 1), "multi": ("multi", 1), "visible": ("visible", 1), "visible, 2 × 2": ("visible", 2)}
+WAYS = {
+    "none": ("none", 1),
+    "multi": ("multi", 1),
+    "visible": ("visible", 1),
+    "none, 2 × 2": ("none", 2),
+    "visible, 2 × 2": ("visible", 2),
+}
 """Name → splatter, and samples a pixel along each axis."""
+COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red"
+"""Of their lines."""
 
 
 class Size(NamedTuple):
@@ -152,18 +160,18 @@ def draw(path: Path, truth: np.ndarray, textures: dict, courses: dict, shown: li
     """The course of PSNR, and a part of the textures."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 6.6), layout="constrained")
-    grid = figure.add_gridspec(3, 6)
-    axes = figure.add_subplot(grid[0, :5])
+    figure = Figure(figsize=(13, 7.6), layout="constrained")
+    grid = figure.add_gridspec(3, len(WAYS), height_ratios=(1.3, 1, 1))
+    axes = figure.add_subplot(grid[0, :-1])
     for k, name in enumerate(WAYS):
         for mip, line in ((True, "-"), (False, "--")):
-            axes.plot(shown, courses[name, mip], line, color=f"C{k}", label=name if mip else None)
+            axes.plot(shown, courses[name, mip], line, color=COLORS[k], label=name if mip else None)
     axes.set(xlabel="step", ylabel="PSNR of texels, dB", title="with mipmaps (lines), without (dashes)")
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
     rows = len(truth)
     cut = slice(rows // 4, rows * 5 // 8), slice(rows // 2, rows)
-    places = [((0, 5), "truth", truth)]
+    places = [((0, len(WAYS) - 1), "truth", truth)]
     for i, mip in enumerate((True, False)):
         for k, name in enumerate(WAYS):
             title = f"{name}, {'mipmaps' if mip else 'none'}: {courses[name, mip][-1]:.1f} dB"
