@@ -177,10 +177,11 @@ def airplane() -> str:
             cells = [f"{one['found']} of {one['starts']}", f"{one['iou']:.3f}", f"{one['loss']:.5f}"]
             for level in ("within 5 %", "within 1 %"):
                 at = one[level]
-                cells.append(f"{at['steps']:.0f} / {at['seconds']:.2f} ({at['reached']})" if at["reached"] else "–")
+                middle = f"{at['steps']:.0f} / {at['seconds']:.2f}" if at["common"] else "–"
+                cells.append(f"{middle} ({at['reached']}; {at['common']})")
             title = {"lm": "Levenberg–Marquardt", "adam": "Adam"}[method]
             lines.append([f"`{splatter}`", title, *cells, f"{one['step_ms']:.0f}"])
-    levels = [f"steps / s to {level} (starts)" for level in ("within 5 %", "within 1 %")]
+    levels = [f"steps / s to {level} (starts; common)" for level in ("within 5 %", "within 1 %")]
     return table(["splatter", "method", "found", "IoU", "loss", *levels, "ms a step"], lines)
 
 
