@@ -17,8 +17,8 @@ ERROR = (
 )
 ERRORS = "Figures: low-passed relative L2 errors of derivative images. Degraded above 0.2, failed above 0.5; the worst."
 GRID = (
-    "Figure: the mean absolute error at the end (over the least on the way). Degraded above 1.2, failed above 2, or "
-    "where the least is more than half of that at the start."
+    "Figure: the mean absolute error at the end (over the least on the way), medians of five starts. Degraded above "
+    "1.2, failed above 2, or where the least is more than half of that at the start."
 )
 NO_EDGES = "`none` has no derivative at outlines, by construction."
 ONE_LAYER = "`single` knows nothing of what lies behind."
