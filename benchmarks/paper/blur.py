@@ -42,7 +42,7 @@ WAYS = {
 }
 """Name → splatter, and samples a pixel along each axis."""
 COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red"
-"""Of their lines."""
+"""The colours of their lines."""
 
 
 class Size(NamedTuple):

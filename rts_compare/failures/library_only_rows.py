@@ -28,7 +28,7 @@ COLOR = np.array([0.9, 0.6, 0.3], np.float32)
 VIEW = ((1.2, 1.6, 2.6), (0, 0, 0))
 SIZE = (64, 64)
 RADII = 0.448, 0.449, 0.45, 0.451, 0.452
-"""Of the balls that lattices show at first."""
+"""Radii of the balls that lattices show at first."""
 
 
 def _points() -> np.ndarray:
