@@ -129,7 +129,7 @@ def main() -> None:
         for name in ("stability.md", "stability.json", "hand.json"):
             shutil.copy(args.output / name, RESULTS / name)
         shutil.copy(args.output / "stability.png", IMAGES / "stability.png")
-        shutil.copy(args.output / "hand.png", IMAGES.parent / "hand.png")
+        shutil.copy(args.output / "hand.png", IMAGES.parent / "paper" / "hand.png")
     print(f"wrote {args.output}")
 
 

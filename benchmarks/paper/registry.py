@@ -109,7 +109,7 @@ EXPERIMENTS = {
         ("--only", "swept", "--quick"),
         surface_claims.implicit_numbers("swept"),
         surface_claims.swept,
-        ("implicit_swept.png", "implicit_swept.gif"),
+        ("implicit_swept.png",),
         "--engines",
     ),
     "spheres": Experiment(
@@ -119,7 +119,7 @@ EXPERIMENTS = {
         ("--only", "spheres", "--quick"),
         surface_claims.implicit_numbers("spheres"),
         surface_claims.spheres,
-        ("implicit_spheres.png", "implicit_spheres.gif"),
+        ("implicit_spheres.png",),
         "--engines",
     ),
     "lego": Experiment(
