@@ -278,7 +278,7 @@ def posed(parameters):
     return ball("lambert").replace(transform=rts.rigid(parameters["pose"]))
 
 
-@pytest.mark.parametrize("method", ["lm", "adam"])
+@pytest.mark.parametrize("method", [pytest.param("lm", marks=pytest.mark.thorough), "adam"])
 def test_fits_stay_on_the_device(place, method):
     target = rts.render(ball("lambert"), CAMERA, SIZE)
     residuals = rts.ImageResiduals(posed, CAMERA, SIZE, target)

@@ -78,6 +78,7 @@ def test_batches_give_the_same(target):
     np.testing.assert_allclose(to_numpy(batched), np.stack(expected), atol=2e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("share", [1, 1e-3])
 def test_compiled_programs_have_little_room_for_few_outlines_and_all_for_many(share, monkeypatch):
     jax = pytest.importorskip("jax")
