@@ -255,8 +255,8 @@ ARRAYS = [
     Defect(
         "hidden samples are dropped behind glass",
         "rts/sampling/hidden.py",
-        "return rule if opaque.all() else HiddenBehindOpaque(rule, opaque)",
-        "return rule",
+        "or not all(p.shader.opaque for p in parts):",
+        "or not any(p.shader.opaque for p in parts):",
         "pruning rendering",
     ),
     Defect(

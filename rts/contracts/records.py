@@ -171,9 +171,12 @@ class Samples(_OnCells):
         asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
         by_sample: names of the tables that have a row for each sample; other tables are shared by all.
-        followed: the fields of the `Request`, out of "cells" and "hidden", that were given and that the sampler obeyed.
+        followed: the fields of the `Request`, out of "cells", "points" and "hidden", that were given and that the sampler
+            obeyed.
         ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
             None for a surface that is not refined.
+        triangle: (N,) int32, the triangle of the proxy that each sample lies on; None if it was not requested, or if
+            samples left their triangles.
     """
 
     ids: Array
@@ -187,6 +190,7 @@ class Samples(_OnCells):
     by_sample: tuple[str, ...] = ()
     followed: tuple[str, ...] = ()
     ran_out: Array | None = None
+    triangle: Array | None = None
 
 
 class Question(NamedTuple):
@@ -196,13 +200,11 @@ class Question(NamedTuple):
         covered: (K, H, W) bool, true where there is a sample.
         depth: (K, H, W) float, the depths of the samples; anything where nothing is covered.
         size: the largest absolute coordinate that depths were computed from, which bounds rounding; 0 if unknown.
-        part: (K, H, W) integers, the part of each sample; None if all are of one part, or if it is unknown.
     """
 
     covered: np.ndarray
     depth: np.ndarray
     size: float = 0.0
-    part: np.ndarray | None = None
 
 
 class Decision(NamedTuple):
@@ -246,25 +248,30 @@ class Hidden(Protocol):
 class Request:
     """Options of a call of a sampler, which may ignore all but `capacity`.
 
-    `Samples.followed` tells whether it obeyed `cells` and `hidden`.
+    `Samples.followed` tells whether it obeyed `cells`, `points` and `hidden`.
 
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are samples.
         cells: (L, C) int32, the only cells of the grid to sample, in any layout, as flat indices, none twice, or −1 for
             none; an array of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
+        points: (M, 2) float64, x and y in cells from the grid's upper left corner: the only points to sample, in place
+            of the centres of cells. Cells of the samples are then (K, 1, M). None for centres.
         hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
         exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them.
         between: whether to compute `Cells.between`, of all cells of the grid.
+        triangles: whether to record `Samples.triangle`.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
     capacity: int | None = None
     cells: Array | None = None
+    points: Array | None = None
     hidden: Hidden | None = None
     facing: bool = False
     exits: bool = False
     between: bool = False
+    triangles: bool = False
     entry: Any = None
 
 
@@ -306,6 +313,39 @@ class Fine(_OnCells):
     flat: bool = False
 
 
+@record()
+class Outlines:
+    """Outlines between the centres of cells: places where one front ends, joined into segments. No derivative.
+
+    A gap lies between two neighbouring centres, along a row or a column, whose fronts are not one surface. Each place
+    in a gap where the front changes is a break. Four neighbouring centres are the corners of a square; the breaks on
+    its sides are joined into segments.
+
+    Attributes:
+        place: (B, 2) float64, x and y of each break, in cells from the grid's corner.
+        gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
+        rows: (B, 2) int32, indices of the last samples before and behind the break along the gap, or −1.
+        near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
+            surfaces pass through one another.
+        slope: (B, 2, 2) float64, slopes of depth along x and y on both sides, where `near` is 2; else 0.
+        ends: (B, 2) bool: is this the gap's first break, and its last?
+        square: (S, 2) int32, the first corner (y, x) of the square of each segment.
+        ties: (S, 2) int32, the two breaks of each segment, so that near surfaces lie to the left of the way from one to
+            the other on the screen; or one break and −1 where no other fits.
+        side: (S, 2) int32, the sides of the square that the two breaks lie on: top, right, bottom, left; or −1.
+    """
+
+    place: Array
+    gap: Array
+    rows: Array
+    near: Array
+    slope: Array
+    ends: Array
+    square: Array
+    ties: Array
+    side: Array
+
+
 @record(static=("supersample", "apron"))
 class Sampled(_OnCells):
     """A sampled scene, the result of `rts.sample` and the input of `rts.render_samples`.
@@ -322,6 +362,8 @@ class Sampled(_OnCells):
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples, in pixels that `rts.Adaptive` makes active, or None.
+        outlines: outlines between centres, for splatters that read them, or None. Their samples are the last rows of
+            each part.
     """
 
     samples: tuple[Samples, ...]
@@ -330,6 +372,7 @@ class Sampled(_OnCells):
     supersample: int = 1
     apron: int = 2
     fine: Fine | None = None
+    outlines: Outlines | None = None
 
     @property
     def one_part(self) -> bool:
@@ -372,6 +415,7 @@ class Splats(_OnCells):
         border: cells at each side that splat into the image but are no part of it.
         one_part: whether all samples are of one part.
         opaque: a promise that alpha is 1 at all samples.
+        outlines: outlines between centres, if the splatter reads them; arrays of the positions' engine.
     """
 
     positions: Array
@@ -382,6 +426,7 @@ class Splats(_OnCells):
     border: int = 0
     one_part: bool = False
     opaque: bool = True
+    outlines: Outlines | None = None
 
     @property
     def parts(self) -> Array | None:

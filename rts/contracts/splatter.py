@@ -69,7 +69,8 @@ class Splatter(Plugin):
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """The samples that can affect the image, in value or derivative, if all are opaque and on cells' centres.
 
-        If a class overrides this method, other samples are dropped before they are evaluated. Host arrays.
+        If a class overrides this method, other samples are dropped before they are evaluated; all are kept in scenes of
+        which some part may be translucent. Host arrays.
 
         Args:
             covered: (K, H, W) bool, true where there is a sample.

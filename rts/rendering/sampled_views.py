@@ -326,7 +326,7 @@ def decided_in_views(hidden: HiddenRule | None, picture: Picture, question: Ques
         picture: the layout of the views.
         question: the samples of the picture.
     """
-    covered, depth, size, _ = question
+    covered, depth, size = question
     far = _largest(depth, picture)
     scales = depth_scales(far)
     if hidden is None:

@@ -38,9 +38,10 @@ def hidden_by(
 ) -> HiddenRule | None:
     """The rule that drops hidden samples of a scene; None to keep all.
 
-    A sample is dropped only behind samples of opaque parts, and while no number of the scene is so large that rounding
-    reorders depths. Where these numbers are traced, those of the triangles serve; all samples are kept then if a part
-    has no triangles, or refines its samples. All are kept if the splatter has no `needed`, or no part is opaque.
+    Samples are dropped only if all parts are opaque: a splatter tells what it needs by depths, and those of opaque
+    layers alone say what is hidden. All are kept, too, if the splatter has no `needed`, or if some number of the scene
+    is so large that rounding reorders depths. Where these numbers are traced, those of the triangles serve; all samples
+    are kept then if a part has no triangles, or refines its samples.
 
     Args:
         splatter: the splatter.
@@ -49,16 +50,14 @@ def hidden_by(
         settles: True if cells amid the one colour of a scene of one part may go without samples (`Cells.settled`).
             Samples that will be evaluated at other values of θ must all stay.
     """
-    opaque = np.array([bool(p.shader.opaque) for p in parts])
-    if not overrides(splatter, "needed", Splatter) or not opaque.any():
+    if not overrides(splatter, "needed", Splatter) or not all(p.shader.opaque for p in parts):
         return None
     size = _size(parts, sizes)
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
     # Where parts meet, rounding decides which of them a cell shows.
     settles = settles and promised(splatter, "fills_interiors") and len(parts) == 1 and parts[0].uniform
-    rule = HiddenBySplatter(splatter, size or 0.0, settles)
-    return rule if opaque.all() else HiddenBehindOpaque(rule, opaque)
+    return HiddenRule(splatter, size or 0.0, settles)
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
@@ -79,7 +78,7 @@ def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float 
 
 
 @dataclass(frozen=True)
-class HiddenBySplatter:
+class HiddenRule:
     """The rule of a splatter for the samples of an image: which of them it needs.
 
     Attributes:
@@ -92,7 +91,7 @@ class HiddenBySplatter:
     size: float
     settles: bool
 
-    def unsized(self) -> HiddenBySplatter:
+    def unsized(self) -> HiddenRule:
         """The rule with `size` 0, for depths in units of their own."""
         return replace(self, size=0.0)
 
@@ -101,7 +100,7 @@ class HiddenBySplatter:
 
         All are kept where numbers are so large that rounding may reorder depths.
         """
-        covered, depth, size, _ = question
+        covered, depth, size = question
         too_rough = (self.settles or len(covered) > 1) and too_far(max(size, self.size), depth)
         needed = covered if too_rough or len(covered) == 1 else self._needed(covered, depth)
         if not self.settles:
@@ -124,56 +123,6 @@ class HiddenBySplatter:
                 f"needed of {self.splatter!r} gave {description}; expected a NumPy array, bool of {covered.shape}"
             )
         return kept & covered
-
-
-@dataclass(frozen=True)
-class HiddenBehindOpaque:
-    """The rule of a splatter in a scene of which some parts are translucent: it holds behind the first opaque sample.
-
-    Attributes:
-        rule: the splatter's rule where all parts are opaque.
-        opaque: (P,) bool, which parts are.
-    """
-
-    rule: HiddenBySplatter
-    opaque: np.ndarray
-
-    @property
-    def settles(self) -> bool:
-        """See `Hidden`: False, since light may shine through any cell."""
-        return False
-
-    @property
-    def size(self) -> float:
-        """See `Hidden`."""
-        return self.rule.size
-
-    def unsized(self) -> HiddenBehindOpaque:
-        """See `HiddenBySplatter`."""
-        return replace(self, rule=self.rule.unsized())
-
-    def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
-        """See `HiddenBySplatter`; if the question has no `part`, all samples are needed."""
-        covered, depth, _, part = question
-        if part is None:
-            return Decision(covered, None, covered)
-        first = np.where((ends := covered & self.opaque[part]).any(axis=0), ends.argmax(axis=0), len(covered))
-        layer = np.arange(len(covered))[:, None, None]
-        # The layers from the first opaque sample on, as a scene of their own.
-        moved = np.minimum(layer + first, len(covered) - 1)
-        inside = layer + first < len(covered)
-        behind = question._replace(
-            covered=np.take_along_axis(covered, moved, axis=0) & inside,
-            depth=np.take_along_axis(depth, moved, axis=0),
-            part=None,
-        )
-        kept = self.rule.decide(behind, wanted).needed
-        back = np.take_along_axis(kept, np.maximum(layer - first, 0), axis=0)
-        needed = covered & ((layer < first) | back)
-        return Decision(needed, None, needed)
-
-
-HiddenRule = HiddenBySplatter | HiddenBehindOpaque
 
 
 def numbers_of(settled: np.ndarray) -> np.ndarray:
@@ -242,13 +191,13 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
     sizes = [s.ids.shape[0] for s in sampled.samples]
     total, part = sum(sizes), sampled.part
 
-    def host(row: np.ndarray, depth: np.ndarray, parts: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
+    def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
         from rts.sampling.hidden_loops import Numbering
 
         if row.max(initial=-1) >= total:
             raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")
         numbering, covered = Numbering(sizes), row >= 0
-        kept = decide(Question(covered, depth, part=parts)).needed
+        kept = decide(Question(covered, depth)).needed
         own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
         if exits:
             if (most := exits[0].max(initial=-1)) >= total:
@@ -267,7 +216,7 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
-    results = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, part, *rows[1:])
+    results = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
     row, own_rows, indices = results[0], results[1 : 1 + len(sizes)], results[len(rows) :]
     exits = None if sampled.exit is None else results[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]

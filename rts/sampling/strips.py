@@ -255,16 +255,12 @@ class HiddenInStrips:
         """See `Hidden`; cells of the question and the decision are those of the list, (K, L, LINE)."""
         from rts.sampling import strips_loops
 
-        covered, depth, size, part = question
+        covered, depth, size = question
         layers, (place, wanted) = len(covered), (self.layout.place, self.layout.wanted)
         lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
         laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
         parallel(strips_loops.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
-        if part is not None:
-            number, owner = read_only(part, depth.dtype).reshape(layers, -1), np.empty_like(deep)
-            parallel(strips_loops.gather, layers * len(place), lists[0], number, place, laid, owner, work=2 * laid.size)
-            part = owner.astype(np.int32)
-        kept, settled, asked = self.rule.decide(Question(laid, deep, size, part), wanted)
+        kept, settled, asked = self.rule.decide(Question(laid, deep, size), wanted)
         needed = covered
         if asked is not laid:
             needed = np.concatenate([covered[:1], self._listed(asked[1:], covered[1:], self.layout.kinds)])
