@@ -3,6 +3,9 @@
 Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines; rts.commands, the subcommands of `rts`;
 and rts.functions, of which the library's own are attributes of `rts`. The library registers its own plugins in its
 `pyproject.toml`, in the same way as anyone's. Only plugins that are asked for are imported.
+
+A distribution whose entry points cannot be read is passed over, with a warning. So is a claim of another distribution
+on a name that the library's own registers.
 """
 
 from __future__ import annotations
@@ -10,11 +13,11 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping
-from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distribution, distributions
 from typing import Any, Literal, NamedTuple, overload
 
 from rts.capabilities import capabilities
-from rts.errors import InputError, PluginError
+from rts.errors import InputError, PluginError, RtsWarning, warn
 
 GROUPS = (
     "rts.surfaces",
@@ -25,6 +28,9 @@ GROUPS = (
     "rts.commands",
     "rts.functions",
 )
+
+OWN = "rasterize-then-splat"
+"""The library's own distribution."""
 
 
 class PluginInfo(NamedTuple):
@@ -62,11 +68,66 @@ _defaults: dict[tuple[str, str | type], Any] = {}
 
 def _entries(group: str) -> dict[str, list[EntryPoint]]:
     if group not in _entry_points:
-        names: dict[str, list[EntryPoint]] = {}
-        for entry in entry_points(group=group):
-            names.setdefault(entry.name, []).append(entry)
-        _entry_points[group] = names
+        found, problems = _read()
+        problems += _keep_own(found)
+        _entry_points.update(found)
+        for problem in problems:
+            warn(problem, RtsWarning)
     return _entry_points[group]
+
+
+def _read() -> tuple[dict[str, dict[str, list[EntryPoint]]], list[str]]:
+    """Entry points by group and name, and a line for each distribution that is passed over."""
+    found: dict[str, dict[str, list[EntryPoint]]] = {group: {} for group in GROUPS}
+    seen, problems = set(), []
+    for each in distributions():
+        try:
+            entries = [entry for entry in each.entry_points if entry.group in found]
+            name = re.sub(r"[-_.]+", "-", each.name).lower() if entries else None  # To read all names would take long.
+        except Exception as error:  # Its files are damaged, and each kind of damage has an error of its own.
+            problems.append(f"{_described(each)} is broken, and passed over; reinstall it ({_reason(error)})")
+            continue
+        if name in seen:  # An older version, which Python would not import.
+            continue
+        for entry in entries:
+            seen.add(name)
+            found[entry.group].setdefault(entry.name, []).append(entry)
+    return found, problems
+
+
+def _keep_own(found: dict[str, dict[str, list[EntryPoint]]]) -> list[str]:
+    """Drop others' claims on names of the library's own distribution. Returns a line for each such name."""
+    problems = []
+    for group, claims in found.items():
+        for name, entries in claims.items():
+            own = [entry for entry in entries if _is_own(entry)] if len(entries) > 1 else []
+            if own:
+                others = " and ".join(sorted(_distribution(entry) for entry in entries if not _is_own(entry)))
+                problems.append(f"the {_kind(group)} {name!r} is the library's; the claim of {others} is passed over")
+                claims[name] = own
+    return problems
+
+
+def _described(broken: Distribution) -> str:
+    """The name of a distribution, some of whose files may be damaged, and its folder."""
+    try:
+        name = broken.name
+    except Exception:
+        name = None
+    return f"the distribution {name or 'without a name'} in {broken.locate_file('')}"
+
+
+def _reason(error: BaseException) -> str:
+    """An error in a line."""
+    return ": ".join(filter(None, (type(error).__name__, " ".join(str(error).split()))))
+
+
+def _is_own(entry: EntryPoint) -> bool:
+    return entry.dist is not None and entry.dist.name == OWN
+
+
+def _kind(group: str) -> str:
+    return group.removeprefix("rts.").removesuffix("s")
 
 
 def _group(group: str) -> str:
@@ -116,17 +177,25 @@ def _entry(group: str, name: str) -> EntryPoint:
     if name not in _entries(group):
         _entry_points.clear()  # A distribution may have been installed since the last look.
     claims = _entries(group).get(name)
-    kind = group.removeprefix("rts.").removesuffix("s")
     if not claims:
         names = plugins(group)
         hint = "; is its distribution installed, and was it again after its entry points changed (pip install .)?"
-        raise InputError(f"no {kind} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
+        raise InputError(f"no {_kind(group)} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
     if len(claims) > 1:
         raise PluginError(
-            f"the {kind} {name!r} is claimed by {' and '.join(sorted(map(_distribution, claims)))}; "
-            f"uninstall one of them"
+            f"the {_kind(group)} {name!r} is claimed by {distributions_of(group, name)}; uninstall one of them"
         )
     return claims[0]
+
+
+def distributions_of(group: str, name: str) -> str:
+    """Names and versions of the distributions that register a plugin, without importing it.
+
+    Args:
+        group: such as "rts.commands", in full.
+        name: one of `plugins(group)`.
+    """
+    return " and ".join(sorted(map(_distribution, _entries(group)[name])))
 
 
 def check_name(group: str, name: str) -> None:
@@ -160,8 +229,7 @@ def plugin(group: str, name: str) -> Any:
         raise InputError(
             f"the name of a plugin is a {type(name).__name__}; expected one of {', '.join(plugins(group))}"
         )
-    entry = _entry(group, name)
-    kind = group.removeprefix("rts.").removesuffix("s")
+    entry, kind = _entry(group, name), _kind(group)
     try:
         return entry.load()
     except ModuleNotFoundError as error:
@@ -171,11 +239,11 @@ def plugin(group: str, name: str) -> Any:
         raise PluginError(
             f"the {kind} {name!r} of {_distribution(entry)} needs the module {error.name!r}, which is not installed"
         ) from error
-    except PluginError:
+    except (PluginError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:  # SystemExit, and panics of compiled code, would end the program.
         raise PluginError(
-            f"the {kind} {name!r} of {_distribution(entry)} fails to import: {type(error).__name__}: {error}"
+            f"the {kind} {name!r} of {_distribution(entry)} fails to import: {_reason(error)}"
         ) from error
 
 
@@ -184,14 +252,12 @@ def built_in_attributes() -> dict[str, tuple[str, str]]:
 
     Such as "Mesh" → ("rts.surfaces", "mesh"), and "tune" → ("rts.functions", "tune").
     """
-    numpy = _entries("rts.engines").get("numpy")  # Missing where the sources alone are in the path.
-    own = numpy[0].dist if numpy else None
     return {
         entry.attr: (group, name)
         for group in ("rts.surfaces", "rts.functions")
         for name, entries in _entries(group).items()
         for entry in entries
-        if own is not None and entry.dist is not None and entry.dist.name == own.name
+        if _is_own(entry)
     }
 
 
@@ -252,7 +318,7 @@ def _details(group: str, name: str) -> PluginInfo:
         error = str(problem)
     missing = _missing(entries[0])
     install = f"{entries[0].dist.name}[{name}]" if missing and entries[0].dist else None
-    return PluginInfo(group, name, " and ".join(map(_distribution, entries)), error, missing, install, able)
+    return PluginInfo(group, name, distributions_of(group, name), error, missing, install, able)
 
 
 def _missing(entry: EntryPoint) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from rts.cli.main import app
 
 pytestmark = pytest.mark.core
 
+Mesh = rts.plugin("surfaces", "mesh")
+
 HEAVY = (
     "torch",
     "jax",
@@ -31,6 +33,8 @@ HEAVY = (
     "matplotlib",
     "optax",
 )
+
+RIVAL = "class Rival: pass"
 
 
 @pytest.fixture
@@ -261,13 +265,19 @@ def test_listing_names_imports_no_plugin():
     assert not {m for m in loaded if m.startswith(("rts_backends", "rts_compare", "rts_surfaces"))}
 
 
-def test_help_lists_commands_without_what_they_need():
-    loaded = modules_after(
-        "from typer.testing import CliRunner\n"
+def test_the_help_names_installed_commands_and_imports_none():
+    code = (
         "from rts.cli.main import app\n"
-        "assert 'compare' in CliRunner().invoke(app, ['--help']).output"
+        "try:\n    app(['--help'], prog_name='rts')\n"
+        "except SystemExit as end:\n    print('ended with', end.code)\n"
+        "print('loaded', *(name for name in sys.modules if name.startswith('rts_')))"
     )
-    assert {m for m in loaded if m.startswith("rts_compare.")} == {"rts_compare.commands"}
+    done = subprocess.run([sys.executable, "-c", f"import sys\n{code}"], capture_output=True, text=True, check=True)
+    *_, ended, loaded = done.stdout.splitlines()
+    assert ended == "ended with 0" and loaded == "loaded"
+    for name in rts.plugins("rts.commands"):
+        assert f" {name} " in done.stdout
+    assert f"Of rasterize-then-splat {rts.__version__}: rts tune --help tells more" in done.stdout
 
 
 def test_rendering_numpy_arrays_loads_neither_torch_nor_jax():
@@ -333,10 +343,55 @@ def test_a_name_claimed_by_two_distributions_is_refused_naming_both(install):
     assert rts.plugin("splatters", "multi").__name__ == "Multi"
 
 
-def test_a_name_of_ours_claimed_by_another_distribution_is_refused(install):
-    install("rival", {"rts.splatters": {"multi": "rival_plugin:Rival"}}, {"rival_plugin": "class Rival: pass"})
-    with pytest.raises(rts.PluginError, match="claimed by .*rival 1.2"):
-        rts.plugin("splatters", "multi")
+@pytest.mark.parametrize(("group", "name"), [("splatters", "multi"), ("engines", "numpy"), ("surfaces", "mesh")])
+def test_a_claim_of_another_distribution_on_a_name_of_ours_is_passed_over(install, group, name):
+    own = rts.plugin(group, name)
+    install(
+        "rival", {f"rts.{group}": {name: "rival_plugin:Rival", "rival": "rival_plugin:Rival"}}, {"rival_plugin": RIVAL}
+    )
+    registry._entry_points.clear()
+    with pytest.warns(
+        rts.RtsWarning, match=f"'{name}' is the library's; the claim of rival 1.2 is passed over"
+    ) as told:
+        assert rts.plugin(group, name) is own
+    assert registry.attribute("Mesh", rts.__all__) is Mesh  # Of the surfaces, and with NumPy arrays.
+    assert rts.plugin(group, "rival").__name__ == "Rival"
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"entry_points.txt": bytes(range(256))},
+        {"entry_points.txt": b"[rts.samplers]\nno entry\n"},
+        {"METADATA": b"\xff"},
+    ],
+    ids=["binary", "a line without =", "binary metadata"],
+)
+def test_a_broken_distribution_is_told_in_a_line_and_passed_over(install, tmp_path, damage):
+    install("broken", {"rts.samplers": {"beams": "broken_plugin:Beams"}}, {"broken_plugin": "class Beams: pass"})
+    install("whole", {"rts.samplers": {"strips": "whole_plugin:Strips"}}, {"whole_plugin": "class Strips: pass"})
+    for name, data in damage.items():
+        (tmp_path / "broken/broken-1.2.dist-info" / name).write_bytes(data)
+    with pytest.warns(rts.RtsWarning) as told:
+        assert {"raster", "strips"} < set(rts.plugins("samplers"))
+    for group in registry.GROUPS:  # It is told once.
+        rts.plugins(group)
+    (line,) = (str(x.message) for x in told)
+    assert "broken" in line and str(tmp_path / "broken") in line and "passed over; reinstall it" in line
+    assert "\n" not in line and "beams" not in rts.plugins("samplers")
+
+
+def test_of_two_versions_in_the_path_the_first_counts(install):
+    for version, source in (("1.0", "class Old: pass"), ("2.0", "class New: pass")):  # The newer one comes first.
+        name = source.split()[1].strip(":")
+        install(
+            "Same_Name" if name == "Old" else "same_name",
+            {"rts.shaders": {"s": f"v_{name}:{name}"}},
+            {f"v_{name}": source},
+            version=version,
+        )
+    assert rts.plugin("shaders", "s").__name__ == "New"
 
 
 def test_a_missing_package_of_an_extra_names_the_pip_command(install):
@@ -383,8 +438,10 @@ def test_an_engine_whose_framework_is_absent_names_our_extra(name, package):
         ("raise ImportError('libGL.so.1: cannot open shared object file')", ("ImportError", "libGL.so.1")),
         ("def broken(:", ("SyntaxError",)),
         ("class Other: pass", ("AttributeError", "Broken")),
+        ("raise SystemExit(3)", ("SystemExit: 3",)),
+        ("class Panic(BaseException): pass\nraise Panic('a line\\nand another')", ("Panic: a line and another",)),
     ],
-    ids=["raises", "import error", "syntax", "no such attribute"],
+    ids=["raises", "import error", "syntax", "no such attribute", "exit", "panic"],
 )
 def test_any_other_failure_to_import_shows_its_cause(install, source, words):
     install("faulty", {"rts.samplers": {"broken": "faulty_plugin:Broken"}}, {"faulty_plugin": source})
@@ -420,6 +477,7 @@ def test_a_broken_plugin_does_not_break_the_others(install):
         ("raise RuntimeError('no display')", "fails to import: RuntimeError: no display"),
         ("import a_package_that_is_absent", "needs the module 'a_package_that_is_absent'"),
         ("draw = 3", "is neither a function of options nor"),
+        ("raise SystemExit(3)", "fails to import: SystemExit: 3"),
     ],
 )
 def test_a_command_that_cannot_be_used_says_why_in_a_line_and_the_others_work(install, source, why):
@@ -427,9 +485,20 @@ def test_a_command_that_cannot_be_used_says_why_in_a_line_and_the_others_work(in
     runner = CliRunner()
     listed = runner.invoke(app, ["--help"])
     assert listed.exit_code == 0 and "draw" in listed.output and "compare" in listed.output
+    assert "faulty_command" not in sys.modules
     done = runner.invoke(app, ["draw", "picture.png", "--fast"])
     assert done.exit_code == 1 and why in done.output and done.output.count("\n") == 1
     assert runner.invoke(app, ["plugins"]).exit_code == 0
+
+
+def test_an_interrupt_is_no_failure_to_import(install):
+    install("slow", {"rts.samplers": {"slow": "slow_plugin:Slow"}}, {"slow_plugin": "raise KeyboardInterrupt"})
+    with pytest.raises(KeyboardInterrupt):
+        rts.plugin("samplers", "slow")
+
+
+def test_a_command_tells_its_own_help():
+    assert "cheapest" in CliRunner().invoke(app, ["tune", "--help"]).output
 
 
 @pytest.mark.parametrize("group", BASES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 import time
 import warnings
@@ -49,12 +50,18 @@ class _Group(TyperGroup):
             return _installed_command(cmd_name)
         return found
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Show installed commands by name, and where they come from: their modules are not imported."""
+        named = copy.copy(self)
+        named.commands = {name: self.commands.get(name) or _named_command(name) for name in self.list_commands(ctx)}
+        super(_Group, named).format_help(ctx, formatter)
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Let --debug stand anywhere before "--"; without arguments, show the help."""
         end = args.index("--") if "--" in args else len(args)
         if "--debug" in args[:end]:
             args = ["--debug", *(a for a in args[:end] if a != "--debug"), *args[end:]]
-        with _one_line(ctx):
+        with _one_line(ctx), _warnings_in_a_line():
             return super().parse_args(ctx, args or ["--help"])
 
     def invoke(self, ctx: Any) -> Any:
@@ -74,6 +81,16 @@ def _installed_command(name: str) -> Any:
 
     broken.__doc__ = f"cannot be used: {_line(str(reason))}"
     return _as_command(name, broken, {"ignore_unknown_options": True, "allow_extra_args": True})
+
+
+def _named_command(name: str) -> Any:
+    """A command that only stands for one of an installed distribution, in the help."""
+
+    def unread() -> None:
+        pass
+
+    unread.__doc__ = f"Of {registry.distributions_of('rts.commands', name)}: `rts {name} --help` tells more."
+    return _as_command(name, unread)
 
 
 def _as_command(name: str, found: Any, settings: dict[str, Any] | None = None) -> Any:
