@@ -187,14 +187,37 @@ def test_a_docstring_says_by_itself_what_it_speaks_of():
 
 def test_the_architecture_has_a_line_for_every_file():
     text = (ROOT / "docs/architecture.md").read_text()
-    tree = text[text.index("## The tree") :].split("```")[1]
-    files = FILES | APPS
-    for name, path in files.items():
-        if path.name != "__init__.py" or name == "rts":
-            assert re.search(rf"\b{path.name}\b", tree), f"{name} is not in docs/architecture.md"
-    for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_loops.py", "").replace("test_<what>.py", "")):
-        places = [*files.values(), *(ROOT / "docs").glob("*.py")]
-        assert any(path.stem == named for path in places), f"docs/architecture.md names {named}.py"
+    named = in_tree(text[text.index("## The tree") :].split("```")[1])
+    assert not [path for path in named if not (ROOT / path).is_file()]
+    own = [path for path in (FILES | APPS).values() if path.name != "__init__.py" or path == FILES["rts"]]
+    assert not {str(path.relative_to(ROOT)) for path in own} - named
+
+
+def in_tree(tree):
+    """Paths of the files that a tree of folders names. A folder's line ends its name in "/", before any remark."""
+    folders, paths = [(-1, Path())], set()
+    for line in tree.splitlines():
+        indent, (first, _, rest) = len(line) - len(line.lstrip()), line.strip().partition(" ")
+        if indent < REMARKS:
+            while folders[-1][0] >= indent:
+                folders.pop()
+            is_folder = first.endswith("/")
+            folders.append((indent, folders[-1][1] / (first if is_folder else "")))
+            line = rest if is_folder else line
+        files = re.findall(r"(?<![*>\w])\w+\.(?:py|cpp|h|html|sh)\b", line)
+        paths |= {str(folders[-1][1] / name) for name in files}
+    return paths
+
+
+REMARKS = 24
+"""Column from which on lines of the tree hold remarks alone."""
+
+
+def test_a_tree_is_read_folder_by_folder():
+    tree = (
+        f"a/      b.py; c.py: two\n  d.py    one (d_loops.py,\n{28 * ' '}e.h)\n  f/\n    g.py  *_loops.py\nh/   i.sh\n"
+    )
+    assert in_tree(tree) == {"a/b.py", "a/c.py", "a/d.py", "a/d_loops.py", "a/e.h", "a/f/g.py", "h/i.sh"}
 
 
 def long_lines(text):

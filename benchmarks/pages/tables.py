@@ -77,6 +77,19 @@ def medians() -> str:
     return table(["samples a pixel", *MODES, "ms"], lines)
 
 
+def layers() -> str:
+    """In how many scenes `visible` with one sample a pixel is off by at most 10 %, by the number of layers."""
+    numbers = 1, 2, 4
+    lines = [[mode, *(str(sum(_error(s, mode, n) <= 0.1 for s in scenes())) for n in numbers)] for mode in MODES]
+    return table([f"of {len(scenes())} scenes", *(f"K = {n}" for n in numbers)], lines)
+
+
+def _error(comparison: Mapping, mode: str, number: int) -> float:
+    """The error of `visible` with so many layers and one sample a pixel, at the scene's own rate."""
+    wanted = {"splatter": "visible", "layers": number, "supersample": 1, "rate": ""}
+    return min(r["error"] for r in own(comparison, mode) if wanted.items() <= r["settings"].items())
+
+
 def _row(comparison: Mapping, mode: str, samples: str) -> tuple[float, float | None]:
     """The error of `visible` with all layers that count, and its least time with two layers and torch."""
     rows = [r for r in own(comparison, mode) if str(r["settings"]["supersample"]) == samples]
@@ -148,6 +161,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "hand": hand_rates,
     "hand-seeds": hand_seeds,
     "defects": defects,
+    "layers": layers,
     "medians": medians,
     "ratios": ratios,
     "faces": faces,

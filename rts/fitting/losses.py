@@ -91,7 +91,7 @@ SCALES = 1e-10, 1e10
 class Loss:
     """A loss for fits: the mean of s² ρ((r / s)²) over residuals r, with s for `f_scale`.
 
-    The losses are those of `scipy.optimize.least_squares`, whose cost is half the sum where this is the mean:
+    Each is the loss of its name in `scipy.optimize.least_squares`, whose cost is half the sum where this is the mean:
 
     - "linear": ρ(z) = z, the mean square.
     - "soft_l1": ρ(z) = 2 (√(1 + z) − 1), a smooth form of "huber".
