@@ -36,6 +36,8 @@ PEER_SYMBOL = "x"
 ENGINE_FILLS = {"torch": "", "jax": "-open"}
 OTHER_FILLS = ("-open-dot", "-dot")
 """Endings of a symbol's name: "" full, "-open" hollow, "-open-dot" hollow with a dot, "-dot" full with a dot."""
+LIBRARY = "rasterize-then-splat"
+"""The name of the distribution, as `environment` has it."""
 
 
 def assigned(names: Iterable[str], fixed: Mapping[str, str], others: Sequence[str]) -> dict[str, str]:
@@ -136,6 +138,10 @@ def arguments(row: Row) -> str:
 
 
 def environment_line(environment: Mapping[str, Any]) -> str:
-    """The date, machine and versions of a comparison, in one line."""
-    versions = ", ".join(f"{name} {version}" for name, version in environment.get("versions", {}).items() if version)
+    """The date, machine and versions of other packages of a comparison, in one line.
+
+    The library's own version is left out: between releases its code changes, and the number does not.
+    """
+    others = {name: version for name, version in environment.get("versions", {}).items() if name != LIBRARY and version}
+    versions = ", ".join(f"{name} {version}" for name, version in others.items())
     return "; ".join(filter(None, [environment.get("date"), environment.get("machine"), versions]))

@@ -146,6 +146,12 @@ def test_settings_are_named_in_short_and_as_arguments():
     assert (chart_style.label(peer), chart_style.arguments(peer)) == ("Mitsuba spp=16", "# Mitsuba, spp=16")
 
 
+def test_charts_name_the_versions_of_other_packages_that_are_installed():
+    versions = {"rasterize-then-splat": "0.1.0", "torch": "2.13.0", "jax": None, "numpy": "2.4.6"}
+    line = chart_style.environment_line({"date": "2026-01-02", "machine": "2 cores", "versions": versions})
+    assert line == "2026-01-02; 2 cores; torch 2.13.0, numpy 2.4.6"
+
+
 def test_built_in_names_keep_their_looks_and_others_go_by_the_order_of_their_names():
     others = [f"toy{i}" for i in range(9)]
     rows = [row("a", 1, 1.0, splatter=s, sampler=s, engine=s) for s in ("visible", *reversed(others))]

@@ -42,7 +42,7 @@ NAME = re.compile(r"(?<![\w./…-])[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*(?![\w/])")
 def public():
     """Classes and functions by name, of `rts` and of the modules that plugins and users import."""
     modules = map(import_module, MODULES)
-    found = {n: value for m in modules for n, value in vars(m).items() if n in getattr(m, "__all__", vars(m))}
+    found = {name: getattr(m, name) for m in modules for name in getattr(m, "__all__", vars(m))}
     return found | {name: getattr(rts, name) for name in {*rts.__all__, *registry.built_in_attributes()}}
 
 
