@@ -39,7 +39,7 @@ class Rays(Sampler):
         transform = [] if part.transform is None else [engine.stop_gradient(constants(part.transform, engine, like))]
         engine.call_host(_checked, (ArraySpec((), np.int32),), camera.view, camera.projection, *transform)
         near, far = camera.depth_range()
-        rays = camera.rays(size)
+        rays = camera.rays(size, request.points)
         directions = xp.reshape(rays.directions, (-1, 3))
         origins = xp.reshape(rays.origins, (-1, 3))
         listed, view = True, size
@@ -48,6 +48,8 @@ class Rays(Sampler):
             size, listed = tuple(request.cells.shape), index[None] >= 0
             index = xp.where(index >= 0, index, 0)
             directions, origins = xp.take(directions, index, axis=0), xp.take(origins, index, axis=0)
+        elif request.points is not None:
+            size = 1, request.points.shape[0]
         origins = origins + near * directions
         hits = _checked_hits(surface.intersect(theta, origins, directions, layers), surface, layers, size)
         depth = near + hits.distance
@@ -74,7 +76,7 @@ class Rays(Sampler):
         else:
             ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
-        followed = () if request.cells is None else ("cells",)
+        followed = tuple(name for name in ("cells", "points") if getattr(request, name) is not None)
         facing = None
         if request.facing and hits.entering is not None:
             facing = _facing(xp.reshape(hits.entering, (layers, *size)), row)

@@ -315,35 +315,39 @@ class Fine(_OnCells):
 
 @record()
 class Outlines:
-    """Outlines between the centres of cells: places where one front ends, joined into segments. No derivative.
+    """Outlines between the centres of cells: places where a front ends, joined into segments. They have no derivative.
 
     A gap lies between two neighbouring centres, along a row or a column, whose fronts are not one surface. Each place
-    in a gap where the front changes is a break. Four neighbouring centres are the corners of a square; the breaks on
-    its sides are joined into segments.
+    in a gap where the front changes is a break. Four neighbouring centres are the corners of a square; breaks on its
+    sides are joined into segments.
 
     Attributes:
         place: (B, 2) float64, x and y of each break, in cells from the grid's corner.
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
-        rows: (B, 2) int32, indices of the last samples before and behind the break along the gap, or −1.
+        rows: (B, 2) int32, indices of the last samples before and behind each break, along its gap, or −1.
+        points: (B, 2, 2) float64, x and y of these samples.
         near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
             surfaces pass through one another.
-        slope: (B, 2, 2) float64, slopes of depth along x and y on both sides, where `near` is 2; else 0.
+        slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
         ends: (B, 2) bool: is this the gap's first break, and its last?
-        square: (S, 2) int32, the first corner (y, x) of the square of each segment.
-        ties: (S, 2) int32, the two breaks of each segment, so that near surfaces lie to the left of the way from one to
-            the other on the screen; or one break and −1 where no other fits.
-        side: (S, 2) int32, the sides of the square that the two breaks lie on: top, right, bottom, left; or −1.
+        square: (S, 2) int32, the first corner (y, x) of each segment's square.
+        ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
+            the other. −1 in second place if a break is alone.
+        side: (S, 2) int32, the sides of the square that these breaks lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
+        joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y?
     """
 
     place: Array
     gap: Array
     rows: Array
+    points: Array
     near: Array
     slope: Array
     ends: Array
     square: Array
     ties: Array
     side: Array
+    joined: Array
 
 
 @record(static=("supersample", "apron"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, InputWarning, warn
 from rts.plugin_base import promised
 from rts.registry import name_of
+from rts.rendering.arguments import Layers, SamplerLike, SplatterLike, Supersample
+from rts.rendering.outlines import with_outlines
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
@@ -37,10 +39,10 @@ def sample(
     camera: Camera,
     size: tuple[int, int],
     *,
-    sampler: Any = "auto",
-    splatter: Any = None,
-    layers: int | Literal["auto"] = 2,
-    supersample: int | Adaptive = 1,
+    sampler: SamplerLike = "auto",
+    splatter: SplatterLike | None = None,
+    layers: Layers = 2,
+    supersample: Supersample = 1,
     capacity: int | None = None,
     engine: str | None = None,
     settles: bool = False,
@@ -126,12 +128,17 @@ def _on_one_grid(
     check_memory(height, width, settings.most_layers, capacity, gradient=gradient)
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     exits = exits and "exit" in reader.reads and gradient
-    request = Request(capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin)
+    outlines = "outlines" in reader.reads
+    request = Request(
+        capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin, triangles=outlines
+    )
     taken = partial(_taken, scene.telling(settings.thin), grid, request)
     if settings.layers == "auto":
         sampled = with_layers_that_count(taken, hidden, scene.opaque)
     else:
         sampled = taken(settings.layers, hidden)
+    if outlines:
+        sampled = with_outlines(sampled, scene, grid)
     return replace(sampled, supersample=side, apron=settings.apron)
 
 

@@ -52,7 +52,10 @@ class RenderSettings:
         size = check_size(size, layers, capacity, finest)
         if not isinstance(supersample, Adaptive):
             supersample = int(supersample)
-        return size, cls(check_splatter(splatter), layers if layers == "auto" else int(layers), supersample, capacity)
+        splatter = check_splatter(splatter)
+        if splatter.layers is not None:  # More would not be read.
+            layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))
+        return size, cls(splatter, layers if layers == "auto" else int(layers), supersample, capacity)
 
     @property
     def side(self) -> int | None:

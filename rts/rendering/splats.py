@@ -119,9 +119,11 @@ def _splats(
 ) -> Splats:
     """The splats of samples with these positions and colours; `more` are further fields of `Splats`."""
     cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
+    outlines = context_of(positions, rgba).constants(sampled.outlines)
     if not context.engine.owns(rgba):
         cells, part = context_of(positions, rgba).constants((cells, part))
     opaque = all(p.shader.opaque for p in parts)
+    more["outlines"] = outlines
     return Splats(positions, rgba, cells, part, one_part=sampled.one_part, opaque=opaque, **more)
 
 

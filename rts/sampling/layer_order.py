@@ -48,7 +48,7 @@ def on_surface(
         layers: K.
         tables: the result of the surface's `table_specs`.
         size: (height, width) of the grid of cells.
-        cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
+        cells: (L, C), the cells of the samples, as flat indices in the grid, or points (L, C, 2); None for all.
     """
     first = Fragments(*(x[:layers] for x in fragments))
     moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables, size, cells)
@@ -91,7 +91,7 @@ def refined(
         camera: host matrices.
         tables: the result of the surface's `table_specs`.
         size: (height, width) of the grid of cells; None for that of the samples.
-        cells: (L, C), the cells of the samples, as flat indices in the grid; None for all.
+        cells: (L, C), the cells of the samples, as flat indices in the grid, or points (L, C, 2); None for all.
     """
     by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
     allotted = {
@@ -105,7 +105,7 @@ def refined(
 
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
-    """The rays (N, 3) of packed samples; those of rows that no cell names are undefined.
+    """The rays (N, 3) of packed samples, of listed `cells` or points; those of rows that no cell names are undefined.
 
     A single row that no cell names gets the ray of the first cell.
     """
@@ -119,12 +119,20 @@ def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.n
         none = np.zeros(1, np.int64)
         layer_order_loops.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *arguments)
     if cells is not None:
-        lines, columns = np.divmod(cells.reshape(-1), width)
+        lines, columns = _lines_and_columns(cells, width)
         layer_order_loops.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *arguments)
     else:
         lines = read_only(samples.row, np.int32).reshape(-1, width)
         parallel(layer_order_loops.rays_of, len(lines), lines, *arguments, work=20 * len(samples.ids))
     return Rays(*ends, camera.spread((height, width)))
+
+
+def _lines_and_columns(cells: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lines and columns (M,) of listed cells (L, C) of a grid; of points (L, C, 2), as fractions of cells."""
+    if cells.ndim == 3:
+        x, y = cells.reshape(-1, 2).T - 0.5
+        return np.ascontiguousarray(y), np.ascontiguousarray(x)
+    return np.divmod(cells.reshape(-1), width)
 
 
 def steps_of(camera: Camera, size: tuple[int, int]) -> Rays:

@@ -23,7 +23,8 @@ from rts.sampling.exits import Exits, beside_outlines, with_pairs
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.layer_order import on_surface, refined, steps_of
-from rts.sampling.packing import lift, repack
+from rts.sampling.packing import lift, repack, triangles_of
+from rts.sampling.points import at_points
 from rts.sampling.sample_checks import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -124,6 +125,24 @@ class TriangleSampler(Sampler):
         at = np.where(listed, cells, 0)
         ids = np.where(listed, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
+
+    def rasterize_points(
+        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
+    ) -> Fragments | None:
+        """Fragments at points of the image; see `rasterize`. With None, the default, the core finds them itself.
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            layers: see `rasterize`.
+            cull: see `rasterize`.
+            points: (M, 2) float64, x and y in cells from the upper left corner.
+
+        Returns:
+            Fragments, (K, 1, M).
+        """
+        return None
 
     def rasterize_exits(
         self,
@@ -235,7 +254,9 @@ class TriangleSampler(Sampler):
         """
         surface, camera = _of_triangles(part.surface), camera.for_size(size)
         listed, hidden, entry = request.cells, request.hidden, request.entry
-        shape = Shape(layers, size if listed is None else tuple(listed.shape), request.capacity, size)
+        if request.points is not None:
+            listed = request.points[None, ...]
+        shape = Shape(layers, size if listed is None else tuple(listed.shape[:2]), request.capacity, size)
         refines = surface.refines
         tables, moves = shape.tables(surface) if refines else {}, refines and surface.refine_moves
         sides = request.facing and layers > 1 and part.cull == "none" and not moves
@@ -250,17 +271,18 @@ class TriangleSampler(Sampler):
             **({"exit": ArraySpec((1 + pairs, *shape.size), np.int32)} if exits or pairs else {}),
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
             **({"between": ArraySpec(shape.size, np.float32)} if thin else {}),
+            **({"triangle": shape.row_spec(np.int32)} if request.triangles and not moves else {}),
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
-            own = np.asarray(cells[0], np.int32) if cells else None
+            own = np.asarray(cells[0], np.int32 if request.points is None else np.float64) if cells else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own, thin)
             samples = search.moved() if moves else search.in_place(sides, exits, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
         samples, more = call.samples(find, beside, tables, [] if listed is None else [listed])
-        followed = [name for name, asked in (("cells", listed), ("hidden", hidden)) if asked is not None]
+        followed = [name for name in ("cells", "points", "hidden") if getattr(request, name) is not None]
         return samples.replace(**more, followed=tuple(followed))
 
     def working_on(
@@ -333,7 +355,7 @@ class _Search:
         tables: the result of the surface's `table_specs`.
         hidden: the rule for hidden samples; None to keep all.
         entry: the surface's prepared entry; None to look it up, or to build it.
-        cells: (L, C), the cells to sample; None for all.
+        cells: (L, C), the cells to sample, or points (1, M, 2); None for all cells.
         thin: True to record `Cells.between`.
     """
 
@@ -367,7 +389,8 @@ class _Search:
             facing = facing_of(fragments, kept, known.proxy, pieces, self.camera, listed=self.cells is not None)
         if not self.surface.refines:
             lifted = lift(fragments, known.proxy, self.shape.capacity, kept, behind)
-            return lifted.replace(facing=facing, settled=decision.settled, between=between)
+            told = triangles_of(fragments, lifted)
+            return lifted.replace(facing=facing, settled=decision.settled, between=between, triangle=told)
         lifted = lift(fragments, known.proxy, None, kept)
         samples, rays = refined(
             self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells
@@ -377,7 +400,7 @@ class _Search:
             given = rays, steps_of(self.camera, self.shape.view), self.cells, self.shape.view, self.tables
             samples, further = with_pairs(samples, self.surface, self.inputs, *given)
         repacked = repack(samples, samples.row >= 0, self.shape.capacity, further)
-        return repacked.replace(facing=facing, between=between)
+        return repacked.replace(facing=facing, between=between, triangle=triangles_of(fragments, repacked))
 
     def moved(self) -> Samples:
         """Samples that the surface moves off its triangles, with `ran_out`."""
@@ -424,6 +447,10 @@ class _Search:
             if not exits:
                 if self.cells is None:
                     fragments = sampler.rasterize(*arguments, self.cull)
+                elif self.cells.ndim == 3:
+                    fragments = sampler.rasterize_points(*arguments, self.cull, self.cells[0])
+                    if fragments is None:
+                        fragments = at_points(known.proxy, camera, view, layers, self.cull, self.cells[0])
                 else:
                     fragments = sampler.rasterize_cells(*arguments, self.cull, self.cells)
                 covered = check_fragments(fragments, grid, count, sampler)

@@ -671,15 +671,25 @@ class Camera:
             depths.append(xp.where(none, xp.ones_like(b) * math.inf, a / xp.where(none, xp.ones_like(b), b)))
         return xp.minimum(*depths), xp.maximum(*depths)
 
-    def rays(self, size: tuple[int, int]) -> Rays:
-        """Rays through pixels' centres: `origins` and `directions` (H, W, 3), world, and `spread`; differentiable."""
+    def rays(self, size: tuple[int, int], points: Array | None = None) -> Rays:
+        """Rays through pixels' centres: `origins` and `directions` (H, W, 3), world, and `spread`; differentiable.
+
+        Args:
+            size: (height, width) in pixels.
+            points: (M, 2), x and y in pixels of other points to cast rays through: the result is then (M, 3). None for
+                the centres.
+        """
         size = check_pixels(size)
         self = self.for_size(size)
         xp, (view, p) = promote(self.view, self.projection)
         engine = engine_of(view)
         height, width = size
-        x = engine.constant((np.arange(width) + 0.5) * 2 / width - 1, view)[None, :]
-        y = engine.constant(1 - (np.arange(height) + 0.5) * 2 / height, view)[:, None]
+        if points is None:
+            x = engine.constant((np.arange(width) + 0.5) * 2 / width - 1, view)[None, :]
+            y = engine.constant(1 - (np.arange(height) + 0.5) * 2 / height, view)[:, None]
+        else:
+            points = engine.constant(points, view)
+            x, y = points[:, 0] * (2 / width) - 1, 1 - points[:, 1] * (2 / height)
         # A camera-space point (X, Y, −z) is seen at NDC (x, y) where two linear equations hold; Cramer's rule solves
         # them for (X, Y) = start + z step.
         a, b = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1]

@@ -191,9 +191,9 @@ def keep_nearest_address() -> int:
 @loop
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
-    vertices, faces, owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
+    vertices, faces, owners, margins, width, height, points, triangle_ids, barycentrics, depths_out,
 ):  # fmt: skip
-    """Fill the fragment arrays for tiles of pixels, or for pieces of the list `cells`.
+    """Fill the fragment arrays for tiles of pixels, or for pieces of the list `points`.
 
     Args:
         first: first tile or piece, of TILE² pixels.
@@ -215,13 +215,13 @@ def cast(
         margins: (T,), see `Covers`.
         width: the image's width.
         height: the image's height.
-        cells: (M,) int32, flat indices of the pixels to cast rays through, −1 for none; empty for all H · W pixels.
+        points: (M, 2) x and y of the positions to cast rays through, NaN for none; empty for all H · W pixels' centres.
         triangle_ids: (K, M or H · W) to fill.
         barycentrics: (K, M or H · W, 2) to fill.
         depths_out: (K, M or H · W) to fill.
     """
     layers = len(triangle_ids)
-    at, columns, lines = np.empty((3, TILE * TILE), np.int64)
+    at, (xs, ys) = np.empty(TILE * TILE, np.int64), np.empty((2, TILE * TILE))
     across = (width + TILE - 1) // TILE
     state, depths = np.empty(HEADER), np.empty(layers)
     ids, sure = np.empty(layers, np.int32), np.empty(layers, np.bool_)
@@ -249,12 +249,11 @@ def cast(
     state[KEEP], state[DEPTH_SLACK], state[REACH_SLACK] = keep, slack, REACH_SLACK_SHARE * radius
     state[NEAREST], state[FARTHEST], state[LEFT_OUT] = planes[2] + slack, planes[3] - slack, left_out
     for tile in range(first, last):
-        pixels = _pixels(tile, across, width, height, cells, at, columns, lines)
+        pixels = _pixels(tile, across, width, height, points, at, xs, ys)
         for p in range(pixels):
-            i, j = columns[p], lines[p]
-            state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, i + 0.5, j + 0.5
-            x, y = (i + 0.5) * 2 / width - 1, 1 - (j + 0.5) * 2 / height
-            if i >= 0 and _aim(ray_space, object_sphere, planes, x, y, ray, state):
+            state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, xs[p], ys[p]
+            x, y = xs[p] * 2 / width - 1, 1 - ys[p] * 2 / height
+            if not np.isnan(x) and _aim(ray_space, object_sphere, planes, x, y, ray, state):
                 ray_bits[9], ray_bits[10], ray_bits[11] = -1, 0, 0
                 ray_bits[17], ray_bits[18], ray_bits[19] = -1, -1, -1
                 _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
@@ -280,14 +279,14 @@ def cast(
         n = 0
         for k in range(layers):
             for p in range(pixels):
-                to, i, j = at[p], columns[p], lines[p]
+                to = at[p]
                 if triangle_ids[k, to] < 0:
                     barycentrics[k, to, 0] = barycentrics[k, to, 1] = depths_out[k, to] = 0
                     continue
                 to_corner(matrix, near_vertices, 3 * n, corners, 0)
                 to_corner(matrix, near_vertices, 3 * n + 1, corners, 1)
                 to_corner(matrix, near_vertices, 3 * n + 2, corners, 2)
-                ea, eb, ec, _ = edge_values(corners, 0, 1, 2, i + 0.5, j + 0.5)
+                ea, eb, ec, _ = edge_values(corners, 0, 1, 2, xs[p], ys[p])
                 a, b, c = ea / (ea + eb + ec), eb / (ea + eb + ec), ec / (ea + eb + ec)
                 barycentrics[k, to, 0], barycentrics[k, to, 1] = a, b
                 depths_out[k, to] = (
@@ -301,23 +300,20 @@ def cast(
 
 
 @compiled
-def _pixels(tile, across, width, height, cells, at, columns, lines):
-    """Fill in the pixels of a tile, or of a piece of `cells`: index of output, column (−1 for none), row.
+def _pixels(tile, across, width, height, points, at, xs, ys):
+    """Fill in the positions of a tile of pixels, or of a piece of `points`: index of output, x (NaN for none), y.
 
-    Returns the number of pixels, at most TILE².
+    Returns the number of positions, at most TILE².
     """
     count = 0
-    if len(cells) > 0:
-        for m in range(tile * TILE * TILE, min(len(cells), (tile + 1) * TILE * TILE)):
-            at[count], columns[count], lines[count] = m, -1, 0
-            if cells[m] >= 0:
-                columns[count], lines[count] = cells[m] % width, cells[m] // width
+    if len(points) > 0:
+        for m in range(tile * TILE * TILE, min(len(points), (tile + 1) * TILE * TILE)):
+            at[count], xs[count], ys[count] = m, points[m, 0], points[m, 1]
             count += 1
         return count
-    top, left = tile // across * TILE, tile % across * TILE
-    for j in range(top, min(height, top + TILE)):
-        for i in range(left, min(width, left + TILE)):
-            at[count], columns[count], lines[count] = j * width + i, i, j
+    for j in range(tile // across * TILE, min(height, tile // across * TILE + TILE)):
+        for i in range(tile % across * TILE, min(width, tile % across * TILE + TILE)):
+            at[count], xs[count], ys[count] = j * width + i, i + 0.5, j + 0.5
             count += 1
     return count
 

@@ -64,7 +64,7 @@ class Embree(TriangleSampler):
         if isinstance(scene, embreex_fallback.Scene):
             arguments = prepared.proxy, prepared.covers.owners, prepared.sphere, _planes(camera.projection)
             return scene.cast(*arguments, camera, size, layers, cull)
-        return _cast(prepared, camera, size, cull, np.empty(0, np.int32), (layers, *size))
+        return _cast(prepared, camera, size, cull, np.empty((0, 2)), (layers, *size))
 
     def rasterize_cells(
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
@@ -72,17 +72,26 @@ class Embree(TriangleSampler):
         """See `TriangleSampler.rasterize_cells`: a ray for each of `cells`; the fallback casts one for each pixel."""
         if isinstance(prepared.scene, embreex_fallback.Scene) or not cells.size:
             return super().rasterize_cells(prepared, camera, size, layers, cull, cells)
-        flat = np.ascontiguousarray(cells, np.int32).reshape(-1)
-        return _cast(prepared, camera, size, cull, flat, (layers, *cells.shape))
+        lines, columns = np.divmod(cells.reshape(-1), size[1])
+        points = np.where(cells.reshape(-1, 1) >= 0, np.column_stack([columns, lines]) + 0.5, np.nan)
+        return _cast(prepared, camera, size, cull, points, (layers, *cells.shape))
+
+    def rasterize_points(
+        self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
+    ) -> Fragments | None:
+        """See `TriangleSampler.rasterize_points`: a ray for each point; the fallback casts none."""
+        if isinstance(prepared.scene, embreex_fallback.Scene) or not len(points):
+            return None
+        return _cast(prepared, camera, size, cull, np.ascontiguousarray(points), (layers, 1, len(points)))
 
 
 def _cast(
-    prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, cells: np.ndarray, shape: tuple[int, ...]
+    prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, points: np.ndarray, shape: tuple[int, ...]
 ) -> Fragments:
-    """Fragments of `shape` (K, ·, ·) in `cells`, flat indices of pixels or −1; in all pixels if `cells` is empty."""
+    """Fragments of `shape` (K, ·, ·) at `points` (M, 2), none where NaN; at all pixels' centres if there are none."""
     scene: Any = prepared.scene
     (height, width), count = size, shape[1] * shape[2]
-    tiles = -(-len(cells) // TILE**2) if len(cells) else -(-height // TILE) * -(-width // TILE)
+    tiles = -(-len(points) // TILE**2) if len(points) else -(-height // TILE) * -(-width // TILE)
     flat = np.empty((shape[0], count), np.int32), np.empty((shape[0], count, 2), np.float32)
     arrays = *flat, np.empty((shape[0], count), np.float32)
     parallel(
@@ -104,7 +113,7 @@ def _cast(
         prepared.covers.margins,
         width,
         height,
-        cells,
+        points,
         *arrays,
     )
     ids, barycentrics, depth = arrays

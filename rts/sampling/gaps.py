@@ -1,0 +1,329 @@
+"""Breaks in gaps: the places between neighbouring centres where one front ends and another begins.
+
+The fronts at two neighbouring centres are one surface if a sheet of triangles leads from one to the other. Where they
+are not, the line between the centres is sampled where their sheets end, then halved until each break is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.sampling.sheets import Sheets
+
+FINE = 1e-4
+"""Length of the interval, in cells, in which a break is known to lie; then the sheets tell where exactly."""
+
+BESIDE = 0.05
+"""Distance beyond a break, in cells, up to which a sheet is followed to tell if it goes on behind the other."""
+
+SAME_DEPTH = 1e-5
+"""Share of the depth by which a sheet's depth may differ from that of a sample on it."""
+
+STEEP, RISE = 1.5, 0.1
+"""Where no triangles tell: two fronts may be two surfaces if their depths differ by more than so many times the least
+difference beside them, plus this share of a cell's width."""
+
+
+class Fronts(NamedTuple):
+    """The fronts at M points of the image. Host arrays.
+
+    Attributes:
+        part: (M,) int32, −1 where nothing is seen.
+        triangle: (M,) int32, −1 where nothing is seen, or where no triangle is known.
+        depth: (M,) float64, linear; 0 where nothing is seen.
+    """
+
+    part: np.ndarray
+    triangle: np.ndarray
+    depth: np.ndarray
+
+    def at(self, index: np.ndarray) -> Fronts:
+        """The fronts with some indices."""
+        return Fronts(*(x[index] for x in self))
+
+
+class Oracle(NamedTuple):
+    """A scene that can be sampled at any point.
+
+    Attributes:
+        fronts: points (M, 2) → their fronts.
+        sheets: the sheets of each part; None where no triangles tell.
+        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+    """
+
+    fronts: Callable[[np.ndarray], Fronts]
+    sheets: Sequence[Sheets | None]
+    width: np.ndarray
+
+    def walk(self, fronts: Fronts, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`Sheets.walk` of fronts, each on its part's sheets: (M,) each; NaN, NaN and −1 where no triangles tell."""
+        count = len(start)
+        reached, depth, triangle = np.full(count, np.nan), np.full(count, np.nan), np.full(count, -1, np.int32)
+        for part, sheets in enumerate(self.sheets):
+            own = np.flatnonzero((fronts.part == part) & (fronts.triangle >= 0))
+            if sheets is not None and len(own):
+                reached[own], depth[own], triangle[own] = sheets.walk(fronts.triangle[own], start[own], end[own])
+        return reached, depth, triangle
+
+    def planes(self, fronts: Fronts, points: np.ndarray) -> np.ndarray:
+        """(M, 3) depths of the fronts' planes at points, and slopes; NaN where no triangles tell."""
+        found = np.full((len(points), 3), np.nan)
+        for part, sheets in enumerate(self.sheets):
+            own = np.flatnonzero((fronts.part == part) & (fronts.triangle >= 0))
+            if sheets is not None and len(own):
+                found[own] = sheets.planes(fronts.triangle[own], points[own])
+        return found
+
+    def knows(self, fronts: Fronts) -> np.ndarray:
+        """(M,) True where triangles tell how a front goes on."""
+        has = np.array([sheets is not None for sheets in self.sheets])
+        return (fronts.part >= 0) & has[fronts.part] & (fronts.triangle >= 0)
+
+    def leads(self, a: Fronts, at: np.ndarray, b: Fronts, to: np.ndarray) -> np.ndarray:
+        """(M,) True where a sheet of triangles leads from the front `a` at one point to the front `b` at another."""
+        leads = np.zeros(len(at), bool)
+        same = np.flatnonzero((a.part == b.part) & self.knows(a) & (b.triangle >= 0))
+        one, other = a.at(same), b.at(same)
+        reached, depth, triangle = self.walk(one, at[same], to[same])
+        near = np.abs(depth - other.depth) <= SAME_DEPTH * other.depth
+        leads[same] = (reached == 1) & ((triangle == other.triangle) | near)
+        return leads
+
+
+class Breaks(NamedTuple):
+    """Breaks, in order of their gaps and along each. Host arrays; see `rts.contracts.records.Outlines`.
+
+    Attributes:
+        gap: (B, 3) int32.
+        place: (B, 2) float64.
+        near: (B,) int32.
+        slope: (B, 2, 2) float64.
+        ends: (B, 2) bool.
+        points: (B, 2, 2) float64, x and y of the last samples before and behind each break.
+        parts: (B, 2) int32, their parts, or −1.
+        joined: (2, H, W) bool: does each cell's front go on to the next one's, along x and along y?
+    """
+
+    gap: np.ndarray
+    place: np.ndarray
+    near: np.ndarray
+    slope: np.ndarray
+    ends: np.ndarray
+    points: np.ndarray
+    parts: np.ndarray
+    joined: np.ndarray
+
+
+class _Intervals(NamedTuple):
+    """Intervals of gaps whose ends are not on one surface: the gap's index, two places along it, and their fronts."""
+
+    gap: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    before: Fronts
+    behind: Fronts
+
+    def at(self, index: np.ndarray) -> _Intervals:
+        return _Intervals(self.gap[index], self.low[index], self.high[index], *(f.at(index) for f in self[3:]))
+
+
+class _Lines(NamedTuple):
+    """Gaps: centres (M, 2), and unit steps (M, 2) along rows or columns."""
+
+    start: np.ndarray
+    step: np.ndarray
+
+    def points(self, gap: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Points (N, 2) at places along gaps."""
+        return self.start[gap] + place[:, None] * self.step[gap]
+
+
+def find_breaks(fronts: Fronts, oracle: Oracle) -> Breaks:
+    """The breaks between the fronts at the centres of all cells, whose arrays are (H, W)."""
+    height, width = fronts.part.shape
+    found, lines = [], []
+    joined = np.zeros((2, height, width), bool)
+    for axis in (1, 0):
+        first = np.zeros((height, width), bool)
+        first[: height - (axis == 0), : width - (axis == 1)] = True
+        y, x = np.nonzero(first)
+        lines.append(np.column_stack([y, x, np.full(len(y), axis)]))
+    gap = np.concatenate(lines).astype(np.int32)
+    y, x, axis = gap.T
+    one, other = _flat(fronts, y, x), _flat(fronts, y + (axis == 0), x + (axis == 1))
+    seen = (one.part >= 0) | (other.part >= 0)
+    start, step = np.column_stack([x, y]) + 0.5, np.column_stack([axis == 1, axis == 0]).astype(float)
+    same = (one.part == other.part) & (one.part >= 0)
+    whole = np.zeros(len(gap), bool)
+    at = np.flatnonzero(same)
+    whole[at] = oracle.leads(one.at(at), start[at], other.at(at), (start + step)[at])
+    whole |= same & ~(oracle.knows(one) & oracle.knows(other)) & _smooth(fronts, oracle.width, y, x, axis)
+    chosen = np.flatnonzero(seen & ~whole)
+    gaps = _Lines(start[chosen], step[chosen])
+    found = _halved(_cut(gaps, one.at(chosen), other.at(chosen), oracle), gaps, oracle)
+    found = found.at(np.lexsort((found.low, found.gap)))
+    place, near, slope, kept = _classified(found, gaps, oracle)
+    found = found.at(kept)
+    number = found.gap
+    broken = np.zeros(len(gap), bool)
+    broken[chosen[number]] = True
+    joined[1 - axis, y, x] = same & ~broken
+    points = np.stack([gaps.points(number, found.low), gaps.points(number, found.high)], 1)
+    ends = np.stack([np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0], 1)
+    parts = np.stack([found.before.part, found.behind.part], 1)
+    return Breaks(
+        gap[chosen[number]], gaps.points(number, place[kept]), near[kept], slope[kept], ends, points, parts, joined
+    )
+
+
+def _flat(fronts: Fronts, y: np.ndarray, x: np.ndarray) -> Fronts:
+    return Fronts(*(table[y, x] for table in fronts))
+
+
+def _smooth(fronts: Fronts, width: np.ndarray, y: np.ndarray, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Do depths from cells to the next ones along an axis change about as beside? (M,) bool; see `STEEP`."""
+    depth = np.where(fronts.part >= 0, fronts.depth, np.nan)
+    steps = [np.abs(np.diff(depth, axis=0, append=np.nan)), np.abs(np.diff(depth, axis=1, append=np.nan))]
+    change = np.where(axis == 1, steps[1][y, x], steps[0][y, x])
+    h, w = depth.shape
+    after = np.where(axis == 1, steps[1][y, np.minimum(x + 1, w - 1)], steps[0][np.minimum(y + 1, h - 1), x])
+    before = np.where(axis == 1, steps[1][y, np.maximum(x - 1, 0)], steps[0][np.maximum(y - 1, 0), x])
+    beside = np.nan_to_num(np.fmin(before, after))
+    return change <= STEEP * beside + RISE * (width[0] + width[1] * fronts.depth[y, x])
+
+
+def _cut(gaps: _Lines, one: Fronts, other: Fronts, oracle: Oracle) -> _Intervals:
+    """Gaps cut where the sheets of either end come to an end, or their depths meet; intervals that are not joined."""
+    end, count = gaps.start + gaps.step, len(gaps.start)
+    ahead, ahead_depth, _ = oracle.walk(one, gaps.start, end)
+    back, back_depth, _ = oracle.walk(other, end, gaps.start)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        d0, d1 = back_depth - one.depth, other.depth - ahead_depth
+        meet = np.where((ahead == 1) & (back == 1), d0 / (d0 - d1), np.nan)
+    guesses = np.column_stack([ahead, 1 - back, meet])
+    guesses[~((guesses > 0) & (guesses < 1))] = np.nan
+    half = FINE * 0.4
+    places = np.concatenate([guesses - half, guesses + half, np.full((count, 1), 0.5)], axis=1)
+    places[np.isfinite(guesses).any(axis=1), -1] = np.nan
+    places = np.sort(np.clip(places, FINE / 8, 1 - FINE / 8), axis=1)
+    gap, column = np.nonzero(np.isfinite(places))
+    place = places[gap, column]
+    told = oracle.fronts(gaps.points(gap, place))
+    # All places along all gaps, with the centres before and after.
+    ids = np.concatenate([np.arange(count), gap, np.arange(count)])
+    along = np.concatenate([np.zeros(count), place, np.ones(count)])
+    every = Fronts(*(np.concatenate(x) for x in zip(one, told, other, strict=True)))
+    order = np.lexsort((along, ids))
+    ids, along, every = ids[order], along[order], every.at(order)
+    first = np.flatnonzero(ids[:-1] == ids[1:])
+    intervals = _Intervals(ids[first], along[first], along[first + 1], every.at(first), every.at(first + 1))
+    return intervals.at(np.flatnonzero(~_one_surface(intervals, gaps, oracle)))
+
+
+def _one_surface(found: _Intervals, gaps: _Lines, oracle: Oracle) -> np.ndarray:
+    """(M,) True for intervals whose ends lie on one sheet of triangles, or both see nothing.
+
+    Where no triangles tell, two samples of a part are on one surface if their depths differ by little.
+    """
+    a, b = found.before, found.behind
+    points = gaps.points(found.gap, found.low), gaps.points(found.gap, found.high)
+    unknown = (a.part == b.part) & (a.part >= 0) & ~(oracle.knows(a) & oracle.knows(b))
+    level = np.abs(a.depth - b.depth) <= RISE * (oracle.width[0] + oracle.width[1] * a.depth)
+    return ((a.part < 0) & (b.part < 0)) | (unknown & level) | oracle.leads(a, points[0], b, points[1])
+
+
+def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
+    """Intervals halved until they are `FINE`; a half whose ends are on one surface is dropped."""
+    finished = []
+    while True:
+        fine = found.high - found.low <= FINE
+        finished.append(found.at(np.flatnonzero(fine)))
+        found = found.at(np.flatnonzero(~fine))
+        if not len(found.gap):
+            break
+        middle = (found.low + found.high) / 2
+        told = oracle.fronts(gaps.points(found.gap, middle))
+        halves = [
+            _Intervals(found.gap, found.low, middle, found.before, told),
+            _Intervals(found.gap, middle, found.high, told, found.behind),
+        ]
+        drop = [_one_surface(half, gaps, oracle) for half in halves]
+        # Where no triangles tell, the half in which the depth changes more has the break.
+        unknown = (found.before.part == told.part) & (told.part == found.behind.part) & (told.part >= 0)
+        unknown &= ~(oracle.knows(found.before) & oracle.knows(found.behind) & oracle.knows(told))
+        changes = [np.abs(half.before.depth - half.behind.depth) for half in halves]
+        drop[0] = np.where(unknown, changes[0] < changes[1], drop[0])
+        drop[1] = np.where(unknown, changes[1] <= changes[0], drop[1])
+        parts = [half.at(np.flatnonzero(~d)) for half, d in zip(halves, drop, strict=True)]
+        found = _Intervals(
+            *(np.concatenate([p[i] for p in parts]) for i in range(3)),
+            *(Fronts(*(np.concatenate(x) for x in zip(parts[0][i], parts[1][i], strict=True))) for i in (3, 4)),
+        )
+    return _Intervals(
+        *(np.concatenate([p[i] for p in finished]) for i in range(3)),
+        *(Fronts(*(np.concatenate(x) for x in zip(*(p[i] for p in finished), strict=True))) for i in (3, 4)),
+    )
+
+
+def _classified(
+    found: _Intervals, gaps: _Lines, oracle: Oracle
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Places (M,) along gaps, `near` (M,), `slope` (M, 2, 2), and the indices of intervals that hold a break."""
+    a, b, step = found.before, found.behind, gaps.step[found.gap]
+    low, high = gaps.points(found.gap, found.low), gaps.points(found.gap, found.high)
+    middle, length = (found.low + found.high) / 2, found.high - found.low
+    at = gaps.points(found.gap, middle)
+    planes = np.stack([oracle.planes(a, at), oracle.planes(b, at)], 1)
+    slopes, known = planes[..., 1:], np.isfinite(planes).all(axis=(1, 2))
+    missing = np.flatnonzero((a.part >= 0) & (b.part >= 0) & ~known)
+    width = oracle.width[0] + oracle.width[1] * np.maximum(a.depth, b.depth)
+    depth = np.where(np.isfinite(planes[..., 0]), planes[..., 0], np.stack([a.depth, b.depth], 1))
+    apart = depth[:, 1] - depth[:, 0]
+    rise = ((slopes[:, 1] - slopes[:, 0]) * step).sum(-1)  # Of the difference of depths along the gap.
+    both = (a.part >= 0) & (b.part >= 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        meets = both & (np.abs(apart) <= np.abs(np.nan_to_num(rise)) * length + SAME_DEPTH * 0.1 * depth.max(axis=1))
+        meets[missing] |= np.abs(apart[missing]) <= 10 * FINE * width[missing]
+        solved = middle - apart / rise
+    # How far do the sheets go on behind one another?
+    ahead, _, _ = oracle.walk(a, low, high + BESIDE * step)
+    back, _, _ = oracle.walk(b, high, low - BESIDE * step)
+    total = length + BESIDE
+    goes_on = ~(ahead * total < length + BESIDE / 2), ~(back * total < length + BESIDE / 2)
+    different = a.part != b.part
+    told = known | different
+    crosses = meets & goes_on[0] & goes_on[1] & told
+    seam = meets & ~different & (~(goes_on[0] | goes_on[1]) | ~told)
+    near = np.where(~both, np.where(a.part >= 0, 0, 1), np.where(apart >= 0, 0, 1))
+    near = np.where(meets & goes_on[0] & ~goes_on[1], 1, np.where(meets & ~goes_on[0] & goes_on[1], 0, near))
+    if len(missing) and crosses[missing].any():
+        own = missing[crosses[missing]]
+        slopes[own] = _sampled_slopes(found.at(own), gaps, oracle)
+        rise[own] = ((slopes[own, 1] - slopes[own, 0]) * step[own]).sum(-1)
+    flat = ~(np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1) > 1e-4 * width)
+    crosses &= np.isfinite(slopes).all(axis=(1, 2)) & ~flat
+    near = np.where(crosses, 2, near).astype(np.int32)
+    exact_a, exact_b = found.low + ahead * total, found.high - back * total
+    place = np.where(near == 0, exact_a, np.where(near == 1, exact_b, np.where(known, solved, middle)))
+    place = np.where(np.isfinite(place), np.clip(place, found.low, found.high), middle)
+    slope = np.where(crosses[:, None, None], slopes, 0.0)
+    return place, near, slope, np.flatnonzero(~seam)
+
+
+def _sampled_slopes(found: _Intervals, gaps: _Lines, oracle: Oracle) -> np.ndarray:
+    """Slopes of depth (M, 2, 2) on both sides of intervals, by samples on each side; NaN where there are none."""
+    slopes = np.full((len(found.gap), 2, 2), np.nan)
+    for side, (fronts, place, way) in enumerate(((found.before, found.low, -1), (found.behind, found.high, 1))):
+        at, step = gaps.points(found.gap, place), gaps.step[found.gap]
+        inward, across = way * BESIDE * step, BESIDE * step[:, ::-1]
+        told = [oracle.fronts(at + inward), oracle.fronts(at + inward + across), oracle.fronts(at + inward - across)]
+        same = [t.part == fronts.part for t in told]
+        along = np.where(same[0], (told[0].depth - fronts.depth) / (way * BESIDE), np.nan)
+        both = np.where(same[1] & same[2], (told[1].depth - told[2].depth) / (2 * BESIDE), np.nan)
+        one = np.where(same[1], told[1].depth - told[0].depth, told[0].depth - told[2].depth) / BESIDE
+        beside = np.where(np.isfinite(both), both, np.where(same[0] & (same[1] | same[2]), one, np.nan))
+        slopes[:, side] = along[:, None] * step + beside[:, None] * step[:, ::-1]
+    return slopes

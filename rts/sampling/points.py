@@ -1,0 +1,53 @@
+"""Triangles at single points of the image, for samplers that rasterize whole images alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.contracts.records import Fragments, Proxy
+from rts.scene.camera import Camera
+
+
+def at_points(
+    proxy: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
+) -> Fragments:
+    """The nearest triangles at points of the image: each triangle against the points in its bounding box.
+
+    Args:
+        proxy: the triangles.
+        camera: NumPy float64 matrices; world is the proxy's local space.
+        size: (height, width) of the grid of cells.
+        layers: K.
+        cull: as in `TriangleSampler.rasterize`.
+        points: (M, 2) float64, x and y in cells from the upper left corner; those outside of the grid meet nothing.
+
+    Returns:
+        Fragments (K, 1, M).
+    """
+    from rts.sampling import sheets_loops
+
+    line = np.floor(points[:, 1])
+    line = np.where((line >= 0) & (line < size[0]), line, size[0]).astype(np.int64)
+    order = np.lexsort((points[:, 0], line))
+    begins = np.searchsorted(line[order], np.arange(size[0] + 1))
+    shape, p = (layers, len(points)), camera.projection
+    ids, weights, depth = np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.full(shape, np.inf)
+    planes = np.stack([p[3] + p[2], p[3] - p[2]]) @ camera.view
+    arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size), planes
+    faces = np.ascontiguousarray(proxy.faces, np.int32)
+    vertices = np.ascontiguousarray(proxy.vertices, np.float32)
+    sheets_loops.hits(*arguments, _facing(camera, cull), vertices, faces, ids, weights, depth)
+    depth = np.where(ids >= 0, depth, 0).astype(np.float32)
+    return Fragments(ids[:, None], weights[:, None], depth[:, None])
+
+
+def pixel_rows(camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """`Camera.pixel_rows` of host matrices, float64."""
+    return np.ascontiguousarray(camera.pixel_rows(size), np.float64)
+
+
+def _facing(camera: Camera, cull: str) -> float:
+    """Sign of the determinant on screen of triangles to keep; 0 for both. A mirrored view or image reverses it."""
+    p = camera.projection
+    winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
+    return float(winding) * {"back": -1.0, "front": 1.0, "none": 0.0}[cull]

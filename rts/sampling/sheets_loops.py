@@ -1,0 +1,231 @@
+"""Sheets of triangles in the image: walks from triangle to triangle along a line, depths, hits of single points. Compiled.
+
+A corner is (X, Y, w, depth), seen at the pixel (X / w, Y / w). The edge function of two corners is their cross product
+in (X, Y, w), linear in the pixel's position. So no triangle needs clipping, and neighbours evaluate opposite numbers on
+their edge. All of it is float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+
+STEPS = 4096
+"""The most triangles of one walk."""
+
+
+@loop
+def corners_of(t, rows, vertices, faces, corners):
+    """Fill `corners` (3, 4) of a triangle; `rows` (4, 4) is `Camera.pixel_rows`. Returns the sign of its determinant."""
+    for c in range(3):
+        v = faces[t, c]
+        x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
+        for r in range(4):
+            corners[c, r] = rows[r, 0] * x + rows[r, 1] * y + rows[r, 2] * z + rows[r, 3]
+    (a, b, c), d = (corners[0], corners[1], corners[2]), 0.0
+    d = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    return np.sign(d)
+
+
+@compiled
+def _edge(corners, k, sign):
+    """Coefficients (x, y, 1) of the edge function opposite corner `k`, positive inside."""
+    i, j = (k + 1) % 3, (k + 2) % 3
+    ax, ay, aw = corners[i, 0], corners[i, 1], corners[i, 2]
+    bx, by, bw = corners[j, 0], corners[j, 1], corners[j, 2]
+    return sign * (ay * bw - aw * by), sign * (aw * bx - ax * bw), sign * (ax * by - ay * bx)
+
+
+@compiled
+def _depth(corners, sign, x, y):
+    """Depth of a triangle's plane at a position, and its slopes along x and y, a pixel."""
+    total, total_x, total_y, deep, deep_x, deep_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        ex, ey, e = _edge(corners, k, sign)
+        value, z = ex * x + ey * y + e, corners[k, 3]
+        total, total_x, total_y = total + value, total_x + ex, total_y + ey
+        deep, deep_x, deep_y = deep + value * z, deep_x + ex * z, deep_y + ey * z
+    z = deep / total
+    return z, (deep_x - z * total_x) / total, (deep_y - z * total_y) / total
+
+
+@loop
+def neighbours(faces, order):
+    """(T, 3) int32: the triangle beyond the edge opposite each corner; −1 where none or several share it.
+
+    `order` (3 T,) sorts the edges (3 t + corner) by their ends.
+    """
+    found = np.full((len(faces), 3), -1, np.int32)
+    n = 0
+    while n < len(order):
+        t, c = order[n] // 3, order[n] % 3
+        i, j = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
+        m = n + 1
+        while m < len(order):
+            s, d = order[m] // 3, order[m] % 3
+            k, h = faces[s, (d + 1) % 3], faces[s, (d + 2) % 3]
+            if min(k, h) != min(i, j) or max(k, h) != max(i, j):
+                break
+            m += 1
+        if m == n + 2:
+            s, d = order[n + 1] // 3, order[n + 1] % 3
+            found[t, c], found[s, d] = s, t
+        n = m
+    return found
+
+
+@loop
+def walk(first, last, triangles, start, end, rows, vertices, faces, beyond, reached, depths, final):
+    """Walk from triangle to triangle along lines in the image, until the sheet ends, turns away, or the line ends.
+
+    Args:
+        first: the first line.
+        last: the line after the last.
+        triangles: (M,) int32, the triangle that each line starts on; −1 for none.
+        start: (M, 2) float64, x and y of the starts.
+        end: (M, 2) float64, of the ends.
+        rows: (4, 4), see `corners_of`.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3) of the proxy.
+        beyond: (T, 3), the result of `neighbours`.
+        reached: (M,) to fill: the share of the line that lies on the sheet; 1 if the walk reached its end.
+        depths: (M,) to fill: the depth of the last triangle's plane where the walk stops.
+        final: (M,) to fill: the last triangle.
+    """
+    corners, other = np.empty((3, 4)), np.empty((3, 4))
+    for m in range(first, last):
+        t, reached[m], depths[m], final[m] = triangles[m], 0.0, 0.0, -1
+        if t < 0:
+            continue
+        x, y = start[m, 0], start[m, 1]
+        dx, dy = end[m, 0] - x, end[m, 1] - y
+        sign, at, came = corners_of(t, rows, vertices, faces, corners), 0.0, -1
+        for _ in range(STEPS):
+            best, edge = np.inf, -1
+            for k in range(3):
+                if k == came:
+                    continue
+                ex, ey, e = _edge(corners, k, sign)
+                slope = ex * dx + ey * dy
+                if slope < 0:
+                    leave = -(ex * x + ey * y + e) / slope
+                    if leave < best:
+                        best, edge = leave, k
+            if best >= 1:
+                at = 1.0
+                break
+            at = max(at, best)
+            s = beyond[t, edge]
+            if s < 0:
+                break
+            i, j = faces[t, (edge + 1) % 3], faces[t, (edge + 2) % 3]
+            turned, back = corners_of(s, rows, vertices, faces, other), -1
+            for k in range(3):
+                h, g = faces[s, (k + 1) % 3], faces[s, (k + 2) % 3]
+                if (h == i and g == j) or (h == j and g == i):
+                    back = k
+            ex, ey, e = _edge(other, back, turned)
+            if not ex * dx + ey * dy > 0:
+                break
+            t, sign, came = s, turned, back
+            corners, other = other, corners
+        reached[m], final[m] = min(at, 1.0), t
+        depths[m] = _depth(corners, sign, x + at * dx, y + at * dy)[0]
+
+
+@loop
+def planes(first, last, triangles, points, rows, vertices, faces, found):
+    """Fill `found` (M, 3): depth of triangles' planes at points, and its slopes along x and y; NaN without triangle."""
+    corners = np.empty((3, 4))
+    for m in range(first, last):
+        if triangles[m] < 0:
+            found[m] = np.nan
+            continue
+        sign = corners_of(triangles[m], rows, vertices, faces, corners)
+        found[m, 0], found[m, 1], found[m, 2] = _depth(corners, sign, points[m, 0], points[m, 1])
+
+
+@loop
+def hits(points, begins, order, rows, clip, keep, vertices, faces, ids, weights, depths):
+    """The K nearest triangles at points of the image, by depth, then by index.
+
+    Args:
+        points: (M, 2) float64, x and y; those of one line of pixels follow one another, by x.
+        begins: (H + 1,) where the points of each line of pixels begin.
+        order: (M,) the places of the points in the results.
+        rows: (4, 4), see `corners_of`.
+        clip: (2, 4) near and far plane, positive on what is seen.
+        keep: sign of the determinants of triangles to keep; 0 keeps both.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3) of the proxy.
+        ids: (K, M) int32, filled with −1.
+        weights: (K, M, 2) float32 to fill with the first two barycentrics.
+        depths: (K, M) float64, filled with infinity.
+    """
+    layers, height, corners = len(ids), len(begins) - 1, np.empty((3, 4))
+    for t in range(len(faces)):
+        sign = corners_of(t, rows, vertices, faces, corners)
+        if sign == 0 or sign * keep < 0:
+            continue
+        low, high, left, right, behind = np.inf, -np.inf, np.inf, -np.inf, False
+        for c in range(3):
+            w = corners[c, 2]
+            if not w > 0:
+                behind = True
+                continue
+            low, high = min(low, corners[c, 1] / w), max(high, corners[c, 1] / w)
+            left, right = min(left, corners[c, 0] / w), max(right, corners[c, 0] / w)
+        if behind:
+            low, high, left, right = -np.inf, np.inf, -np.inf, np.inf
+        if not (high >= 0 and low <= height):
+            continue
+        top, bottom = int(max(low, 0.0)), int(min(high, height - 1.0))
+        for line in range(top, bottom + 1):
+            a, b = begins[line], begins[line + 1]
+            if a == b:
+                continue
+            a += np.searchsorted(points[a:b, 0], left)
+            for n in range(a, b):
+                x, y = points[n, 0], points[n, 1]
+                if x > right:
+                    break
+                inside, total, deep, near, far, wa, wb = True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for k in range(3):
+                    ex, ey, e = _edge(corners, k, sign)
+                    value = ex * x + ey * y + e
+                    # Of two triangles on one edge, the one that lies right of it, or below, has the points on it.
+                    inside &= value > 0 or (value == 0 and (ex > 0 or (ex == 0 and ey > 0)))
+                    total += value
+                    if k == 0:
+                        wa = value
+                    elif k == 1:
+                        wb = value
+                if not inside or not total > 0:
+                    continue
+                wa, wb = wa / total, wb / total
+                wc = 1 - wa - wb
+                z = wa * corners[0, 3] + wb * corners[1, 3] + wc * corners[2, 3]
+                if planes_hide(t, clip, vertices, faces, wa, wb, wc):
+                    continue
+                m = order[n]
+                k = layers - 1
+                if not (z < depths[k, m]):
+                    continue
+                while k > 0 and (z < depths[k - 1, m]):
+                    ids[k, m], depths[k, m], weights[k, m] = ids[k - 1, m], depths[k - 1, m], weights[k - 1, m]
+                    k -= 1
+                ids[k, m], depths[k, m], weights[k, m, 0], weights[k, m, 1] = t, z, wa, wb
+
+
+@compiled
+def planes_hide(t, clip, vertices, faces, wa, wb, wc):
+    """True if a point of a triangle, by its barycentrics, is before the near or beyond the far plane."""
+    a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+    for p in range(2):
+        value = clip[p, 3]
+        for r in range(3):
+            value += clip[p, r] * (wa * vertices[a, r] + wb * vertices[b, r] + wc * vertices[c, r])
+        if value < 0:
+            return True
+    return False
