@@ -1,6 +1,7 @@
 """Errors that the library raises on purpose, and its kinds of warnings; a public module, as `rts.errors`.
 
-Each message says what was given, what was expected, and what to do next. A warning names a defect of an image that was
+Each message says what was given, what was expected, and what to do next, in one line: line breaks and other characters
+that no terminal shows, as names of files may have them, are escaped. A warning names a defect of an image that was
 rendered nevertheless, or a likely mistake in the input.
 """
 
@@ -12,6 +13,9 @@ import warnings
 
 class RtsError(Exception):
     """Base class of all errors of this library."""
+
+    def __init__(self, *args: object):
+        super().__init__(*(in_one_line(x) if isinstance(x, str) else x for x in args))
 
 
 class InputError(RtsError, ValueError):
@@ -59,11 +63,16 @@ class FileWarning(RtsWarning):
 
 
 def warn(message: str, category: type[RtsWarning]) -> None:
-    """Warn, and name the line outside of the library that called it."""
+    """Warn, in one line, and name the line outside of the library that called it."""
     level, frame = 1, sys._getframe(0)
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OWN_PACKAGES:
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, category, stacklevel=level)
+    warnings.warn(in_one_line(message), category, stacklevel=level)
+
+
+def in_one_line(text: str) -> str:
+    """The text with line breaks, control characters and halves of surrogate pairs as Python's literals write them."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 OWN_PACKAGES = ("rts", "rts_backends", "rts_compare", "rts_surfaces")

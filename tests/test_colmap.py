@@ -1,6 +1,7 @@
 """Posed images of COLMAP's models, and cameras of views saved."""
 
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -138,6 +139,13 @@ def test_binary_tables_of_any_other_length_are_refused(tmp_path, table):
         ("images", "0.1 -0.2 4.0", "nan -0.2 4.0", "expected a quaternion and a position"),
         ("points3D", "0.5 20 3", "0.5 20", "is not POINT3D_ID X Y Z"),
         ("points3D", "0.1 0.3", "0.1 x", "is not POINT3D_ID X Y Z"),
+        ("points3D", "20 3", "99999999999999999999 3", "is not POINT3D_ID X Y Z"),
+        ("points3D", "0.1 0.3", "1e300 0.3", "point 8 is at [1e+300, 0.3, 0.02]; expected numbers up to 1e+18"),
+        ("points3D", "15 0.2", "8 0.2", "point 8 is there twice"),
+        ("cameras", "8 OPENCV", "3 OPENCV", "camera 3 is there twice; expected each number once"),
+        ("images", "19 0", "20 0", "image 20 is there twice"),
+        ("images", "cam/IMG 01.png", "cam/IMG 00.png", "image 20 is of the picture 'cam/IMG 00.png', as image 19 is"),
+        ("images", "0.1 -0.2 4.0", "1e300 -0.2 4.0", "expected a quaternion and a position"),
     ],
 )
 def test_wrong_tables_of_text_are_refused_in_one_line(tmp_path, table, old, new, message):
@@ -147,6 +155,18 @@ def test_wrong_tables_of_text_are_refused_in_one_line(tmp_path, table, old, new,
     assert old in text
     path.write_text(text.replace(old, new))
     refused(message, tmp_path, split="all")
+
+
+def test_numbers_that_are_there_twice_in_binary_tables_are_refused(tmp_path):
+    listed = data_set(tmp_path, count=3)
+    number, *rest = listed[0]
+    twice = [*listed, (number, *rest[:-2], "cam/other.png", [])]
+    binary_model(tmp_path / "sparse/0", CAMERAS, twice, POINTS)
+    refused(f"images.bin, image {number} is there twice", tmp_path)
+    binary_model(tmp_path / "sparse/0", CAMERAS, listed, POINTS)
+    path = tmp_path / "sparse/0/points3D.bin"
+    path.write_bytes(path.read_bytes().replace(struct.pack("<Q", 15), struct.pack("<Q", 8)))
+    refused("points3D.bin, point 8 is there twice", tmp_path)
 
 
 def test_wrong_data_sets_are_refused_in_one_line(tmp_path):

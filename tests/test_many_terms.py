@@ -1,5 +1,9 @@
 """Fits of residuals of many terms: batches, validation, optimiser objects, rates, checkpoints."""
 
+import json
+import pickle
+import traceback
+
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, quick, to_numpy
@@ -307,6 +311,84 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InputError, match="is no checkpoint of rts.fit"):
             rts.fit(Lines(), start(), checkpoint=path)
+
+
+def changed_archive(path, **changes):
+    """Replace arrays of an archive."""
+    with np.load(path) as file:
+        known = {name: file[name] for name in file.files}
+    np.savez(path, **{**known, **changes})
+    path.with_name(f"{path.name}.npz").rename(path)
+    return known
+
+
+@pytest.mark.parametrize(
+    "changes, expected",
+    [
+        (
+            {"parameters.0": np.float32([0, np.nan, 0])},
+            "its parameters.0 is missing, of another shape or dtype, or not",
+        ),
+        ({"best.0": np.zeros(4, np.float32)}, "its best.0 is missing, of another shape"),
+        ({"best.0": np.zeros(3)}, "its best.0 is missing, of another shape or dtype"),
+        ({"about": np.zeros(3, np.uint8)}, "its entry about is no JSON of a fit"),
+        ({"method": np.frombuffer(pickle.dumps({}), np.uint8)}, "the state of its optimiser is damaged"),
+    ],
+)
+def test_a_checkpoint_with_a_fault_is_refused_in_one_line(tmp_path, changes, expected):
+    pytest.importorskip("torch")
+    path = tmp_path / "fit"
+    rts.fit(Lines(), start(), steps=3, checkpoint=path)
+    changed_archive(path, **changes)
+    with pytest.raises(InputError, match=expected) as caught:
+        rts.fit(Lines(), start(), steps=9, checkpoint=path)
+    shown = "".join(traceback.format_exception(caught.value))
+    assert "weights_only" not in shown and "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_of_more_stages_is_refused(tmp_path):
+    pytest.importorskip("torch")
+    path = tmp_path / "fit"
+    rts.fit(Lines(), start(), steps=3, checkpoint=path)
+    with np.load(path) as file:
+        about = json.loads(file["about"].tobytes())
+    about["stages"].append(about["run"])
+    changed_archive(path, about=np.frombuffer(json.dumps(about).encode(), np.uint8))
+    with pytest.raises(InputError, match="its stages are no list of the ends of fewer than 1"):
+        rts.fit(Lines(), start(), checkpoint=path)
+
+
+def test_the_state_of_an_optimiser_with_other_groups_is_refused(tmp_path):
+    torch = pytest.importorskip("torch")
+    p = start()
+    path = tmp_path / "fit.npz"
+    rts.fit(Lines(), p, method=torch.optim.Adam([p["p"]], lr=0.1), steps=3, checkpoint=path)
+    with pytest.raises(InputError, match="of another optimiser"):
+        rts.fit(Lines(), p, method=torch.optim.Adam([p["p"]], lr=0.1, amsgrad=True), steps=6, checkpoint=path)
+    rts.fit(Lines(), p, method=torch.optim.Adam([p["p"]], lr=0.2), steps=6, checkpoint=path)
+
+
+def test_a_fit_that_goes_astray_keeps_its_last_sound_state(tmp_path):
+    torch = pytest.importorskip("torch")
+    options = dict(learning_rate=1e38, method="sgd", steps=9, checkpoint_every=1)
+    fit = rts.fit(Lines(), start(), checkpoint=tmp_path / "fit.npz", **options)
+    assert "may have gone too far" in fit.reason
+    again = rts.fit(Lines(), start(), checkpoint=tmp_path / "fit.npz", **options)
+    assert (again.reason, again.history) == (fit.reason, fit.history)
+    # A number that nobody reads may be NaN.
+    unread = {"p": torch.zeros(3), "q": torch.tensor([float("nan")])}
+    whole = rts.fit(Lines(), unread, steps=9)
+    assert broken(6, tmp_path / "unread.npz", residuals=Lines(), parameters=unread, steps=9, checkpoint_every=3)
+    assert whole.history == rts.fit(Lines(), unread, steps=9, checkpoint=tmp_path / "unread.npz").history
+
+
+def test_a_checkpoint_that_cannot_be_read_is_one_line(tmp_path):
+    for name, expected in (("a" * 300, "expected a file in a folder"), ("\0", "expected a file in a folder")):
+        with pytest.raises(InputError, match=expected):
+            rts.fit(Lines(), start(), checkpoint=tmp_path / name)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(InputError, match="cannot be read|expected a file in a folder"):
+        rts.fit(Lines(), start(), checkpoint=tmp_path / "loop")
 
 
 def test_a_full_disk_leaves_the_last_checkpoint_and_the_fit_goes_on(tmp_path, monkeypatch):

@@ -193,11 +193,37 @@ def test_the_frame_of_nerf_is_about_the_mean_camera(tmp_path, data):
         ({"frames": [{"file_path": "train/r_0", "transform_matrix": [[math.nan] * 4] * 4}]}, "finite"),
         ({"frames": [{"file_path": "train/r_0", "transform_matrix": "eye"}]}, "the matrix is 'eye'"),
         ({"fl_x": 100.0}, "fl_x = 100.0"),
+        ({"fl_x": 10**400}, "fl_x = inf; expected a positive number"),
+        ({"fl_x": 5e-324, "camera_angle_x": None}, "fx = 4.94066e-324; expected a positive one, in pixels"),
+        ({"camera_angle_x": 5e-324}, "between 0 and π"),
+        ({"w": 5e-324}, "expected"),
+        ({"k1": 1e300}, "k1 = 1e+300; expected a finite one, up to 1e+09"),
+        ({"is_fisheye": "x"}, "frame 0 has is_fisheye = 'x'; expected true or false"),
+        ({"is_fisheye": 0}, "is_fisheye = 0"),
+        ({"frames": [{"file_path": "\ud800", "transform_matrix": pose().tolist()}]}, "no file can be called"),
+        ({"frames": [{"file_path": "a\nb", "transform_matrix": pose().tolist()}]}, r"nor a\nb.png"),
+        ({"frames": [{"file_path": "train/r_0", "transform_matrix": (1e300 * pose()).tolist()}]}, "up to 1e+18"),
     ],
 )
 def test_wrong_files_of_blender_are_refused_in_one_line(tmp_path, change, message):
     blender(tmp_path, **change)
     refused(message, tmp_path)
+
+
+def test_a_fisheye_is_told_by_its_flag_or_not_at_all(tmp_path):
+    blender(tmp_path)
+    tree = json.loads((tmp_path / "transforms_train.json").read_text())
+    for flag, is_fisheye in ((True, True), (False, False), (None, False)):
+        write(tmp_path, {**tree, "is_fisheye": flag})
+        assert (rts.load_views(tmp_path)[0].lens is not None) == is_fisheye
+
+
+def test_a_coefficient_that_is_next_to_nothing_bends_nothing(tmp_path):
+    images = []
+    for least in (0.0, 5e-324):
+        blender(tmp_path, camera_model="OPENCV", k1=-0.1, k3=least)
+        images.append([view.image for view in rts.load_views(tmp_path)])
+    np.testing.assert_array_equal(*images)
 
 
 def refused(message, *args, **options):

@@ -100,7 +100,7 @@ class Engine(Plugin):
 
         It keeps state, perhaps the parameters too: call it with the parameters that it returned last. To be kept in
         checkpoints, the function is an object with two more methods: `state() -> bytes`, and `restore(state,
-        parameters)`, which goes on from there.
+        parameters)`, which goes on from there, and raises an InputError for a state of another optimiser.
 
         Args:
             method: "adam", "sgd", or an optimiser object of the framework.
@@ -190,6 +190,14 @@ class Engine(Plugin):
     def padded(self, x: Array) -> bool:
         """True if packed arrays, which have a row for each sample, may have further rows that no cell refers to."""
         return False
+
+    def room(self, rows: int, x: Array) -> int:
+        """The number of rows to allot for `rows` rows that are computed from `x`, at least `rows`.
+
+        An engine that compiles eager operations anew for each shape rounds up, so that arrays whose lengths vary from
+        call to call, such as tables of meshes, have few shapes. The default returns `rows`.
+        """
+        return rows
 
     def fill_unused(self, x: Array, row: Array) -> Array:
         """Packed x (N, ·), with its first row in place of all rows behind the last that `row` (K, H, W) refers to.

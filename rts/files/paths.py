@@ -11,11 +11,12 @@ import errno
 import functools
 import os
 import struct
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
 from typing import Any
+
+import platformdirs
 
 from rts.errors import InputError
 
@@ -97,17 +98,19 @@ def inside(folder: Path, name: str, referrer: Path, start: Path | None = None) -
             file can have.
     """
     plain = name.replace("\\", "/")
-    absolute = plain.startswith("/") or PureWindowsPath(plain).drive or "\0" in plain
-    target = folder if absolute else ((start or referrer.parent) / plain).resolve()
-    if absolute or not target.is_relative_to(folder.resolve()):
-        raise InputError(
-            f"{referrer} refers to {name!r}, outside its own folder, which is refused; copy that file beside "
-            f"the model and name it without a path"
-        )
+    refused = InputError(
+        f"{referrer} refers to {name[:60]!r}, outside its own folder, which is refused; copy that file beside "
+        f"the model and name it without a path"
+    )
+    if plain.startswith("/") or PureWindowsPath(plain).drive:
+        raise refused
     try:
-        return as_path(target)
-    except InputError:
+        target = as_path((start or referrer.parent) / plain).resolve()
+    except (InputError, RuntimeError):  # Of links that lead to one another.
         raise InputError(f"{referrer} refers to {name[:60]!r}, which no file can be called; repair the file") from None
+    if not target.is_relative_to(folder.resolve()):
+        raise refused
+    return target
 
 
 def cache_folder() -> Path:
@@ -115,12 +118,8 @@ def cache_folder() -> Path:
 
     Later processes read them. Without a home folder, it is a folder of this process alone.
     """
-    try:
-        if sys.platform == "darwin":
-            return Path.home() / "Library" / "Caches" / "rts"
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rts"
-    except RuntimeError:  # There is no home.
-        return Path(own_folder().name)
+    folder = platformdirs.user_cache_path("rts", appauthor=False)
+    return folder if folder.is_absolute() else Path(own_folder().name)  # Without a home, "~" stays as it is.
 
 
 @functools.cache

@@ -170,7 +170,7 @@ def fit(
     file, state = None, None
     if checkpoint is not None:
         file = Checkpoint(checkpoint, checkpoint_every, parameters, engine, title, processes)
-        state = file.read()
+        state = file.read(len(stages))
     start, most = time.perf_counter(), int(steps or STEPS.get(title, STEPS["adam"]))
     runs: list[Run] = []
     for numbers in () if state is None else state.about["stages"]:

@@ -12,6 +12,7 @@ import numpy as np
 from rts.arrays.engines import Engine, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.errors import InputError
+from rts.fitting.checkpoint import arrays_in, is_like
 from rts.fitting.dependence import directions_in_words, refuse_independent
 from rts.fitting.losses import SQUARE, Loss
 from rts.fitting.parameter_names import named_leaves
@@ -115,11 +116,18 @@ class _Control:
         np.savez(file, vector=vector, **vars(self))
         return file.getvalue()
 
-    def unpacked(self, packed: bytes) -> np.ndarray:
-        """Set the control to the state in bytes of `packed`. Returns the vector (U,)."""
-        with np.load(io.BytesIO(packed)) as known:
-            self.__dict__.update({name: known[name].item() for name in vars(self)})
-            return known["vector"]
+    def unpacked(self, packed: bytes, like: np.ndarray) -> np.ndarray:
+        """Set the control to the state in bytes of `packed`. Returns the vector (U,).
+
+        Raises:
+            InputError: the bytes are no such state, or the vector is not like the other one.
+        """
+        known, own = arrays_in(packed) or {}, {"vector": like, **vars(self)}
+        sound = all(name in known and is_like(known[name], np.asarray(value)) for name, value in own.items())
+        if not sound or not (known["damping"] > 0 and known["growth"] > 0):
+            raise InputError("the state of its method is damaged")
+        self.__dict__.update({name: known[name].item() for name in vars(self)})
+        return known["vector"]
 
 
 def _split(x: np.ndarray, sizes: Sequence[int]) -> list[np.ndarray]:
@@ -178,7 +186,8 @@ def levenberg_marquardt(
 
     def restore(packed: bytes, _: Tree) -> None:
         nonlocal vector
-        vector = engine.namespace.astype(engine.constant(control.unpacked(packed), vector), vector.dtype, copy=False)
+        values = control.unpacked(packed, engine.to_numpy(vector))
+        vector = engine.namespace.astype(engine.constant(values, vector), vector.dtype, copy=False)
 
     going = True
     if saving.resumes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
@@ -15,6 +14,7 @@ from rts.arrays.trees import Tree
 from rts.errors import EngineError, InputError, RtsError
 from rts.fitting.interrupts import interrupts_held_back
 from rts.fitting.parameter_names import listed, one_line
+from rts.terminal import shows_bar
 
 Report = Callable[[int, Tree, float], Any]
 
@@ -148,6 +148,30 @@ class Run:
             raise original from error
 
 
+def fault_of(numbers: Any, count: int) -> str:
+    """The name of an entry of `Run.numbers` that is missing, or of another kind; "" if they are sound.
+
+    Args:
+        numbers: what a file holds in their place.
+        count: the number of arrays of the parameters.
+    """
+    if not isinstance(numbers, dict):
+        return "run"
+    history, mattered, validated = (numbers.get(name) for name in ("history", "mattered", "validated"))
+    sound = {
+        "history": isinstance(history, list) and all(type(x) is float for x in history),
+        "best_loss": type(numbers.get("best_loss")) is float,
+        "mattered": isinstance(mattered, list)
+        and len(mattered) in (0, count)
+        and all(type(x) is bool for x in mattered),
+        "validated": isinstance(validated, list)
+        and all(isinstance(x, list) and [type(y) for y in x] == [int, float] and x[0] >= 0 for x in validated),
+        "_last_gain": type(numbers.get("_last_gain")) is int and numbers["_last_gain"] >= 0,
+        "_reference": type(numbers.get("_reference")) is float,
+    }
+    return next((name for name, is_sound in sound.items() if not is_sound), "")
+
+
 LONGEST_REASON = 500
 TRACING = ("JAXTypeError", "JAXIndexError")
 """Bases of the errors of jax that say that a value is not known while a function is traced."""
@@ -195,7 +219,7 @@ def require(finite: bool, what: str, start: bool) -> None:
 @contextlib.contextmanager
 def progress_bar(wanted: bool | None, steps: int, method: str, run: Run) -> Iterator[None]:
     """A progress bar on standard error, if `wanted`; None for only on a terminal."""
-    if wanted is False or (wanted is None and not sys.stderr.isatty()):
+    if not shows_bar(wanted):
         yield
         return
     from rich.console import Console

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rts.arrays.trees import Tree
+from rts.errors import InputError
 from rts.fitting.checkpoint import Checkpoint, State
 from rts.fitting.run import Run
 
@@ -31,11 +32,18 @@ class Saving:
         return self._state is not None
 
     def resumed(self, parameters: Tree, restore: Callable[[bytes, Tree], None]) -> Tree:
-        """The parameters to go on from; the run and the method are set to the state, too."""
+        """The parameters to go on from; the run and the method are set to the state, too.
+
+        Raises:
+            InputError: the state is not one of the method.
+        """
         state = self._state
-        if state is None:
+        if state is None or self._checkpoint is None:
             return parameters
-        restore(state.method, state.parameters)
+        try:
+            restore(state.method, state.parameters)
+        except InputError as error:
+            raise self._checkpoint.refused(str(error)) from None
         self._run.go_on(state.about["run"], state.best)
         self._resumed = len(self._run.history)
         return state.parameters

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import optax
 
+from rts import InputError
 from rts.plugin_api.arrays import Tree, map_leaves
 
 
@@ -49,7 +50,18 @@ class Optimizer:
         return file.getvalue()
 
     def restore(self, state: bytes, parameters: Tree) -> None:
-        """Go on from a `state`; `parameters` are not read, since each step is given them."""
-        with np.load(io.BytesIO(state)) as known:
-            arrays = [jax.numpy.asarray(known[f"arr_{i}"]) for i in range(len(known.files))]
-        self._state = jax.tree.unflatten(jax.tree.structure(self._state), arrays)
+        """Go on from a `state`; `parameters` are not read, since each step is given them.
+
+        Raises:
+            InputError: the state is damaged, or of another transformation.
+        """
+        own = [*map(np.asarray, jax.tree.leaves(self._state))]
+        try:
+            with np.load(io.BytesIO(state), allow_pickle=False) as file:
+                known = [file[f"arr_{i}"] for i in range(len(file.files))]
+        except Exception:  # Of which damaged archives raise many kinds.
+            known = []
+        same = [(x.shape, x.dtype) for x in known] == [(x.shape, x.dtype) for x in own]
+        if not same or not all((np.isfinite(x) | ~np.isfinite(y)).all() for x, y in zip(known, own, strict=True)):
+            raise InputError("the state of its optimiser is damaged, or of another optimiser")
+        self._state = jax.tree.unflatten(jax.tree.structure(self._state), [*map(jax.numpy.asarray, known)])

@@ -17,6 +17,8 @@ from rts.files.views.poses import Pose, entries, fitted, rigid
 CONTRADICTION = 1e-3
 """Largest difference, in widths of the image, of two statements of a file about one focal length."""
 AXES = ("x", "w"), ("y", "h")
+LEAST_ANGLE = 1e-9
+"""The least field of view, radians: pixels per radian stay finite."""
 
 
 def blender(path: Path, tree: Mapping[str, Any], downscale: int) -> list[Pose]:
@@ -38,7 +40,7 @@ def _check_angle(place: str, lens: Mapping[str, Any]) -> None:
     """Refuse fields of view that are none; without one, focal lengths are needed, of the file or of its frames."""
     for axis, _ in AXES:
         angle: Any = lens.get(f"camera_angle_{axis}")
-        if angle is not None and not (is_real(angle) and 0 < angle < math.pi):
+        if angle is not None and not (is_real(angle) and LEAST_ANGLE < angle < math.pi):
             raise InputError(
                 f"{place} has a camera_angle_{axis} of {quoted(angle)}; expected the field of view in radians, "
                 "between 0 and π"
@@ -55,8 +57,8 @@ def _lens(place: str, frame: Mapping[str, Any], size: tuple[int, int]) -> tuple[
             kind = "positive number" if key in ("w", "h", "fl_x", "fl_y") else "number"
             raise InputError(f"{place} has {key} = {quoted(value)}; expected a {kind}")
     ratio = size[1] / size[0]
-    width = stated.get("w", stated.get("h", size[0]) * ratio)
-    height = stated.get("h", width / ratio)
+    width = float(stated.get("w", stated.get("h", size[0]) * ratio))
+    height = float(stated.get("h", width / ratio))
     fx = _focal(place, frame, "x", width)
     if fx is None:
         raise InputError(f"{place} lacks camera_angle_x and fl_x; expected the horizontal field of view in radians")
@@ -93,4 +95,7 @@ def _is_fisheye(place: str, frame: Mapping[str, Any]) -> bool:
     model = frame.get("camera_model")
     if model is not None:
         check_model(place, model)
-    return model == FISHEYE or frame.get("is_fisheye") is True
+    stated = frame.get("is_fisheye")
+    if stated is not None and not isinstance(stated, bool):
+        raise InputError(f"{place} has is_fisheye = {quoted(stated)}; expected true or false")
+    return model == FISHEYE or stated is True

@@ -6,17 +6,17 @@ of their keypoints is passed over: each point lists the images that see it.
 
 from __future__ import annotations
 
-import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.damaged_files import contents, lines_of, unreadable
+from rts.files.damaged_files import COUNT, contents, is_plain, lines_of, unreadable
 from rts.files.views.lenses import MODELS, Lens, check_model, lens_of
+from rts.files.views.poses import DIGITS, LARGEST
 
 IDS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -49,15 +49,13 @@ def read_cameras(path: Path) -> dict[int, tuple[Lens, tuple[int, int]]]:
     """Lens and size (height, width) of each camera, by its number.
 
     Raises:
-        InputError: the file is damaged, or a model is not followed.
+        InputError: the file is damaged, a number stands for two cameras, or a model is not followed.
     """
-    cameras = {}
+    cameras: dict[int, tuple[Lens, tuple[int, int]]] = {}
     for number, model, width, height, parameters in (_binary_cameras if _is_binary(path) else _text_cameras)(path):
         place = f"{path}, camera {number}"
-        lens = lens_of(place, model, parameters)
-        if not (0 < width < 2**31 and 0 < height < 2**31):
-            raise InputError(f"{place} has {width} × {height} pixels; expected positive numbers")
-        cameras[number] = lens, (height, width)
+        _refuse_repeated(place, number, cameras)
+        cameras[number] = lens_of(place, model, parameters), (height, width)
     return cameras
 
 
@@ -65,31 +63,53 @@ def read_entries(path: Path) -> list[Entry]:
     """The pictures, in the file's order.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is damaged, or a number or a name stands for two pictures.
     """
-    entries = []
+    entries: dict[int, Entry] = {}
+    names: dict[str, int] = {}
     for number, pose, camera, name in (_binary_images if _is_binary(path) else _text_images)(path):
-        quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
-        length = float(np.linalg.norm(quaternion))
-        if not (math.isfinite(length) and length > 1e-8 and np.isfinite(translation).all()):
-            raise InputError(f"{path}, image {number} has the pose {list(pose)}; expected a quaternion and a position")
-        entries.append(Entry(number, camera, name, _rotation(quaternion / length), translation))
-    return entries
+        place = f"{path}, image {number}"
+        _refuse_repeated(place, number, entries)
+        if name in names:
+            raise InputError(
+                f"{place} is of the picture {name[:60]!r}, as image {names[name]} is; expected one of them"
+            )
+        names[name] = number
+        known = np.array(pose)
+        length = float(np.linalg.norm(known[:4])) if (np.abs(known) <= LARGEST).all() else 0.0  # NaN is not.
+        if length <= 1e-8:
+            raise InputError(f"{place} has the pose {list(pose)}; expected a quaternion and a position")
+        entries[number] = Entry(number, camera, name, _rotation(known[:4] / length), known[4:])
+    return list(entries.values())
 
 
 def read_points(path: Path) -> Points:
     """The points, and the images that see them.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is damaged, or a number stands for two points.
     """
-    positions, seen = [], []
-    for position, images in (_binary_points if _is_binary(path) else _text_points)(path):
-        positions.append(position)
+    known: dict[int, tuple] = {}
+    seen = []
+    for number, position, images in (_binary_points if _is_binary(path) else _text_points)(path):
+        _refuse_repeated(f"{path}, point {number}", number, known)
+        known[number] = position
         seen.append(images)
+    positions = np.array(list(known.values()), np.float64).reshape(-1, 3)
+    wrong = np.flatnonzero(~(np.abs(positions) <= LARGEST).all(axis=1))
+    if len(wrong):
+        raise InputError(
+            f"{path}, point {list(known)[wrong[0]]} is at {positions[wrong[0]].tolist()}; expected numbers up to "
+            f"{LARGEST:g}"
+        )
     rows = np.repeat(np.arange(len(seen)), [len(images) for images in seen])
     images = np.concatenate(seen) if seen else np.zeros(0, np.int64)
-    return Points(np.array(positions, np.float64).reshape(-1, 3), images, rows)
+    return Points(positions, images, rows)
+
+
+def _refuse_repeated(place: str, number: int, known: Container[int]) -> None:
+    if number in known:
+        raise InputError(f"{place} is there twice; expected each number once: export the model again")
 
 
 def _is_binary(path: Path) -> bool:
@@ -157,12 +177,12 @@ def _binary_images(path: Path) -> Iterator[tuple[int, tuple, int, str]]:
         yield number, tuple(pose), camera, name
 
 
-def _binary_points(path: Path) -> Iterator[tuple[tuple, np.ndarray]]:
+def _binary_points(path: Path) -> Iterator[tuple[int, tuple, np.ndarray]]:
     data = _Bytes(path)
     for _ in data.entries():
-        _, *position, _, _, _, _, count = data.take("Q3d3BdQ")
+        number, *position, _, _, _, _, count = data.take("Q3d3BdQ")
         seen = np.frombuffer(data.skip(SEEN * count), "<u4")
-        yield tuple(position), seen[::2].astype(np.int64)
+        yield number, tuple(position), seen[::2].astype(np.int64)
 
 
 # --------------------------------------------------------------------------------------------------------------- text
@@ -175,6 +195,21 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
+def _number(word: str, bits: int = 32) -> int:
+    """The number of a camera, an image or a point; a ValueError where COLMAP can have none of that kind."""
+    number = int(word) if COUNT.fullmatch(word) and len(word) <= DIGITS + 2 else -1
+    if not 0 <= number < 2**bits - 1:  # The last one is COLMAP's for none.
+        raise ValueError(f"{word} is no number of {bits} bits")
+    return number
+
+
+def _real(word: str) -> float:
+    """A number in ASCII; else a ValueError. Python's own rules take underscores, and digits of any script."""
+    if "_" in word or not is_plain(word):
+        raise ValueError(f"{word} is no number")
+    return float(word)
+
+
 def _damaged(path: Path, number: int, expected: str) -> InputError:
     return unreadable(path, "COLMAP's text", f"line {number} is not {expected}")
 
@@ -183,7 +218,8 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]
     for number, line in _lines(path):
         words = line.split()
         try:
-            yield int(words[0]), words[1], int(words[2]), int(words[3]), [float(word) for word in words[4:]]
+            size = _number(words[2], 64), _number(words[3], 64)
+            yield _number(words[0]), words[1], *size, [_real(word) for word in words[4:]]
         except (ValueError, IndexError):
             raise _damaged(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from None
 
@@ -195,8 +231,8 @@ def _text_images(path: Path) -> Iterator[tuple[int, tuple, int, str]]:
             continue
         words = line.split(maxsplit=9)
         try:
-            pose, name = tuple(float(word) for word in words[1:8]), words[9].strip()
-            entry = int(words[0]), pose, int(words[8]), name
+            pose, name = tuple(_real(word) for word in words[1:8]), words[9].strip()
+            entry = _number(words[0]), pose, _number(words[8]), name
         except (ValueError, IndexError):
             raise _damaged(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
         following = next(lines, None)  # Of keypoints, and empty if there are none.
@@ -205,13 +241,14 @@ def _text_images(path: Path) -> Iterator[tuple[int, tuple, int, str]]:
         yield entry
 
 
-def _text_points(path: Path) -> Iterator[tuple[tuple, np.ndarray]]:
+def _text_points(path: Path) -> Iterator[tuple[int, tuple, np.ndarray]]:
     for number, line in _lines(path):
         words = line.split()
         try:
-            position, seen = tuple(float(word) for word in words[1:4]), [int(word) for word in words[8::2]]
+            point, position = _number(words[0], 64), tuple(_real(word) for word in words[1:4])
+            seen = [_number(word) for word in words[8::2]]
             if len(words) < 8 or len(words) % 2:
                 raise ValueError
         except ValueError:
             raise _damaged(path, number, "POINT3D_ID X Y Z R G B ERROR and pairs of a track") from None
-        yield position, np.array(seen, np.int64)
+        yield point, position, np.array(seen, np.int64)

@@ -26,6 +26,8 @@ MODELS = {
 FISHEYE = "OPENCV_FISHEYE"
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion, in OpenCV's order."""
+LEAST_FOCAL, LARGEST = 1e-6, 1e9
+"""Least focal length, pixels, and the largest parameter of a lens."""
 BAND = 32
 """Rows of a picture that are undistorted together: their positions stay in caches."""
 
@@ -143,13 +145,12 @@ def check_model(place: str, model: object) -> None:
 
 
 def checked_lens(place: str, lens: Lens) -> Lens:
-    """The lens, refused where its numbers are not finite, or a focal length is not positive."""
-    numbers = {name: getattr(lens, name) for name in ("fx", "fy", "cx", "cy", *COEFFICIENTS)}
-    for name, value in numbers.items():
-        if not math.isfinite(value) or (name in ("fx", "fy") and value <= 0):
-            raise InputError(
-                f"{place} has {name} = {value:g}; expected a {'positive' if name[0] == 'f' else 'finite'} one"
-            )
+    """The lens, refused where its numbers are too large or none, or a focal length is not positive."""
+    for name in ("fx", "fy", "cx", "cy", *COEFFICIENTS):
+        value, focal = getattr(lens, name), name in ("fx", "fy")
+        if not (LEAST_FOCAL if focal else -LARGEST) <= value <= LARGEST:
+            kind = "positive one, in pixels" if focal else "finite one"
+            raise InputError(f"{place} has {name} = {value:g}; expected a {kind}, up to {LARGEST:g}")
     return lens
 
 
@@ -182,6 +183,7 @@ def undistorted(picture: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray
 
 def _first_root(polynomial: Polynomial) -> float:
     """The smallest positive root of a polynomial that is 1 at 0; infinity without one."""
-    roots = polynomial.trim().roots()
-    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return float(real.min(initial=math.inf))
+    # Inverses of roots: the coefficient that NumPy divides by is 1, where the last one may be tiny.
+    inverses = Polynomial(polynomial.coef[::-1]).roots()
+    real = inverses.real[(np.abs(inverses.imag) <= 1e-9 * np.abs(inverses)) & (inverses.real > 0)]
+    return 1 / float(real.max()) if len(real) else math.inf

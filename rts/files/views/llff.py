@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.views.lenses import Lens
+from rts.files.damaged_files import contents
+from rts.files.views.lenses import Lens, checked_lens
 from rts.files.views.pictures import EXTENSIONS, picture_folder, picture_size, with_mask
-from rts.files.views.poses import Pose, fitted, rigid
+from rts.files.views.poses import LARGEST, Pose, fitted, rigid
 
 SCALE_OF_NEAREST = 0.75
 """In NeRF's frame of LLFF scenes the nearest bound is 1 / 0.75."""
@@ -33,13 +35,13 @@ def llff(path: Path, downscale: int, frame: str) -> list[Pose]:
         place = f"{path}, row {i}"
         down, right, back, position, (height, width, focal) = matrix.T
         c2w = rigid(place, np.stack([right, -down, back, position], axis=1), (3, 4))
-        if min(height, width, focal) <= 0 or not 0 < near < far:
+        if min(height, width, focal) <= 0 or not 1 / LARGEST < near < far < LARGEST:
             raise InputError(
                 f"{place} has height {height:g}, width {width:g}, focal length {focal:g}, bounds {near:g} and {far:g}; "
                 "expected positive numbers, bounds in order"
             )
         size = picture_size(picture)
-        fitted(place, Lens(focal, focal, 0, 0), (height, width), picture, size)
+        fitted(place, checked_lens(place, Lens(focal, focal, 0, 0)), (height, width), picture, size)
         # Pixels stay square where sizes are rounded.
         focal *= size[1] / width
         lens = Lens(focal, focal, size[1] / 2, size[0] / 2)
@@ -50,13 +52,13 @@ def llff(path: Path, downscale: int, frame: str) -> list[Pose]:
 
 def _rows(path: Path) -> np.ndarray:
     """(N, 17) finite numbers."""
+    data = contents(path)
     try:
-        rows = np.load(path, allow_pickle=False)
-        if not isinstance(rows, np.ndarray):
-            raise ValueError("it holds several arrays")
-    except Exception as error:  # NumPy raises many kinds.
-        said = " ".join(str(error).split())[:80]
-        raise InputError(f"{path} is no array of numbers ({said}); expected numpy.save's, without pickles") from error
+        rows = np.load(io.BytesIO(data), allow_pickle=False)
+    except Exception:  # NumPy raises many kinds, some with the advice to load pickles.
+        rows = None
+    if not isinstance(rows, np.ndarray):
+        raise InputError(f"{path} is no array of numbers; expected numpy.save's, whole and without pickles")
     if rows.ndim != 2 or rows.shape[1] != ROW or not len(rows) or rows.dtype.kind not in "fiu":
         raise InputError(f"{path} has shape {rows.shape} and dtype {rows.dtype}; expected (N, {ROW}) numbers")
     rows = rows.astype(np.float64)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from rts.files.views.llff import llff
 from rts.files.views.opencv_json import opencv
 from rts.files.views.pictures import read_mask, read_picture
 from rts.files.views.poses import Pose, read_json
+from rts.rendering.arguments import ColorLike
 from rts.scene.camera import Camera
 from rts.scene.view import Reading, View
 
@@ -38,7 +39,7 @@ def load_views(
     split: str = "train",
     downscale: int = 1,
     linear: bool = True,
-    background: Any = None,
+    background: Literal["white", "black"] | ColorLike | None = None,
     pixel_center: float = 0.5,
     frame: str = "file",
     near: float | None = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,7 +36,7 @@ class Folder(NamedTuple):
     def mask(self, name: str) -> Path | None:
         """The mask of a picture, called as COLMAP calls it: NAME.png, or as a picture that is a PNG itself; or None."""
         for mask in (name + ".png", name if name.lower().endswith(".png") else None):
-            if mask and (self.masks / mask).is_file():
+            if mask and os.path.isfile(self.masks / mask):  # False, too, for a name that is too long.
                 return inside(self.masks, mask, self.masks, self.masks)
         return None
 

@@ -14,6 +14,13 @@ from rts.errors import InputError
 from rts.files.damaged_files import contents
 from rts.files.views.lenses import Lens
 
+LARGEST = 1e18
+"""Largest entry of a matrix in a file: float32 holds the squares of such numbers."""
+MOST_PIXELS = 2**31
+"""Pictures are less wide, and less high."""
+DIGITS = 18
+"""Integers of so many digits fit into 64 bits."""
+
 
 class Pose(NamedTuple):
     """A picture's entry in a file.
@@ -50,13 +57,18 @@ def read_json(path: Path) -> Mapping[str, Any]:
         InputError: it is no JSON, or no object.
     """
     try:
-        tree = json.loads(contents(path))
+        tree = json.loads(contents(path), parse_int=_integer)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError.
         said = " ".join(str(error).split())[:80]
         raise InputError(f"{path} is no JSON ({said}); the file may be cut short: export it again") from error
     if not isinstance(tree, Mapping):
         raise InputError(f"{path} holds a {type(tree).__name__}; expected an object with frames, or with views")
     return tree
+
+
+def _integer(digits: str) -> int | float:
+    """An integer of JSON; one of more than 64 bits as a floating number, which may be infinite."""
+    return int(digits) if len(digits) <= DIGITS else float(digits)
 
 
 def entries(path: Path, tree: Mapping[str, Any], key: str, *needed: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -80,14 +92,17 @@ def entries(path: Path, tree: Mapping[str, Any], key: str, *needed: str) -> list
 
 
 def numbers(place: str, what: str, value: Any, *shapes: tuple[int, ...]) -> np.ndarray:
-    """Finite numbers of one of these shapes, float64, from a file."""
+    """Numbers of one of these shapes, float64, from a file; none beyond `LARGEST`."""
     try:
         known = check_numbers(what, value, *shapes)
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
     if known is None:
         raise InputError(f"{place}: {what} is not known; expected numbers")
-    return known.astype(np.float64)
+    known = known.astype(np.float64)
+    if np.abs(known).max(initial=0) > LARGEST:
+        raise InputError(f"{place}: {what} holds {np.abs(known).max():.6g}; expected numbers up to {LARGEST:g}")
+    return known
 
 
 def rigid(place: str, matrix: Any, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -119,9 +134,12 @@ def fitted(place: str, lens: Lens, stated: tuple[float, float], path: Path, size
     """The lens for pictures of another size (height, width) than the file states.
 
     Raises:
-        InputError: the picture has another shape: it is neither larger nor smaller, but for whole pixels.
+        InputError: the file states no size of a picture; or the picture has another shape: it is neither larger nor
+            smaller, but for whole pixels.
     """
     height, width = stated
+    if not (1 <= height < MOST_PIXELS and 1 <= width < MOST_PIXELS):
+        raise InputError(f"{place} has {width:g} × {height:g} pixels; expected positive numbers, less than 2³¹")
     # Pictures that were made smaller are rounded to whole pixels.
     if abs(size[0] * width / height - size[1]) > 1 + size[1] / size[0]:
         raise InputError(
