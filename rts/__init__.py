@@ -10,7 +10,8 @@ The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`
 `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
-from typing import TYPE_CHECKING, Any
+# pyright: reportUnsupportedDunderAll=false
+# Type checkers read `__init__.pyi`, which declares the names that are imported on first use.
 
 from rts import errors, registry, regularizers
 from rts.arrays.engines import Engine, engine_of, namespace
@@ -61,28 +62,14 @@ _MOVED = {
 }
 """Module → names that moved there from `rts`, separated by spaces."""
 
-if TYPE_CHECKING:
-    # Declared so that type checkers find misspelt names; the objects come from entry points.
-    Bezier: Any
-    BSpline: Any
-    Isosurface: Any
-    Mesh: Any
-    Revolution: Any
-    Sdf: Any
-    Subdivision: Any
-    Ndc: Any
-    load_radiance_field: Any
-    tune: Any
-    volume_render: Any
-else:
 
-    def __getattr__(name: str):
-        """The built-in surface or function of this name, imported through its entry point on first use."""
-        for place, names in _MOVED.items():
-            if name in names.split():
-                raise AttributeError(f"rts.{name} is {place}.{name} now")
-        found = globals()[name] = registry.attribute(name, __all__)
-        return found
+def __getattr__(name: str):
+    """The built-in surface or function of this name, imported through its entry point on first use."""
+    for place, names in _MOVED.items():
+        if name in names.split():
+            raise AttributeError(f"rts.{name} is {place}.{name} now")
+    found = globals()[name] = registry.attribute(name, __all__)
+    return found
 
 
 def __dir__() -> list[str]:

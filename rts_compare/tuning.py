@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rts import Part, engine_of
+from rts import Camera, Part, engine_of
 from rts.diagnostics.command_tools import output_folder
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError
@@ -17,7 +17,7 @@ from rts.plugin_api.checks import check_positive, is_count, quoted
 from rts_compare.compared_settings import usable
 from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.measurements import TOGETHER, Measurements
-from rts_compare.moving_scenes import SceneFunction, parts_of
+from rts_compare.moving_scenes import Scene, SceneFunction, parts_of
 from rts_compare.scene_sources import engines_for, scene_of, some_modes
 from rts_compare.settings_search import SUPERSAMPLE, Search
 from rts_compare.true_derivatives import SAMPLES
@@ -55,7 +55,7 @@ class Tuned(NamedTuple):
 
 
 def tune(
-    scene: Any,
+    scene: str | Path | Scene | SceneFunction | Callable[[], tuple[Part | Sequence[Part], Camera]],
     parameters: Tree = None,
     *,
     tolerance: float = 0.05,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rts import InputError, Part
 from rts.plugin_api.arrays import Array
@@ -31,7 +31,7 @@ class Bezier(Patches):
         InputError: indices of another shape, or a tolerance that is not positive.
     """
 
-    def __init__(self, indices: Any, tolerance: float = TOLERANCE):
+    def __init__(self, indices: ArrayLike, tolerance: float = TOLERANCE):
         table = index_table("indices", indices, 16)
         super().__init__(table, tolerance, read_only(np.unique(table)))
         self._least = int(self.table.max()) + 1

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rts import InputError, Part, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, from_numbers, shape_of
@@ -108,7 +109,7 @@ class Revolution(BSpline):
 
     shaped_by = ("radii",)
 
-    def __init__(self, heights: Any, count: int = 8, ends: str = "clamped", tolerance: float = TOLERANCE):
+    def __init__(self, heights: ArrayLike, count: int = 8, ends: str = "clamped", tolerance: float = TOLERANCE):
         if not is_count(count) or count < 4:
             raise InputError(f"count is {quoted(count)}; expected an integer of at least 4")
         shape = shape_of(from_numbers(heights, "heights"))

@@ -8,11 +8,12 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, Rate, TriangleSurface, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, exemplar, unit
 from rts.plugin_api.checks import fingerprint, index_table, pieces, quoted
-from rts.plugin_api.operations import interpolate, take
+from rts.plugin_api.operations import filled_up, interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
@@ -41,7 +42,7 @@ class Mesh(TriangleSurface):
     proxy_is_cheap = True
     param_step = 0.25
 
-    def __init__(self, faces: Any, indices: Mapping[str, Any] | None = None):
+    def __init__(self, faces: ArrayLike, indices: Mapping[str, ArrayLike | None] | None = None):
         self.faces = index_table("faces", faces, 3)
         self.face_count = len(self.faces)
         self._tables = [self.faces]
@@ -148,12 +149,13 @@ class Mesh(TriangleSurface):
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Interpolated positions and attributes; see the class for their names."""
-        gbuffer = GBuffer(position=self._interpolate(theta["vertices"], samples, 0))
+        vertices = with_room(theta["vertices"])
+        gbuffer = GBuffer(position=self._interpolate(vertices, samples, 0))
         for name in self._attributes(theta):
             attribute = partial(self._interpolate, theta[name], samples, self._columns[name])
             gbuffer.defer(G_BUFFER_NAMES.get(name, name), attribute)
         if "normals" not in theta:
-            gbuffer.defer("normal", lambda: self._interpolate(self.vertex_normals(theta["vertices"]), samples, 0))
+            gbuffer.defer("normal", lambda: self._interpolate(self.vertex_normals(vertices), samples, 0))
         return gbuffer
 
     def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
@@ -173,8 +175,10 @@ class Mesh(TriangleSurface):
 
     def _vertex_normals(self, vertices: Array) -> Array:
         xp, engine = namespace(vertices), engine_of(vertices)
-        faces = engine.constant(self.faces, vertices)
+        # Further faces are points, and add nothing.
+        table = filled_up(self.faces, engine.room(len(self.faces), vertices))
+        faces = engine.constant(table, vertices)
         a, b, c = (take(vertices, faces[:, i]) for i in range(3))
         face_normals = xp.linalg.cross(b - a, c - a)
-        segments = self.faces.T.reshape(-1)
+        segments = table.T.reshape(-1)
         return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))

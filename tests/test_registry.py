@@ -1,6 +1,5 @@
 """Plugins by name: what is found, what is loaded, and what the errors say."""
 
-import ast
 import json
 import subprocess
 import sys
@@ -209,10 +208,6 @@ def test_surfaces_and_functions_of_the_library_are_attributes_of_it():
     assert set(registry.built_in_attributes()) <= set(dir(rts)) and "render" in dir(rts)
     assert rts.Mesh is rts.plugin("surfaces", "mesh") and rts.Sdf is rts.plugin("surfaces", "sdf")
     assert rts.tune is rts.plugin("functions", "tune")
-    # Type checkers are told the names.
-    [block] = [n for n in ast.parse((root / "rts/__init__.py").read_text()).body if isinstance(n, ast.If)]
-    told = {ast.unparse(n.target) for n in block.body if isinstance(n, ast.AnnAssign)}
-    assert ast.unparse(block.test) == "TYPE_CHECKING" and told == set(registry.built_in_attributes())
 
 
 def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(install):

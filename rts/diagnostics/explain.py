@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from rts.arrays.engines import engine_of
 from rts.contracts.checks import CheckedPart, check_scene
 from rts.contracts.records import Sampled, Samples
 from rts.registry import name_of
+from rts.rendering.arguments import Layers, SplatterLike, Supersample
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive, missed
@@ -33,9 +34,9 @@ def explain(
     camera: Camera,
     size: tuple[int, int] | None = None,
     *,
-    splatter: Any = "auto",
-    layers: int | Literal["auto"] = 2,
-    supersample: int | Adaptive = 1,
+    splatter: SplatterLike = "auto",
+    layers: Layers = 2,
+    supersample: Supersample = 1,
 ) -> list[Choice]:
     """Explain which sampler `sampler="auto"` chooses for each part, and count samples if a size is given.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.plugin_base import overrides
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
 from rts.rendering.samples import sample
@@ -103,11 +104,11 @@ class ImageResiduals(Residuals):
         target: Array | Sequence[Array],
         *,
         weights: Array | Sequence[Array] | None = None,
-        background: Any = None,
-        sampler: Any = "auto",
-        splatter: Any = "auto",
-        layers: int | Literal["auto"] = 2,
-        supersample: int | Adaptive = 1,
+        background: BackgroundLike = None,
+        sampler: SamplerLike = "auto",
+        splatter: SplatterLike = "auto",
+        layers: Layers = 2,
+        supersample: Supersample = 1,
         capacity: int | None = None,
         channels: int = 3,
         loss: str | Loss = "linear",

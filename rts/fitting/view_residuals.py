@@ -20,6 +20,7 @@ from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage
 from rts.operations.linear import matmul
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.sampling.adaptive import Adaptive
 from rts.scene.camera import Camera
 from rts.scene.view import View
@@ -93,11 +94,11 @@ class ViewResiduals(Residuals):
         target: Callable[[View], Any] | None = None,
         unreadable: Literal["error", "skip"] = "error",
         memory: int = MEMORY,
-        background: Any = None,
-        sampler: Any = "auto",
-        splatter: Any = "auto",
-        layers: int | Literal["auto"] = 2,
-        supersample: int | Adaptive = 1,
+        background: BackgroundLike = None,
+        sampler: SamplerLike = "auto",
+        splatter: SplatterLike = "auto",
+        layers: Layers = 2,
+        supersample: Supersample = 1,
         capacity: int | None = None,
         channels: int = 3,
         loss: str | Loss = "linear",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from rts.contracts.checks import check_background, check_cameras
 from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.operations.inset import averaged
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.rendering.image import image_of, over_background, seen, splatted
 from rts.rendering.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.rendering.samples import sampled_scene
@@ -23,7 +24,6 @@ from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
 from rts.rendering.splats import views_to_splats
-from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import Prepared
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -39,11 +39,11 @@ def render_views(
     cameras: Sequence[Camera] | Camera,
     size: tuple[int, int],
     *,
-    sampler: Any = "auto",
-    splatter: Any = "auto",
-    layers: int | Literal["auto"] = 2,
-    supersample: int | Adaptive = 1,
-    background: Any = None,
+    sampler: SamplerLike = "auto",
+    splatter: SplatterLike = "auto",
+    layers: Layers = 2,
+    supersample: Supersample = 1,
+    background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Array:

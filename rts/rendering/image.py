@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
@@ -16,11 +15,11 @@ from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.plugin_base import promised
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.rendering.samples import Finer, coarse_scene, finer, sampled_scene
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_fine_splats, to_splats
-from rts.sampling.adaptive import Adaptive
 from rts.sampling.empty_images import why_empty
 from rts.sampling.prepared import Prepared
 from rts.sampling.strips import Layout
@@ -35,11 +34,11 @@ def render(
     camera: Camera,
     size: tuple[int, int],
     *,
-    sampler: Any = "auto",
-    splatter: Any = "auto",
-    layers: int | Literal["auto"] = 2,
-    supersample: int | Adaptive = 1,
-    background: Any = None,
+    sampler: SamplerLike = "auto",
+    splatter: SplatterLike = "auto",
+    layers: Layers = 2,
+    supersample: Supersample = 1,
+    background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Array:
@@ -164,8 +163,8 @@ def render_samples(
     parts: Part | Sequence[Part],
     camera: Camera,
     *,
-    splatter: Any = "auto",
-    background: Any = None,
+    splatter: SplatterLike = "auto",
+    background: BackgroundLike = None,
     engine: str | None = None,
 ) -> Array:
     """The half of `render` with derivatives: evaluate the parts at the samples, shade, project and splat.

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from rts.arrays.engines import context_of_scene, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checks import changed_part, check_background, check_changes, check_channels
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.rendering.image import image_over
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
-from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import Prepared
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -43,7 +43,7 @@ class PreparedParts(Prepared):
 
 def prepare(
     parts: Part | Sequence[Part],
-    sampler: Any = "auto",
+    sampler: SamplerLike = "auto",
     *,
     camera: Camera | None = None,
     size: tuple[int, int] | None = None,
@@ -79,10 +79,10 @@ class Renderer:
         camera: Camera,
         size: tuple[int, int],
         *,
-        splatter: Any = "auto",
-        layers: int | Literal["auto"] = 2,
-        supersample: int | Adaptive = 1,
-        background: Any = None,
+        splatter: SplatterLike = "auto",
+        layers: Layers = 2,
+        supersample: Supersample = 1,
+        background: BackgroundLike = None,
         capacity: int | None = None,
         engine: str | None = None,
     ):

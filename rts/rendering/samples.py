@@ -129,9 +129,7 @@ def _on_one_grid(
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     exits = exits and "exit" in reader.reads and gradient
     outlines = "outlines" in reader.reads
-    request = Request(
-        capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin, triangles=outlines
-    )
+    request = Request(capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin, triangles=outlines)
     taken = partial(_taken, scene.telling(settings.thin), grid, request)
     if settings.layers == "auto":
         sampled = with_layers_that_count(taken, hidden, scene.opaque)

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, Rate, RaySurface, TriangleSurface, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, from_numbers, map_leaves, unit
@@ -105,10 +106,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def __init__(
         self,
-        bounds: Any,
+        bounds: ArrayLike,
         isovalue: float = 0.0,
         f: Callable[[Any, Array], Array] | None = None,
-        shape: Any = None,
+        shape: Sequence[int] | None = None,
         *,
         motion: str = "normal",
         inside: str = "below",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, RaySurface, namespace
 from rts.plugin_api.arrays import Array, Tree
@@ -49,7 +49,7 @@ class Sdf(Implicit, RaySurface):
         self,
         f: Function,
         radius: float = 2.0,
-        center: Any = (0.0, 0.0, 0.0),
+        center: ArrayLike = (0.0, 0.0, 0.0),
         isovalue: float = 0.0,
         inside: str = "below",
         lipschitz: float | None = 1.0,

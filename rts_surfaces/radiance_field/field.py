@@ -92,7 +92,7 @@ class RadianceField:
         return map_leaves(engine_of(self.weights).to_numpy, self.weights)
 
 
-def load_radiance_field(path: Any) -> RadianceField:
+def load_radiance_field(path: str | os.PathLike[str]) -> RadianceField:
     """The radiance field (Mildenhall et al. 2020) whose weights an .npz holds.
 
     Its arrays are called as krrish94/nerf-pytorch calls its layers, after the name of the network: coarse.layer1.weight

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -45,7 +45,7 @@ def volume_render(
     near: float | None = None,
     far: float | None = None,
     samples: tuple[int, int] = (64, 64),
-    background: Any = "white",
+    background: Literal["white", "black"] | Sequence[float] | np.ndarray | None = "white",
     ndc: Ndc | None = None,
     progress: bool | None = None,
 ) -> VolumeImage:

@@ -6,12 +6,13 @@ control points with weights that depend on the sample alone: linear in θ, and e
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, engine_of
 from rts.plugin_api.arrays import Array, Tree, constants, shape_of, unit
@@ -93,15 +94,15 @@ class Subdivision(Parametric):
 
     def __init__(
         self,
-        faces: Any,
+        faces: ArrayLike | Sequence[Sequence[int]],
         scheme: str = "catmark",
         *,
-        creases: Any = (),
-        corners: Any = (),
-        holes: Any = (),
+        creases: ArrayLike = (),
+        corners: ArrayLike = (),
+        holes: ArrayLike = (),
         boundary: str = "edge_and_corner",
         chaikin: bool = False,
-        indices: Mapping[str, Any] | None = None,
+        indices: Mapping[str, ArrayLike | Sequence[Sequence[int]] | None] | None = None,
         uv_rule: str = "corners_plus1",
         tolerance: float = TOLERANCE,
     ):

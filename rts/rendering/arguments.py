@@ -1,0 +1,48 @@
+"""Types of the arguments that choose how a scene is rendered, one for each argument."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol, TypeAlias
+
+from rts.contracts.sampler import Sampler
+from rts.contracts.splatter import Splatter
+from rts.sampling.adaptive import Adaptive
+
+
+class ArrayLike(Protocol):
+    """An array of NumPy, torch, jax or another engine, as type checkers know it without these packages."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of elements along each axis."""
+        ...
+
+    @property
+    def dtype(self) -> Any:
+        """The kind of the elements."""
+        ...
+
+
+# Editors offer the names; `str` admits those of other plugins.
+SamplerLike: TypeAlias = (
+    Literal["auto", "raster", "embree", "opengl", "rays", "reference"] | str | Sampler | type[Sampler]
+)
+"""A name of a sampler, built in or another plugin's; a sampler; or its class."""
+
+SplatterLike: TypeAlias = (
+    Literal["auto", "visible", "edges", "multi", "single", "none"] | str | Splatter | type[Splatter]
+)
+"""A name of a splatter, built in or another plugin's; a splatter; or its class."""
+
+Layers: TypeAlias = int | Literal["auto"]
+"""A number of surface layers at each pixel, or "auto"."""
+
+Supersample: TypeAlias = int | Adaptive
+"""Samples along each side of a pixel, or `rts.Adaptive`."""
+
+ColorLike: TypeAlias = ArrayLike | Sequence[float]
+"""A colour as an array (C,), or numbers."""
+
+BackgroundLike: TypeAlias = ColorLike | Sequence[Sequence[Sequence[float]]] | None
+"""A colour, an image (H, W, C) as an array or nested lists, or None for transparent."""
