@@ -2,7 +2,6 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-OLDEST ?= .venv-oldest
 BIN := $(VENV)/bin
 # Each takes up to 5 GB, most of it compiled jax programs.
 WORKERS ?= 2
@@ -20,7 +19,7 @@ BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || co
 SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++ $(BROWSER)
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
-.PHONY: check demo docs paper test test-all test-xla apps warmup lint types wheel oldest clean system
+.PHONY: check demo docs paper test test-all test-xla apps warmup lint types wheel oldest newest clean system
 
 check: lint types docs test test-all test-xla apps wheel oldest
 
@@ -82,9 +81,9 @@ wheel: $(VENV)/.dev
 	PYTHON=$(PYTHON) tests/wheel.sh dist $(EXAMPLE) constraints.txt
 	PYTHON=$(PYTHON) apps/wheels.sh dist constraints.txt
 
-# The oldest versions that pyproject.toml allows, and the tests that would notice.
-oldest: system $(OLDEST)/.installed
-	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest -n $(WORKERS) --dist loadfile -p no:cacheprovider -m "engines or files"
+# Sets of versions, and the tests that would notice. TORCH=2.13.0 takes that torch in place of the set's.
+oldest newest: system
+	PYTHON=$(PYTHON) WORKERS=$(WORKERS) tests/versions.sh $@
 
 system:
 	@missing=$$(for p in $(SYSTEM_PACKAGES); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done); \
@@ -106,7 +105,7 @@ system:
 	$@ -m pip install --quiet --upgrade pip
 
 $(VENV)/.demo: $(BIN)/python $(SOURCES)
-	$(INSTALL) -e '.[torch,plots]'
+	$(INSTALL) -e '.[torch,plots,cli]'
 	@touch $@
 
 $(VENV)/.test: $(BIN)/python $(SOURCES) $(EXAMPLE)/pyproject.toml
@@ -125,11 +124,7 @@ $(VENV)/.dev: $(BIN)/python $(SOURCES)
 	$(INSTALL) --group dev
 	@touch $@
 
-$(OLDEST)/.installed: $(OLDEST)/bin/python pyproject.toml constraints-oldest.txt $(EXAMPLE)/pyproject.toml
-	PYTHONWARNINGS=ignore $(OLDEST)/bin/python -m pip install --quiet -c constraints-oldest.txt -e '.[all,test]' -e ./$(EXAMPLE)
-	@touch $@
-
 .PRECIOUS: %/bin/python
 
 clean:
-	rm -rf $(VENV) $(OLDEST) out build dist *.egg-info $(EXAMPLE)/*.egg-info $(APPS:%=%/*.egg-info)
+	rm -rf $(VENV) .venv-* out build dist *.egg-info $(EXAMPLE)/*.egg-info $(APPS:%=%/*.egg-info)

@@ -3,6 +3,7 @@ import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import rts
-from rts.cli import demo
+from rts.cli import demo, tried_versions
 from rts.cli import main as cli
 from rts.cli import pose_fit as pose
 from rts.errors import InputError, PluginError
@@ -178,6 +179,28 @@ def test_plugins_lists_each_plugin_and_why_one_does_not_load(monkeypatch):
     monkeypatch.setattr(rts.registry, "survey", lambda: partly)
     ready = "ready, but without dd: pip install 'odd[odd]'"
     assert f"│ {ready} │ triangles, layers 1, reads uv normal │" in succeed("plugins")
+
+
+def test_plugins_names_installed_packages_that_are_newer_than_any_tried(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    known = {name: f"{newest}.9" for name, newest in tried_versions.NEWEST.items()}
+    monkeypatch.setattr(tried_versions, "installed", lambda: known)
+    assert "untried" not in succeed("plugins")
+    minor = tried_versions.NEWEST["torch"].partition(".")[2]
+    monkeypatch.setattr(tried_versions, "installed", lambda: known | {"torch": f"2.{int(minor) + 1}.0+cpu"})
+    _, _, line = succeed("plugins").partition("untried, though nothing forbids it: ")
+    assert line == f"torch 2.{int(minor) + 1}.0+cpu (newest tried: 2.{minor})"
+
+
+def test_the_pinned_versions_are_no_newer_than_those_tried():
+    pinned = dict(
+        line.lower().split("==")
+        for line in (Path(__file__).parents[1] / "constraints.txt").read_text().split()
+        if "==" in line
+    )
+    for name, newest in tried_versions.NEWEST.items():
+        if name != "python":
+            assert not tried_versions._newer(name, pinned[name]), f"{name} {pinned[name]}, newest tried {newest}"
 
 
 # -------------------------------------------------------------------------------------------------- render

@@ -14,7 +14,7 @@ import rts
 pytest.importorskip("numba")
 import numba
 
-from rts.compiling import loops as compiling
+from rts.compiling import numba_internals as compiling
 from rts.compiling import warmup
 from rts.operations import take_loops
 
@@ -216,3 +216,47 @@ def test_loops_are_written_by_one_process_at_a_time(tmp_path):
         process.communicate(timeout=60)
     assert [process.returncode for process in processes] == [0, 0]
     assert len(list(kept.glob("several.double*.nbc"))) == 2 and len(list(kept.glob("several.double*.nbi"))) == 1
+
+
+WITHOUT_PRIVATE_NAMES = """
+import sys
+import numpy as np
+import numba
+import numba.core.caching
+from numba.core import event
+numba.njit(lambda: None)()  # numba imports more of itself.
+{change}
+sys.path.insert(0, {folder!r})
+import several
+x = np.ones(3)
+several.double(x)
+assert x.tolist() == [2, 2, 2]
+print(sum(several.double.stats.cache_hits.values()), "rts.compiling.numba_internals" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize(
+    "change, private",
+    [
+        ("", True),
+        ("del numba.core.caching.FunctionCache", False),
+        ("del event.Listener, event.register", False),
+        (
+            "njit = numba.njit\nnumba.njit = lambda **o: njit(**o) if 'cache' in o else "
+            "lambda f: type('Other', (), {'__slots__': ()})()",
+            True,
+        ),
+    ],
+    ids=["as it is", "no FunctionCache", "no events", "no cache of dispatchers"],
+)
+@pytest.mark.thorough
+def test_loops_are_kept_by_a_numba_without_private_names(change, private, tmp_path):
+    (tmp_path / "several.py").write_text(
+        "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"
+    )
+    variables = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    code = WITHOUT_PRIVATE_NAMES.format(folder=str(tmp_path), change=change)
+    for hits in (0, 1):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.split() == [str(hits), str(private)]

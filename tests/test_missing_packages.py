@@ -126,6 +126,27 @@ def test_without_optax_jax_renders():
     without("optax", "", jax=True)
 
 
+@pytest.mark.parametrize("package", ["typer", "rich"])
+def test_without_the_packages_of_the_command_the_library_works_and_the_command_says_what_it_needs(package):
+    printed = without(
+        package,
+        """
+        from rts.__main__ import main
+        try:
+            main()
+        except SystemExit as stop:
+            print(stop.code)
+        from rts.terminal import shows_bar
+        assert not shows_bar(None) and not shows_bar(False)
+        if package == "rich":
+            error(lambda: shows_bar(True))
+        """.replace("package", repr(package)),
+    )
+    needs = f"error: the command rts needs the package {package!r}: pip install 'rasterize-then-splat[cli]'"
+    assert printed.splitlines()[0] == needs
+    assert package == "typer" or "PluginError: progress=True needs the package 'rich'" in printed
+
+
 @pytest.mark.thorough
 def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
     printed = without(

@@ -255,7 +255,9 @@ def test_every_file_of_tests_has_one_area():
 def test_the_oldest_versions_are_those_that_are_allowed():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    wanted = project["dependencies"] + sum((extras[e] for e in ("torch", "jax", "embree", "opengl", "plots")), [])
+    wanted = project["dependencies"] + sum(
+        (extras[e] for e in ("torch", "jax", "cli", "embree", "opengl", "plots")), []
+    )
     pinned = dict(
         line.lower().split("==") for line in (ROOT / "constraints-oldest.txt").read_text().split() if "==" in line
     )

@@ -13,7 +13,7 @@ export PYTHONWARNINGS=ignore
 wheel=$(ls "$dist"/rasterize_then_splat-*.whl)
 cp -r "$example" plugin
 venv/bin/python -m pip install --quiet --upgrade pip
-venv/bin/python -m pip install --quiet -c "$constraints" "$wheel[torch,plots]" "./plugin[test]"
+venv/bin/python -m pip install --quiet -c "$constraints" "$wheel[torch,plots,cli]" "./plugin[test]"
 unset PYTHONWARNINGS
 venv/bin/python - <<'PYTHON'
 import pathlib

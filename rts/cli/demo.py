@@ -88,8 +88,8 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
         "pixels": list(shrunk(target, 256).shape),
     }
     with writing(folder / "summary.json"):
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-        (folder / "summary.md").write_text(_markdown(summary, files))
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        (folder / "summary.md").write_text(_markdown(summary, files), encoding="utf-8")
     return result, [*files, folder / "summary.json", folder / "summary.md"]
 
 

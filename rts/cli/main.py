@@ -290,6 +290,7 @@ def plugins(
 ) -> None:
     """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
     from rts.cli.plugin_tables import plugin_table, print_matrix
+    from rts.cli.tried_versions import untried
 
     if matrix:
         print_matrix(Console(), only or ())
@@ -297,6 +298,8 @@ def plugins(
         raise typer.BadParameter("goes with --matrix", param_hint="--only")
     else:
         Console().print(plugin_table())
+        if newer := untried():
+            _say(escape(newer))
 
 
 @app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")

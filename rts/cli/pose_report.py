@@ -51,7 +51,8 @@ def write_report(
     """
     with writing(folder / "pose.json"):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "pose.json").write_text(json.dumps(_numbers(result) | verdict.numbers(), indent=2) + "\n")
+        text = json.dumps(_numbers(result) | verdict.numbers(), indent=2) + "\n"
+        (folder / "pose.json").write_text(text, encoding="utf-8")
     large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
 
     def picture(pose: Pose, mask: np.ndarray) -> np.ndarray:

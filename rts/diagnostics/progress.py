@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
+
+from rts.terminal import shows_bar
 
 Phase = Callable[[str, int], Callable[[], None]]
 """(name of a phase, number of its steps) → a function to call after each step."""
@@ -17,7 +18,7 @@ def phases(wanted: bool | None) -> Iterator[Phase]:
     Args:
         wanted: True to show bars, False for none; None to show them on a terminal.
     """
-    if wanted is False or (wanted is None and not sys.stderr.isatty()):
+    if not shows_bar(wanted):
         yield lambda what, steps: lambda: None
         return
     from rich.console import Console

@@ -6,6 +6,7 @@ from rts.contracts.oriented_pieces import pieces
 from rts.sampling.cache import fingerprint
 from rts.sampling.sample_checks import check_camera
 from rts.scene.topology import index_table
+from rts.terminal import shows_bar
 
 __all__ = [
     "check_camera",
@@ -16,4 +17,5 @@ __all__ = [
     "is_count",
     "pieces",
     "quoted",
+    "shows_bar",
 ]

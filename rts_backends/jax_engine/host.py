@@ -20,9 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.experimental.buffer_callback import buffer_callback
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, partial_eval
+
+try:
+    from jax.experimental.buffer_callback import buffer_callback
+except ImportError:  # jax before 0.6.1.
+    buffer_callback = None
 
 HostFunction = Callable[..., Sequence[np.ndarray | np.generic]]
 """Function from NumPy arrays, which are read-only and lent for the length of the call, to NumPy arrays."""
@@ -52,7 +56,30 @@ def filled(
             x.flags.writeable = False
         function(read, [np.asarray(x) for x in results])
 
+    if buffer_callback is None:
+        return _filled.bind(*operands, function=function, shapes=tuple(shapes))
     return list(buffer_callback(fill, list(shapes), input_output_aliases=in_place)(*operands))
+
+
+_filled = Primitive("rts_host_filled")
+_filled.multiple_results = True
+
+
+@_filled.def_abstract_eval
+def _filled_results(*operands: Any, function: Filler, shapes: Shapes) -> list[ShapedArray]:
+    return [ShapedArray(shape.shape, shape.dtype) for shape in shapes]
+
+
+def _emitted(ctx: Any, *operands: Any, function: Filler, shapes: Shapes) -> Sequence[Any]:
+    """The call in a program of a jax without `buffer_callback`, which copies the results."""
+
+    def results(*operands: Any) -> list[np.ndarray]:
+        made = [np.empty(shape.shape, shape.dtype) for shape in shapes]
+        function(list(map(np.asarray, operands)), made)
+        return made
+
+    emit = mlir.emit_python_callback
+    return emit(ctx, results, None, operands, ctx.avals_in, ctx.avals_out, has_side_effect=False)[0]
 
 
 def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Array]:
@@ -163,5 +190,6 @@ if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
 
 batching.primitive_batchers[_call] = _batched
 partial_eval.dce_rules[_call] = _without_unused
+mlir.register_lowering(_filled, _emitted, platform="cpu")
 mlir.register_lowering(_call, mlir.lower_fun(_copying, multiple_results=True))
 mlir.register_lowering(_call, mlir.lower_fun(_in_place, multiple_results=True), platform="cpu")

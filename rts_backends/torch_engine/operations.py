@@ -80,6 +80,8 @@ class _Call:
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
         """The operation's array code as a function of the differentiable operands; `fixed` are the others."""
+        # Some batched derivatives of torch before 2.9 take indices of 64 bits alone.
+        fixed = tuple(x.long() if x.dtype is torch.int32 else x for x in fixed)
 
         def specified(*varied: Tensor) -> Tensor:
             before, _specifying.on = _specifying.on, True

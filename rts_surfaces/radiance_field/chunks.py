@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 
 from rts import Engine, engine_of
 from rts.plugin_api.arrays import Array
+from rts.plugin_api.checks import shows_bar
 
 CHUNK = 8192
 """Rows at a time: activations of a network of 128 units are then some 20 MB."""
@@ -54,7 +54,7 @@ def progress_bar(wanted: bool | None, what: str, total: int) -> Iterator[Callabl
         what: the work's name, for the bar.
         total: the number at which the bar is full.
     """
-    if wanted is False or (wanted is None and not sys.stderr.isatty()):
+    if not shows_bar(wanted):
         yield lambda count: None
         return
     from rich.console import Console

@@ -10,6 +10,7 @@ import ctypes
 import functools
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -77,7 +78,7 @@ def find() -> Tools:
     old = ""
     for prefix in (Path(p) for p in (*places, *PREFIXES) if p):
         try:
-            version = (prefix / "include/opensubdiv/version.h").read_text()
+            version = (prefix / "include/opensubdiv/version.h").read_text(encoding="utf-8")
         except OSError:
             continue
         if (prefix / "include/opensubdiv/bfr/refinerSurfaceFactory.h").is_file():
@@ -160,7 +161,8 @@ def _own_folder() -> tempfile.TemporaryDirectory:
 def _key(tools: Tools) -> str:
     compiler = Path(tools.compiler[0]).resolve()
     stat = compiler.stat()
-    known = (*tools.compiler, compiler, stat.st_size, stat.st_mtime_ns, tools.prefix, tools.version, FLAGS, os.uname())
+    known = (*tools.compiler, compiler, stat.st_size, stat.st_mtime_ns, tools.prefix, tools.version, FLAGS)
+    known += (platform.node(), platform.system(), platform.release(), platform.version(), platform.machine())
     text = b"".join((Path(__file__).parent / name).read_bytes() for name in SOURCES)
     return hashlib.sha256(repr(known).encode() + text).hexdigest()[:20]
 

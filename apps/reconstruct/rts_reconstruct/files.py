@@ -53,7 +53,9 @@ def _write_mesh(folder: Path, model: Model, pictures: Pictures) -> list[str]:
         return ["mesh.obj", "mesh.glb"]
     picture = Image.fromarray(_bytes(model.atlas.texture))
     picture.save(folder / "texture.png")
-    (folder / "mesh.mtl").write_text("newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd texture.png\n")
+    (folder / "mesh.mtl").write_text(
+        "newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd texture.png\n", encoding="utf-8"
+    )
     (folder / "mesh.obj").write_text(_obj(vertices, model, None), encoding="utf-8")
     # glTF has one row a vertex for both positions and map.
     rows, corners = _rows(model)
