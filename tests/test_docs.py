@@ -175,6 +175,9 @@ def test_pages_for_users_of_others_show_one_task_and_its_gradient(model):
         for step in (-0.05, 0.05)
     ]
     assert float(found["pose"].grad[3]) == pytest.approx((losses[1] - losses[0]) / 0.1, rel=0.05)
+    for other in ("deodr", "mitsuba"):
+        page = " ".join((ROOT / f"docs/coming-from/{other}.md").read_text().split())
+        assert f"by ours {float(found['loss'].detach()):.4f}, and" in page
     # The others that are installed agree, as far as their pages say.
     ours, slope = float(found["loss"].detach()), float(found["pose"].grad[3])
     pytest.importorskip("deodr")
