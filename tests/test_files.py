@@ -356,6 +356,54 @@ def test_fractions_of_a_gltf_may_be_integers(tmp_path, dtype, component):
     np.testing.assert_array_equal(part.theta["vertices"], GRID[0])
 
 
+def with_material(path, material):
+    """A glTF whose only primitive has this material."""
+    tree = json.loads(path.read_text())
+    tree["meshes"][0]["primitives"][0]["material"], tree["materials"] = 0, [material]
+    return write(path, json.dumps(tree))
+
+
+@pytest.mark.parametrize(
+    "material, expected",
+    [
+        (None, 1),
+        ({}, 1),
+        ({"alphaMode": "OPAQUE"}, 1),
+        ({"alphaMode": "MASK"}, 0),
+        ({"alphaMode": "MASK", "alphaCutoff": 0.2}, 1),
+        ({"alphaMode": "MASK", "alphaCutoff": 0.2, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.6]}}, 0),
+        ({"alphaMode": "BLEND"}, 0.25),
+    ],
+)
+def test_alpha_of_colours_of_a_gltf_counts_as_its_material_says(tmp_path, material, expected):
+    values = np.float32([[1, 0.2, 0, 0.25]] * 4)
+    path = gltf_with(tmp_path, "COLOR_0", values, 5126, "VEC4")
+    [part] = rts.load(path if material is None else with_material(path, material))
+    colors = part.theta["colors"]
+    alpha = colors[:, 3] if colors.shape[1] == 4 else np.ones(4)
+    np.testing.assert_allclose(alpha, expected, atol=2e-3)
+    np.testing.assert_allclose(colors[:, :3], values[:, :3], atol=1e-6)
+    assert part.shader.opaque == (expected == 1) and len(part.theta.get("color", np.ones(3))) == 3
+
+
+def test_a_gltf_that_is_compressed_in_a_way_that_is_not_read_is_warned_of_or_refused(tmp_path):
+    mesh = trimesh.Trimesh(*GRID, process=False)
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), embed_buffers=True)
+    path, text = tmp_path / "m.gltf", files["model.gltf"].decode()
+    for name in ("EXT_meshopt_compression", "KHR_meshopt_compression"):
+        tree = json.loads(text)
+        tree["bufferViews"][0]["extensions"] = {name: {"buffer": 0, "byteLength": 9, "mode": "ATTRIBUTES"}}
+        with pytest.warns(rts.errors.FileWarning, match=f"uses the extension {name}, which is not read"):
+            rts.load(write(path, json.dumps(tree)))
+        tree["extensionsUsed"] = tree["extensionsRequired"] = [name]
+        with pytest.raises(InputError, match=f"requires the extension '{name}', which is not read"):
+            rts.load(write(path, json.dumps(tree)))
+        del tree["extensionsRequired"]
+        tree["buffers"].append({"byteLength": 9, "extensions": {name: {"fallback": True}}})
+        with pytest.raises(InputError, match=f"and the extension that has them is not read: {name}"):
+            rts.load(write(path, json.dumps(tree)))
+
+
 # --------------------------------------------------------------------------------------------- what does not
 
 

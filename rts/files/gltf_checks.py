@@ -22,6 +22,8 @@ from rts.files.images import is_image
 
 APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
 """Names of extensions that do not concern shapes begin like this."""
+TOLD = "EXT_mesh_gpu_instancing"
+"""An extension of which `check_scenes` warns."""
 PROPERTIES = {
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse",
     "bufferViews": "buffer byteOffset byteLength byteStride target",
@@ -95,7 +97,7 @@ def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str]
         tree = json.loads(text, parse_constant=_no_number, object_pairs_hook=_unique)
         if not isinstance(tree, dict):
             raise ValueError("the whole is no object")
-        _check_extensions(tree, fail)
+        _check_extensions(path, tree, fail)
         buffers, views, changes = [], [], {}
         for i, buffer in enumerate(tree.get("buffers", [])):
             place = f"buffer {i}"
@@ -176,11 +178,14 @@ def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) 
 
 
 def _buffer(index: int, buffer: dict[str, Any], binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes:
-    uri = buffer.get("uri")
-    content = (binary or b"") if uri is None else _content(uri, file, fail)
+    uri, extensions = buffer.get("uri"), buffer.get("extensions", {})
+    # A buffer of compression's may stand for data that are nowhere.
+    absent = any(extension.get("fallback") for extension in extensions.values())
+    content = (b"" if absent else binary or b"") if uri is None else _content(uri, file, fail)
     promised = count_of(buffer["byteLength"])
     if promised > len(content):
-        raise fail(f"buffer {index} promises {promised} bytes, and has {len(content)}")
+        unread = f", and the extension that has them is not read: {', '.join(extensions)}" if extensions else ""
+        raise fail(f"buffer {index} promises {promised} bytes, and has {len(content)}{unread}")
     return content
 
 
@@ -231,8 +236,8 @@ def _check_primitive(
     return changes
 
 
-def _check_extensions(tree: dict[str, Any], fail: Any) -> None:
-    """Refuse other versions, and extensions that are needed and not read."""
+def _check_extensions(path: Path, tree: dict[str, Any], fail: Any) -> None:
+    """Refuse other versions, and extensions that are needed and not read; warn of those that are only used."""
     asset = tree.get("asset", {})
     if not str(asset.get("version", "2")).startswith("2") or str(asset.get("minVersion", "2.0")) != "2.0":
         raise fail(f"it is of version {asset.get('minVersion', asset.get('version'))!r} of glTF; expected 2.0")
@@ -241,6 +246,11 @@ def _check_extensions(tree: dict[str, Any], fail: Any) -> None:
     unknown = [name for name in required if name not in read and not APPEARANCE.match(str(name))]
     if unknown or not isinstance(required, list):
         raise fail(f"it requires the extension {(unknown or [required])[0]!r}, which is not read")
+    holders = [*tree.get("bufferViews", []), *(p for mesh in tree.get("meshes", []) for p in mesh["primitives"])]
+    used = [*tree.get("extensionsUsed", []), *(name for holder in holders for name in holder.get("extensions", {}))]
+    for name in dict.fromkeys(used):
+        if name not in (*read, TOLD) and not APPEARANCE.match(name):
+            warn(f"{path} uses the extension {name[:60]}, which is not read; it is loaded as it is without")
 
 
 def _check_names(path: Path, tree: dict[str, Any]) -> None:

@@ -131,34 +131,43 @@ def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray 
         texture = None if image is None else pixels(image)
         if _known(material, "baseColorFactor") is not None:
             color = _unit_range(material.baseColorFactor)
-        mode = _known(material, "alphaMode") if gltf else "BLEND"
-        if mode in (None, "OPAQUE"):
-            texture, color = (None if x is None else x[..., :3] for x in (texture, color))
-        elif mode == "MASK":
-            cutoff = _known(material, "alphaCutoff")
-            texture, color = _cut_out(texture, color, 0.5 if cutoff is None else cutoff)
     elif visual.kind == "vertex":
         attributes["colors"] = (_unit_range(visual.vertex_colors), faces)
     elif visual.kind == "face":
         one_a_face = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
         attributes["colors"] = (_unit_range(visual.face_colors), one_a_face)
-    return attributes, texture, color
+    if not gltf:
+        return attributes, texture, color
+    rows = attributes["colors"][0] if "colors" in attributes else None
+    rows, texture, color = _as_alpha_mode_says(rows, texture, color, _known(visual, "material"), "uv" in attributes)
+    return attributes | ({} if rows is None else {"colors": (rows, faces)}), texture, color
 
 
-def _cut_out(
-    texture: np.ndarray | None, color: np.ndarray | None, cutoff: float
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The texture and colour of a material, whose product has alpha 1 from the cutoff on, and 0 below.
+def _as_alpha_mode_says(
+    rows: np.ndarray | None, texture: np.ndarray | None, color: np.ndarray | None, material: Any, mapped: bool
+) -> tuple[np.ndarray | None, ...]:
+    """Vertex colours (A, 4), a texture and a factor with the alpha that a material of glTF gives them.
 
-    A texture (h, w, 3) and a colour (3,) have no alpha, and stay as they are, as None does.
+    It is none where the mode is OPAQUE, as it is without a material. Where the mode is MASK, the product of alpha is 1
+    from the cutoff on, and 0 below. A texture hides the colours, unless it is not `mapped`. Arrays of three components
+    have no alpha, and stay as they are, as None does.
     """
-    factor = 1.0 if color is None or len(color) < 4 else color[3]
-    if texture is not None and texture.shape[-1] == 4:
-        alpha = (texture[..., 3:] * factor >= cutoff).astype(texture.dtype)
-        texture, factor = np.concatenate([texture[..., :3], alpha], axis=-1), 1.0
-    if color is not None and len(color) == 4:
-        color = np.append(color[:3], float(factor >= cutoff))
-    return texture, color
+    mode = _known(material, "alphaMode") or "OPAQUE"
+    if mode == "BLEND":
+        return rows, texture, color
+    plain = [None if x is None else x[..., :3] for x in (rows, texture, color)]
+    if mode != "MASK":
+        return tuple(plain)
+    cutoff = _known(material, "alphaCutoff")
+    at, shown = (1, texture) if mapped and texture is not None else (0, rows)
+    cutoff = 0.5 if cutoff is None else cutoff
+    alpha = float(color[3]) if color is not None and len(color) == 4 else 1.0
+    if shown is not None and shown.shape[-1] == 4:
+        opaque = shown[..., 3:] * alpha >= cutoff
+        plain[at] = np.concatenate([shown[..., :3], opaque], axis=-1, dtype=shown.dtype)
+    elif color is not None and len(color) == 4:
+        plain[2] = np.append(color[:3], float(alpha >= cutoff))
+    return tuple(plain)
 
 
 def _known(thing: Any, name: str, default: Any = None) -> Any:
