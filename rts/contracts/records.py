@@ -334,6 +334,8 @@ class Outlines:
         ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
             the other. −1 in second place if a break is alone.
         side: (S, 2) int32, the sides of the square that these breaks lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
+        beyond: (S, 4) int32, the breaks along the same outline before and after these two: the last but one, the last,
+            the next, and the next but one; −1 for none.
         joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y?
     """
 
@@ -347,6 +349,7 @@ class Outlines:
     square: Array
     ties: Array
     side: Array
+    beyond: Array
     joined: Array
 
 

@@ -16,11 +16,13 @@ class Segments(NamedTuple):
         square: (S, 2) int32.
         ties: (S, 2) int32.
         side: (S, 2) int32.
+        beyond: (S, 4) int32.
     """
 
     square: np.ndarray
     ties: np.ndarray
     side: np.ndarray
+    beyond: np.ndarray
 
 
 def joined(breaks: Breaks) -> Segments:
@@ -60,4 +62,30 @@ def joined(breaks: Breaks) -> Segments:
     lone = j < 0
     ties = np.column_stack([number[i], np.where(lone, -1, number[j])])
     sides = np.column_stack([side[i], np.where(lone, -1, side[j])])
-    return Segments(squares[i].astype(np.int32), ties.astype(np.int32), sides.astype(np.int32))
+    beyond = _beyond(ties, len(y))
+    return Segments(*(x.astype(np.int32) for x in (squares[i], ties, sides, beyond)))
+
+
+def _beyond(ties: np.ndarray, count: int) -> np.ndarray:
+    """`Outlines.beyond` (S, 4) of segments between `count` breaks."""
+    # Each break ends at most two segments, in the squares on its two sides.
+    s, end = np.nonzero(ties >= 0)
+    order = np.argsort(ties[s, end], kind="stable")
+    s, end, tied = s[order], end[order], ties[s, end][order]
+    pair = np.flatnonzero(tied[1:] == tied[:-1])
+    next_segment, next_end = np.full((len(ties), 2), -1), np.zeros((len(ties), 2), int)
+    for a, b in ((pair, pair + 1), (pair + 1, pair)):
+        next_segment[s[a], end[a]], next_end[s[a], end[a]] = s[b], end[b]
+
+    def step(segment: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The next segment at an end of each, its far end, and the break there; −1 for none."""
+        known = segment >= 0
+        beside = np.where(known, next_segment[segment, end], -1)
+        far = 1 - next_end[segment, end]
+        return beside, far, np.where(beside >= 0, ties[beside, far], -1)
+
+    found, segments = np.full((len(ties), 4), -1), np.arange(len(ties))
+    for at, columns in ((0, (1, 0)), (1, (2, 3))):
+        one, far, found[:, columns[0]] = step(segments, np.full(len(ties), at))
+        _, _, found[:, columns[1]] = step(one, far)
+    return found

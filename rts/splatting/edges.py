@@ -26,14 +26,8 @@ from rts.splatting.layers import check_rows, nothing, unpack
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
-STARTS = ((0, 0), (1, 0), (1, 1), (0, 1))
-"""Where each side of a square begins, clockwise: top, right, bottom, left."""
-
 BORDER = 2e-4
 """Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
-
-UPRIGHT = 1e-3
-"""The least ratio of a normal's components, so that shares of squares beside upright edges have no division by 0."""
 
 
 class Edges(Splatter):
@@ -141,10 +135,8 @@ class _Segments(NamedTuple):
     Attributes:
         square: (S, 2) int, x and y of the first corner's cell.
         lone: (S,) bool.
-        start: (S, 2) x and y.
-        way: (S, 2) from start to end.
+        path: (3, S, 2), x and y of start, corner and end, from the first corner's centre.
         side: (S, 2) int, the sides of the square that start and end lie on.
-        place: (S, 2), where start and end lie on the sides, clockwise from the upper left corner: 0 to 4.
         ties: (S, 2) int, the breaks at start and end.
         jump: (2, S, C), at start and end, the colour on the right of the way less that on the left.
         moves: (2, S, 2), the motion of start and end.
@@ -152,10 +144,8 @@ class _Segments(NamedTuple):
 
     square: Array
     lone: Array
-    start: Array
-    way: Array
+    path: Array
     side: Array
-    place: Array
     ties: Array
     jump: Array
     moves: Array
@@ -163,17 +153,17 @@ class _Segments(NamedTuple):
     @classmethod
     def of(cls, outlines: Outlines, breaks: _Breaks) -> _Segments:
         """The segments between breaks."""
-        xp = namespace(breaks.place)
-        lone, square = outlines.ties[:, 1] < 0, xp.stack([outlines.square[:, 1], outlines.square[:, 0]], axis=-1)
-        ties = xp.stack([outlines.ties[:, 0], xp.where(lone, outlines.ties[:, 0], outlines.ties[:, 1])], axis=-1)
-        side = xp.stack([outlines.side[:, 0], xp.where(lone, (outlines.side[:, 0] + 2) % 4, outlines.side[:, 1])], axis=-1)
-        start, end = (xp.take(breaks.place, ties[:, i], axis=0) for i in (0, 1))
-        first = xp.astype(square, start.dtype) + 0.5
-        middle = 2 * first + 1 - start  # The point opposite: mirrored, along the gap put back.
+        xp, side = namespace(breaks.place), outlines.side
+        lone, first = outlines.ties[:, 1] < 0, outlines.ties[:, 0]
+        ties = xp.stack([first, xp.where(lone, first, outlines.ties[:, 1])], axis=-1)
+        side = xp.stack([side[:, 0], xp.where(lone, (side[:, 0] + 2) % 4, side[:, 1])], axis=-1)
+        square = xp.stack([outlines.square[:, 1], outlines.square[:, 0]], axis=-1)
+        origin = xp.astype(square, breaks.place.dtype) + 0.5
+        start, end = (xp.take(breaks.place, ties[:, i], axis=0) - origin for i in (0, 1))
         along = xp.take(breaks.step, ties[:, 0], axis=0)
-        end = xp.where(lone[:, None], along * start + (1 - along) * middle, end)
-        local = xp.clip(xp.stack([start - first, end - first]), 0.0, 1.0)
-        place = [_on_sides(local[i], side[:, i]) for i in (0, 1)]
+        end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
+        start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
+        corner = _corners(start, end, outlines.beyond, breaks.place, origin)
         jump, moves = [], []
         for i in (0, 1):
             before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
@@ -182,94 +172,131 @@ class _Segments(NamedTuple):
             jump.append(xp.where(forward[:, None], before - behind, behind - before))
             moves.append(xp.take(breaks.moves, ties[:, i], axis=0))
         jump[1] = xp.where(lone[:, None], jump[0], jump[1])
-        return cls(square, lone, start, end - start, side, xp.stack(place, axis=-1), ties, xp.stack(jump), xp.stack(moves))
+        return cls(square, lone, xp.stack([start, corner, end]), side, ties, xp.stack(jump), xp.stack(moves))
 
     def parts(self) -> list[tuple[Array, Array, Array]]:
-        """What segments change: cells (x and y) and changes (S, C), for each corner of the square."""
-        xp, parts = namespace(self.start), []
-        normal = xp.stack([self.way[:, 1], -self.way[:, 0]], axis=-1)
-        mean = (self.jump[0] + self.jump[1]) / 2
-        pieces = self._pieces(normal)
+        """What segments change: cells (x and y) and changes (S, C), for each corner of the square.
+
+        The area of a quarter of the square on the right of the way is minus the integral of y over x around it: along
+        the way, in straight pieces, and back along the square's sides, of which only the bottom counts.
+        """
+        xp, mean, parts = namespace(self.path), (self.jump[0] + self.jump[1]) / 2, []
+        pieces, bottoms = self._pieces(), [self._right_of_bottom(2.5, 3.0), self._right_of_bottom(2.0, 2.5)]
         for k, (dx, dy) in enumerate(CORNERS):
-            x, y = self.square[:, 0] + dx, self.square[:, 1] + dy
-            corner = xp.astype(xp.stack([x, y], axis=-1), self.start.dtype) + 0.5
-            low = corner - 0.5 * xp.asarray([dx, dy], dtype=corner.dtype, device=corner.device)
-            share = _share_of_quarter(low - self.start, normal)
-            share = share - xp.where(self._on_the_right(k), 0.25, 0.0)
-            beside = (self.side[:, 0] == k) | (self.side[:, 0] == (k + 3) % 4)
-            change = xp.where(self.lone & ~beside, 0.0, share)[:, None] * mean
-            for at, flux in pieces:
-                right, below = (
-                    xp.clip((at[:, a] - xp.astype(self.square[:, a], at.dtype) - 1) / BORDER + 0.5, 0.0, 1.0)
-                    for a in (0, 1)
-                )
+            area, change = 0.5 * bottoms[dx], xp.zeros_like(mean)
+            for at, way, flux in pieces:
+                column = at[:, 0] >= 0.5 if dx else at[:, 0] < 0.5
+                height = xp.clip(at[:, 1] - 0.5 * dy, 0.0, 0.5)
+                area = area - xp.where(column, height * way[:, 0], 0.0)
+                right, below = (xp.clip((at[:, a] - 0.5) / BORDER + 0.5, 0.0, 1.0) for a in (0, 1))
                 share = (right if dx else 1 - right) * (below if dy else 1 - below)
                 change = change + share[:, None] * flux
-            parts.append((x, y, change))
+            share = area - xp.where(self._on_the_right(k), 0.25, 0.0)
+            beside = (self.side[:, 0] == k) | (self.side[:, 0] == (k + 3) % 4)
+            change = change + xp.where(self.lone & ~beside, 0.0, share)[:, None] * mean
+            parts.append((self.square[:, 0] + dx, self.square[:, 1] + dy, change))
         return parts
 
     def normals(self, breaks: _Breaks) -> Array:
         """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
-        xp = namespace(self.start)
-        engine, count = engine_of(self.start), breaks.place.shape[0]
-        normal, total = xp.stack([self.way[:, 1], -self.way[:, 0]], axis=-1), breaks.step * 1e-6
+        xp, way = namespace(self.path), self.path[2] - self.path[0]
+        engine, count = engine_of(self.path), breaks.place.shape[0]
+        normal, total = xp.stack([way[:, 1], -way[:, 0]], axis=-1), breaks.step * 1e-6
         for i in (0, 1):
             # Two segments at a line of crossing may run in opposite directions.
             ahead = xp.sum(normal * xp.take(breaks.step, self.ties[:, i], axis=0), axis=-1) >= 0
-            turned = xp.where((self.lone)[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
+            turned = xp.where(self.lone[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
             total = total + engine.segment_sum(turned, engine.to_numpy(self.ties[:, i]), count)
         return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
+
+    def _places(self) -> list[Array]:
+        """Places (S,) of start and end on the square's sides, clockwise from the upper left corner: 0 to 4."""
+        xp, places = namespace(self.path), []
+        for i in (0, 1):
+            x, y, side = self.path[2 * i][:, 0], self.path[2 * i][:, 1], self.side[:, i]
+            places.append(xp.where(side == 0, x, xp.where(side == 1, 1 + y, xp.where(side == 2, 3 - x, 4 - y))))
+        return places
 
     def _on_the_right(self, k: int) -> Array:
         """(S,) True where a corner lies on the right of the way: clockwise between the end and the start."""
         # Clockwise, corner k begins side k, so all that lies on sides from k on comes after it.
         start, end = self.side[:, 0] >= k, self.side[:, 1] >= k
-        return namespace(start).where(self.place[:, 0] < self.place[:, 1], start | ~end, start & ~end)
+        places = self._places()
+        return namespace(start).where(places[0] < places[1], start | ~end, start & ~end)
 
-    def _pieces(self, normal: Array) -> list[tuple[Array, Array]]:
-        """The middles (S, 2) and the fluxes (S, C) of three pieces of each segment, cut where pixels meet."""
-        xp = namespace(normal)
-        cuts = []
-        for a in (0, 1):
-            border, way = xp.astype(self.square[:, a], normal.dtype) + 1 - self.start[:, a], self.way[:, a]
-            there = xp.abs(way) > 1e-9
-            cuts.append(xp.clip(xp.where(there, border / xp.where(there, way, 1.0), 0.0), 0.0, 1.0))
-        last = xp.where(self.lone, 0.5, 1.0)
-        cuts = [xp.minimum(c, last) for c in (xp.minimum(*cuts), xp.maximum(*cuts))]
-        bounds, pieces = [xp.zeros_like(last), *cuts, last], []
-        jump = stopped(self.jump)
-        for low, high in zip(bounds[:-1], bounds[1:], strict=True):
-            t = ((low + high) / 2)[:, None]
-            moves, jumps = ((1 - t) * x[0] + t * x[1] for x in (self.moves, jump))
-            flux = xp.sum(moves * normal, axis=-1) * (high - low)
-            pieces.append((self.start + t * self.way, flux[:, None] * jumps))
+    def _right_of_bottom(self, low: float, high: float) -> Array:
+        """(S,) the length, between two places on the square's sides, of what lies on the right of the way."""
+        (start, end), xp = self._places(), namespace(self.path)
+
+        def between(a: Array, b: Array) -> Array:
+            return xp.clip(xp.clip(b, low, high) - xp.clip(a, low, high), 0.0, None)
+
+        return xp.where(start < end, high - low - between(start, end), between(end, start))
+
+    def _pieces(self) -> list[tuple[Array, Array, Array]]:
+        """Middles (S, 2), ways (S, 2) and fluxes (S, C) of straight pieces of segments, cut where pixels meet."""
+        xp, pieces, jump = namespace(self.path), [], stopped(self.jump)
+        chord = self.path[2] - self.path[0]
+        length = xp.sum(chord * chord, axis=-1)
+        turn = xp.sum((self.path[1] - self.path[0]) * chord, axis=-1) / xp.where(length > 0, length, 1.0)
+        shares = xp.zeros_like(turn), turn, xp.ones_like(turn)
+        for i in (0, 1):
+            start, way = self.path[i], self.path[i + 1] - self.path[i]
+            cuts = []
+            for a in (0, 1):
+                there = xp.abs(way[:, a]) > 1e-9
+                cuts.append(xp.where(there, (0.5 - start[:, a]) / xp.where(there, way[:, a], 1.0), 0.0))
+            first, last = xp.zeros_like(turn), xp.ones_like(turn)
+            cuts = [xp.clip(c, 0.0, 1.0) for c in (xp.minimum(*cuts), xp.maximum(*cuts))]
+            bounds = [first, *cuts, last]
+            for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+                t = ((low + high) / 2)[:, None]
+                at, piece = start + t * way, (high - low)[:, None] * way
+                u = (1 - t) * shares[i][:, None] + t * shares[i + 1][:, None]
+                moves, jumps = ((1 - u) * x[0] + u * x[1] for x in (self.moves, jump))
+                flux = moves[:, 0] * piece[:, 1] - moves[:, 1] * piece[:, 0]
+                # A lone break's edge ends amid the square.
+                beside = xp.sum(xp.abs(at - self.path[0]), axis=-1) <= 0.5
+                flux = xp.where(self.lone & ~beside, 0.0, flux)
+                pieces.append((at, piece, flux[:, None] * jumps))
         return pieces
 
 
-def _on_sides(local: Array, side: Array) -> Array:
-    """Places (S,) on the sides of squares, 0 to 4, of points (S, 2) in units of the square."""
-    xp = namespace(local)
-    x, y = local[:, 0], local[:, 1]
-    return xp.where(side == 0, x, xp.where(side == 1, 1 + y, xp.where(side == 2, 3 - x, 4 - y)))
+def _corners(start: Array, end: Array, beyond: Array, place: Array, origin: Array) -> Array:
+    """Points (S, 2) between start and end, where outlines turn.
+
+    The lines through the breaks before the start and after the end meet in a point. Where an outline turns there alone,
+    this is its corner. Where it turns as much before and after, it is a curve, whose area beyond the chord is a third
+    of the triangle's. Without such a point in the square, the middle of the chord.
+    """
+    xp = namespace(place)
+    points = [xp.take(place, xp.where(beyond[:, i] >= 0, beyond[:, i], 0), axis=0) - origin for i in range(4)]
+    known = [beyond[:, i] >= 0 for i in range(4)]
+    ahead, back = start - points[1], points[2] - end
+    area = _cross(ahead, back)
+    usable = known[1] & known[2] & (xp.abs(area) > 1e-6)
+    meet = start + (_cross(end - start, back) / xp.where(usable, area, 1.0))[:, None] * ahead
+    chord = end - start
+    inside = xp.all((meet >= 0) & (meet <= 1), axis=-1)
+    usable = usable & inside & (xp.sum((meet - start) * ahead, axis=-1) > 0) & (xp.sum((end - meet) * back, axis=-1) > 0)
+    turns = xp.where(known[0], _angle(points[1] - points[0], ahead), 0.0), xp.where(known[3], _angle(back, points[3] - points[2]), 0.0)
+    whole = _angle(ahead, back)
+    alone = xp.clip(1 - (turns[0] + turns[1]) / xp.where(whole > 1e-6, whole, 1.0), 0.0, 1.0)
+    weight = (1 + 2 * alone) / 3
+    length = xp.sum(chord * chord, axis=-1)
+    share = xp.clip(xp.sum((meet - start) * chord, axis=-1) / xp.where(length > 0, length, 1.0), 0.0, 1.0)
+    foot = start + share[:, None] * chord
+    return xp.where(usable[:, None], foot + weight[:, None] * (meet - foot), start + chord / 2)
 
 
-def _share_of_quarter(low: Array, normal: Array) -> Array:
-    """The area of half a cell by half a cell, with its least corner at `low` (S, 2), where `normal` · x is below 0."""
-    xp = namespace(low)
-    size = xp.sum(xp.abs(normal), axis=-1)
-    flat = size <= 1e-12
-    normal = normal / xp.where(flat, 1.0, size)[:, None]
-    # From the corner where n · x is least, the area grows as squares of the distance.
-    spans = 0.5 * xp.maximum(xp.abs(normal), UPRIGHT * xp.ones_like(normal))
-    a, b = spans[:, 0], spans[:, 1]
-    middle = xp.sum((low + 0.25) * normal, axis=-1)
-    depth = (a + b) / 2 - middle
+def _cross(a: Array, b: Array) -> Array:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
-    def square(x: Array) -> Array:
-        return xp.maximum(x, xp.zeros_like(x)) ** 2
 
-    area = (square(depth) - square(depth - a) - square(depth - b) + square(depth - a - b)) / (8 * a * b)
-    return xp.where(flat, 0.0, area)
+def _angle(a: Array, b: Array) -> Array:
+    """Angles (S,) between vectors (S, 2), 0 to π."""
+    xp = namespace(a)
+    return xp.abs(xp.atan2(_cross(a, b), xp.sum(a * b, axis=-1)))
 
 
 def _beside_breaks(
