@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +58,8 @@ def read(path: Any, size: int, held_out: int, background: Any = None) -> Picture
         background: (3,) colour from 0 to 1, of pictures without alpha and masks; None for that of their borders.
 
     Raises:
-        InputError: no views, one view, pictures that do not tell the object, or an argument of the wrong kind.
+        InputError: no views, one view, pictures that do not tell the object, or half of them without it, or an argument
+            of the wrong kind.
     """
     views = list(path) if isinstance(path, (list, tuple)) else _loaded(path)
     kept = [i for i in range(len(views)) if not held_out or i % held_out != held_out - 1]
@@ -68,6 +70,8 @@ def read(path: Any, size: int, held_out: int, background: Any = None) -> Picture
         )
     given, world = views, around([view.camera.for_size(view.size) for view in views])
     views, outlined, behind = _outlined([_smaller(view, size, world) for view in views], _named(path), background)
+    if outlined:
+        _check_shown(views, _named(path))
     others = [i for i in range(len(views)) if i not in set(kept)]
     numbers = kept + others
     fitted, held = [views[i] for i in kept], [views[i] for i in others]
@@ -125,8 +129,12 @@ def _outlined(views: list[rts.View], named: str, background: Any) -> tuple[list[
     shown = [_shown(view) for view in looked_at]
     if np.mean([((mask < 0.5) & (s > 0.5)).mean() for mask, s in zip(masks, shown, strict=True)]) > OUTSIDE:
         return [_with(view, _cut_out, None if view.lens is None else _shown) for view in views], True, behind
+    white = all(view.mask is not None and view.lens is None for view in looked_at)
     if given is None:
-        behind = _border(images, named)
+        behind = _border(images, named, white)
+    if white:
+        told = f"the masks of {named} are white all over, so that they tell no object; colours alone are compared"
+        warnings.warn(told, rts.RtsWarning, 3)
     return [_with(view, _opaque, None if view.mask is None else _mask) for view in views], False, behind
 
 
@@ -164,16 +172,31 @@ def _cut_out(view: rts.View) -> np.ndarray:
     return np.concatenate([view.image[..., :3] * mask[..., None], mask[..., None]], axis=2)
 
 
-def _border(images: Sequence[np.ndarray], named: str) -> np.ndarray:
-    """The colour (3,) of a plain background, by the outermost pixels."""
+def _check_shown(views: Sequence[rts.View], named: str) -> None:
+    """Refuse pictures half of which show no object, by their alpha or masks; warn of fewer."""
+    blank = [i for i, view in enumerate(views) if not (view.image[..., 3] >= 0.5).any()]
+    if not blank:
+        return
+    names = ", ".join(str(where(views[i]) or i) for i in blank[:3]) + (", …" if len(blank) > 3 else "")
+    told = f"alpha or masks are black all over in {len(blank)} of {len(views)} views of {named}: {names}"
+    if 2 * len(blank) >= len(views):
+        raise rts.InputError(f"{told}; expected masks, or alpha, that are white where the object is")
+    warnings.warn(f"{told}; what these see is taken for empty: leave them out if it is not", rts.RtsWarning, 3)
+
+
+def _border(images: Sequence[np.ndarray], named: str, white: bool) -> np.ndarray:
+    """The colour (3,) of a plain background, by the outermost pixels. `white`: there are masks, white all over."""
     sides = [side[..., :3].reshape(-1, 3) for i in images for side in (i[0], i[-1], i[:, 0], i[:, -1])]
     pixels = np.concatenate(sides)
     behind = np.median(pixels, axis=0)
     scatter = float(np.median(np.abs(pixels - behind).max(axis=1)))
     if scatter > PLAIN:
+        fault = f"the pictures of {named} have neither alpha nor masks"
+        if white:
+            fault = f"the masks of {named} are white all over, so that they tell no object"
         raise rts.InputError(
-            f"the pictures of {named} have neither alpha nor masks, and their borders no plain colour (they differ by "
-            f"{scatter:.2f}, at most {PLAIN} is plain); add masks, or give the background's colour"
+            f"{fault}, and the pictures' borders have no plain colour (they differ by {scatter:.2f}, at most {PLAIN} "
+            "is plain); expected masks that are black outside of the object, or give the background's colour"
         )
     return behind.astype(np.float32)
 

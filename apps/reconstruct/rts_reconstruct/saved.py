@@ -60,8 +60,8 @@ class Saved:
             atlas = {n.removeprefix("atlas_"): arrays.pop(n) for n in list(arrays) if n.startswith("atlas_")}
             model = Model(**arrays, atlas=Atlas(**atlas) if atlas else None)
             before, losses, seconds = about["identity"], about["losses"], about["seconds"]
-        except Exception as error:  # NumPy raises many kinds.
-            raise rts.InputError(f"{self.file} is damaged ({error}); leave out --resume to begin again") from error
+        except Exception:  # NumPy raises many kinds, some with the advice to load pickles.
+            raise rts.InputError(f"{self.file} is damaged; leave out --resume to begin again") from None
         other = [name for name, value in self.identity.items() if before.get(name) != value]
         if other:
             changes = ", ".join(f"{name} was {before.get(name)!r:.40}" for name in other)

@@ -63,6 +63,19 @@ def test_a_viewer_sees_steps_and_can_stop_them(tmp_path, no_pause):
     assert found.model.atlas is None and (tmp_path / "mesh.obj").is_file()
 
 
+@pytest.mark.thorough
+def test_black_masks_are_one_line_and_no_mesh(folder, tmp_path):
+    tree = json.loads((folder / "transforms.json").read_text())
+    rts.save_image(folder / "mask.png", np.zeros((SIZE, SIZE, 3), np.float32))
+    for frame in tree["frames"]:
+        frame["mask_path"] = "mask.png"
+        rts.save_image(folder / frame["file_path"], on_white(rts.load_image(folder / frame["file_path"])))
+    (folder / "transforms.json").write_text(json.dumps(tree))
+    run = CliRunner().invoke(app, f"reconstruct {folder} -o {tmp_path / 'out'} --quick --size {SIZE}".split())
+    assert run.exit_code == 1 and not (tmp_path / "out").exists()
+    assert len(run.stderr.splitlines()) == 1 and "black all over in 8 of 8 views" in run.stderr
+
+
 def gltf(path):
     """The tables of a binary glTF file."""
     data = path.read_bytes()

@@ -60,13 +60,42 @@ def test_masks_cut_the_object_out():
     np.testing.assert_allclose(found.views[0].image[..., :3], on_white(images()[0]) * alpha[..., None], atol=1e-6)
 
 
+def masked(black, change=on_white):
+    """Views of which the first ones have black masks, and the others masks of the object."""
+    return [
+        rts.View(v.camera, change(v.image), mask=v.image[..., 3] * (i >= black), name=v.name)
+        for i, v in enumerate(views())
+    ]
+
+
+def test_masks_that_are_black_in_half_of_the_views_are_refused_and_in_fewer_warned_of():
+    for black in (4, 8):
+        with pytest.raises(rts.InputError, match=f"black all over in {black} of 8 views .*: 0.png, 1.png, 2.png, …;"):
+            pictures.read(masked(black), SIZE, 0)
+    with pytest.raises(rts.InputError, match="alpha or masks are black all over in 8 of 8"):
+        pictures.read(views(lambda image: 0 * image), SIZE, 4)
+    with pytest.warns(rts.errors.RtsWarning, match="black all over in 3 of 8 views .*: 0.png, 1.png, 2.png; what"):
+        pictures.read(masked(3), SIZE, 0)
+
+
+def test_masks_that_are_white_all_over_tell_no_object():
+    def white(change):
+        return [rts.View(v.camera, change(v.image), mask=np.ones((SIZE, SIZE), np.float32)) for v in views()]
+
+    with pytest.warns(rts.errors.RtsWarning, match="white all over, so that they tell no object; colours alone"):
+        assert not pictures.read(white(on_white), SIZE, 0).outlined
+    noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    with pytest.raises(rts.InputError, match="white all over, .* borders have no plain colour .* black outside of the"):
+        pictures.read(white(lambda image: noise), SIZE, 0)
+
+
 def test_pictures_without_alpha_need_a_plain_background():
     behind = np.array([0.2, 0.6, 0.4], np.float32)
     found = pictures.read(views(lambda image: image[..., :3] + (1 - image[..., 3:]) * behind), SIZE, 0)
     assert not found.outlined
     np.testing.assert_allclose(found.background, behind, atol=1e-6)
     noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
-    with pytest.raises(rts.InputError, match="neither alpha nor masks, and their borders no plain colour"):
+    with pytest.raises(rts.InputError, match="neither alpha nor masks, and the pictures' borders have no plain colour"):
         pictures.read(views(lambda image: noise), SIZE, 0)
 
 
