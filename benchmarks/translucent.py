@@ -27,7 +27,7 @@ from rts.diagnostics.example_shapes import icosphere
 from rts.diagnostics.smoothing import low_pass
 from rts.rendering.scene import Scene
 from rts.rendering.splats import to_splats
-from rts_compare.other_renderers.mitsuba_renderer import emitter, mitsuba, sensor
+from rts_compare.other_renderers.mitsuba_renderer import emitter, flat, mitsuba, positions_of, sensor, set_flat
 
 CAMERA = rts.Camera.look_at((0.1, 0.2, 6), (0, 0, 0), (0.21, 1, 0), fov_y=30)
 """Edges of upright cards are aslant in its images."""
@@ -168,11 +168,12 @@ def by_mitsuba(change: Change, samples: int, seed: int) -> np.ndarray:
             meshes[f"part{i}"] = mesh
         scene = mi.load_dict({"type": "scene", "sensor": sensor(SIZE, 30.0, (0.1, 100.0)), **meshes})
     integrator = mi.load_dict({"type": "prb_projective", "max_depth": 8, "rr_depth": 50, "sppi": samples})
-    parameters, key, t = mi.traverse(scene), f"part{change.index}.vertex_positions", mi.Float(0.0)
-    rest = mi.Float(parameters[key])
+    parameters, t = mi.traverse(scene), mi.Float(0.0)
+    key = positions_of(parameters, f"part{change.index}")
+    rest = mi.Float(flat(parameters[key]))
     velocity = np.broadcast_to(view[:3, :3] @ [PIXEL, PIXEL / 2, 0], (len(rest) // 3, 3))
     dr.enable_grad(t)
-    parameters[key] = rest + t * mi.Float(np.ravel(velocity).astype(np.float32))
+    set_flat(parameters, key, rest + t * mi.Float(np.ravel(velocity).astype(np.float32)))
     parameters.update()
     dr.forward(t, dr.ADFlag.ClearEdges)
     image = mi.render(scene, parameters, integrator=integrator, spp=samples, seed=seed)

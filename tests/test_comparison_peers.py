@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from helpers import icosphere
 from scipy.ndimage import gaussian_filter
 
@@ -13,7 +14,7 @@ from rts.diagnostics.smoothing import low_pass
 from rts_compare.derivative_scores import loss_weights
 from rts_compare.moving_scenes import moving
 from rts_compare.other_renderers.installed_renderers import peers
-from rts_compare.other_renderers.mitsuba_renderer import mitsuba
+from rts_compare.other_renderers.mitsuba_renderer import emitter, flat, mitsuba, positions_of, set_flat
 
 pytestmark = pytest.mark.rendering
 
@@ -223,6 +224,39 @@ def test_deodr_does_not_clip():
     pytest.importorskip("deodr")
     _, left_out = peers(moving("long", [SQUARE, card(-1, -1, 1, 1, z=3.5)], CAMERA, SIZE), ())
     assert "DEODR: it clips no triangles, and some are nearer than the near plane" in left_out
+
+
+def test_a_mesh_for_mitsuba_is_a_file_with_its_colours(tmp_path):
+    vertices, faces = icosphere(1)
+    colors = np.abs(vertices) / 3
+    path = tmp_path / "mesh.ply"
+    described = emitter(vertices, faces, str(path), colors)
+    assert described["emitter"]["radiance"] == {"type": "mesh_attribute", "name": "vertex_color"}
+    header, body = path.read_bytes().split(b"end_header\n")
+    assert b"property float r\nproperty float g\nproperty float b\nelement face" in header
+    rows = np.frombuffer(body, "<f4", 6 * len(vertices)).reshape(-1, 6)
+    np.testing.assert_array_equal(rows, np.concatenate([vertices, colors], axis=1).astype(np.float32))
+    read = trimesh.load(path, process=False)
+    np.testing.assert_array_equal(read.faces, faces)
+    assert emitter(vertices, faces, str(path))["emitter"]["radiance"] == {"type": "rgb", "value": 1.0}
+    np.testing.assert_array_equal(trimesh.load(path, process=False).vertices, vertices.astype(np.float32))
+
+
+def test_parameters_of_mitsuba_have_either_name():
+    assert positions_of({"box.vertex_positions": 0}, "box") == "box.vertex_positions"
+    assert positions_of({"box.positions": 0, "box.faces": 0}, "box") == "box.positions"
+
+
+def test_parameters_of_mitsuba_are_flat_or_tensors():
+    try:
+        mi = mitsuba()
+    except ImportError as error:
+        pytest.skip(str(error))
+    rows = np.arange(12, dtype=np.float32).reshape(4, 3)
+    parameters = {"old": mi.Float(rows.reshape(-1)), "new": mi.TensorXf(rows)}
+    for name, shape in {"old": (12,), "new": (4, 3)}.items():
+        set_flat(parameters, name, 2 * flat(parameters[name]))
+        np.testing.assert_array_equal(np.array(parameters[name]), 2 * rows.reshape(shape))
 
 
 @pytest.fixture

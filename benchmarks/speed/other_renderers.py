@@ -17,7 +17,14 @@ import numpy as np
 from benchmarks.camera import DISTANCE, FOV
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import RATE, START
-from rts_compare.other_renderers.mitsuba_renderer import emitter, integrator, mitsuba, sensor
+from rts_compare.other_renderers.mitsuba_renderer import (
+    emitter,
+    integrator,
+    mitsuba,
+    positions_of,
+    sensor,
+    set_flat,
+)
 
 SIGMA = 1.0
 """Width of DEODR's anti-aliased edges, pixels."""
@@ -223,7 +230,7 @@ class Mitsuba(_Fit):
         dr.enable_grad(turn, move)
         if self.full:
             dr.enable_grad(vertices)
-        self.parameters["mesh.vertex_positions"] = dr.ravel(turn @ vertices + move)
+        set_flat(self.parameters, positions_of(self.parameters, "mesh"), dr.ravel(turn @ vertices + move))
         self.parameters.update()
         self.seed += 1
         image = mi.render(self.scene, self.parameters, integrator=self.integrator, spp=SAMPLES, seed=self.seed)

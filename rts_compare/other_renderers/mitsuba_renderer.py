@@ -78,7 +78,8 @@ def integrator() -> Any:
 def emitter(vertices: np.ndarray, faces: np.ndarray, path: str, colors: np.ndarray | None = None) -> dict[str, Any]:
     """The dict of a mesh that emits its vertex colours on a black material.
 
-    Writes a PLY file, which Mitsuba reads with the scene: only so a mesh gets both colours and an emitter.
+    Writes a PLY file, which Mitsuba reads with the scene: only so a mesh gets both colours and an emitter. Every
+    version reads it, while `mitsuba.Mesh` is made in another way from 3.10 on.
 
     Args:
         vertices: (V, 3).
@@ -86,17 +87,10 @@ def emitter(vertices: np.ndarray, faces: np.ndarray, path: str, colors: np.ndarr
         path: of the PLY file.
         colors: (V, 3); None for white.
     """
-    mi = mitsuba()
-    mesh = mi.Mesh("mesh", len(vertices), len(faces))
-    arrays = mi.traverse(mesh)
-    arrays["vertex_positions"] = np.ravel(vertices).astype(np.float32)
-    arrays["faces"] = np.ravel(faces).astype(np.uint32)
-    arrays.update()
     radiance: dict[str, Any] = {"type": "rgb", "value": 1.0}
     if colors is not None:
-        mesh.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
         radiance = {"type": "mesh_attribute", "name": "vertex_color"}
-    mesh.write_ply(path)
+    _write_ply(vertices, faces, path, colors)
     return {
         "type": "ply",
         "filename": path,
@@ -104,6 +98,39 @@ def emitter(vertices: np.ndarray, faces: np.ndarray, path: str, colors: np.ndarr
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
         "emitter": {"type": "area", "radiance": radiance},
     }
+
+
+def _write_ply(vertices: np.ndarray, faces: np.ndarray, path: str, colors: np.ndarray | None) -> None:
+    """Write a PLY file with colours in floating numbers, as Mitsuba reads them."""
+    names = ["x", "y", "z", *("r", "g", "b")[: 0 if colors is None else 3]]
+    rows = vertices if colors is None else np.concatenate([vertices, colors], axis=1)
+    records = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    records["count"], records["corners"] = 3, faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property float {name}" for name in names]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    with open(path, "wb") as file:
+        file.write("\n".join(lines).encode() + np.asarray(rows, "<f4").tobytes() + records.tobytes())
+
+
+# Mitsuba 3.10 was not at hand: its names and shapes are those of its release notes, and were not tried with it.
+
+
+def positions_of(parameters: Mapping[str, Any], mesh: str) -> str:
+    """The name of a mesh's positions: "positions" from Mitsuba 3.10 on, "vertex_positions" before."""
+    name = f"{mesh}.positions"
+    return name if name in parameters else f"{mesh}.vertex_positions"
+
+
+def flat(parameter: Any) -> Any:
+    """A parameter of a mesh as a flat `mitsuba.Float`; from Mitsuba 3.10 on it is a tensor, a row a vertex."""
+    return import_module("drjit").ravel(parameter)
+
+
+def set_flat(parameters: Any, name: str, value: Any) -> None:
+    """Set a parameter of a mesh to a flat `mitsuba.Float`, as a tensor where it was one."""
+    dr, old = import_module("drjit"), parameters[name]
+    parameters[name] = type(old)(value, dr.shape(old)) if dr.is_tensor_v(old) else value
 
 
 class MitsubaScene:
@@ -133,10 +160,10 @@ class MitsubaScene:
         """Name of a parameter that a mode changes → its value at rest and its velocity, as flat `mitsuba.Float`."""
         found = {}
         for index, velocity in enumerate(self.given.velocity(mode)):
-            for entry, change in (("vertex_positions", velocity.vertices), ("vertex_color", velocity.colors)):
+            positions, colors = positions_of(self.parameters, f"part{index}"), f"part{index}.vertex_color"
+            for key, change in ((positions, velocity.vertices), (colors, velocity.colors)):
                 if change is not None:
-                    key = f"part{index}.{entry}"
-                    rest = self.moved[key] if key in self.moved else mitsuba().Float(self.parameters[key])
+                    rest = self.moved[key] if key in self.moved else mitsuba().Float(flat(self.parameters[key]))
                     found[key] = rest, mitsuba().Float(np.ravel(change).astype(np.float32))
         return found
 
@@ -150,7 +177,7 @@ class MitsubaScene:
             seed: of the samples.
         """
         for key, value in {**self.moved, **values}.items():
-            self.parameters[key] = value
+            set_flat(self.parameters, key, value)
         self.moved = dict(rest)
         self.parameters.update()
         return mitsuba().render(self.scene, self.parameters, integrator=self.integrator, spp=spp, seed=seed)
