@@ -13,6 +13,8 @@ The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`
 # pyright: reportUnsupportedDunderAll=false
 # Type checkers read `__init__.pyi`, which declares the names that are imported on first use.
 
+import importlib
+
 from rts import errors, registry, regularizers
 from rts.arrays.engines import Engine, engine_of, namespace
 from rts.compiling.warmup import warmup
@@ -67,7 +69,8 @@ def __getattr__(name: str):
     """The built-in surface or function of this name, imported through its entry point on first use."""
     for place, names in _MOVED.items():
         if name in names.split():
-            raise AttributeError(f"rts.{name} is {place}.{name} now")
+            errors.warn_deprecated(f"rts.{name}", f"{place}.{name}", until="0.4")
+            return getattr(importlib.import_module(place), name)
     found = globals()[name] = registry.attribute(name, __all__)
     return found
 
@@ -76,7 +79,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *registry.built_in_attributes()})
 
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 
 __all__ = [
     "Adaptive",

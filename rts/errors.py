@@ -62,12 +62,23 @@ class FileWarning(RtsWarning):
     """A file was read, but some of its content was ignored."""
 
 
-def warn(message: str, category: type[RtsWarning]) -> None:
+def warn(message: str, category: type[RtsWarning] | type[DeprecationWarning]) -> None:
     """Warn, in one line, and name the line outside of the library that called it."""
     level, frame = 1, sys._getframe(0)
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OWN_PACKAGES:
         level, frame = level + 1, frame.f_back
     warnings.warn(in_one_line(message), category, stacklevel=level)
+
+
+def warn_deprecated(old: str, new: str, *, until: str) -> None:
+    """Warn that a name or argument goes in a later minor version; until then it works as before.
+
+    Args:
+        old: the name, or how it is called: "rts.Fragments".
+        new: the replacement.
+        until: the version without it, at least one minor version after the first that warns: "0.4".
+    """
+    warn(f"{old} is deprecated and goes in rts {until}; take {new}", DeprecationWarning)
 
 
 def in_one_line(text: str) -> str:

@@ -166,8 +166,20 @@ def test_old_names_tell_where_they_are():
     for place, names in rts._MOVED.items():
         for name in names.split():
             assert hasattr(import_module(place), name)
-            with pytest.raises(AttributeError, match=f"rts.{name} is {place}.{name} now"):
-                getattr(rts, name)
+            with pytest.warns(DeprecationWarning, match=f"^rts.{name} is deprecated .*; take {place}.{name}$") as told:
+                assert getattr(rts, name) is getattr(import_module(place), name)
+            assert [w.filename for w in told] == [__file__]
+
+
+def test_names_that_are_deprecated_go_in_the_version_that_they_told():
+    now = tuple(map(int, rts.__version__.split(".")[:2]))
+    versions = []
+    for path in [*FILES.values(), *APPS.values()]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] == "warn_deprecated":
+                [until] = [ast.literal_eval(k.value) for k in node.keywords if k.arg == "until"]
+                versions.append(tuple(map(int, until.split("."))))
+    assert versions and all(now < until for until in versions)
 
 
 def test_compiled_code_is_imported_when_it_is_needed():
@@ -268,7 +280,11 @@ def test_the_oldest_versions_are_those_that_are_allowed():
 
 def test_the_version_is_that_of_the_distribution():
     assert rts.__version__ == version("rasterize-then-splat")
-    assert f"version: {rts.__version__}" in (ROOT / "CITATION.cff").read_text()
+    released, dev, _ = rts.__version__.partition(".dev")
+    [newest, *_] = re.findall(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert f"version: {newest}\n" in (ROOT / "CITATION.cff").read_text()
+    numbers = [tuple(map(int, version.split("."))) for version in (newest, released)]
+    assert numbers[0] < numbers[1] if dev else numbers[0] == numbers[1]
     assert sys.modules["rts"].__file__ == str(FILES["rts"])
 
 

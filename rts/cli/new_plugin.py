@@ -74,6 +74,7 @@ def _names(kind: str, name: str) -> dict[str, str]:
     if name in registry.plugins(f"rts.{group}"):
         raise InputError(f"there is a {kind} {name!r} already; choose another name")
     major, minor = map(int, __version__.split(".")[:2])
+    least = __version__ if "dev" in __version__ else f"{major}.{minor}"  # 0.3.0.dev0 is before 0.3.
     return {
         "kind": kind,
         "group": group,
@@ -82,6 +83,6 @@ def _names(kind: str, name: str) -> dict[str, str]:
         "distribution": f"rts-{name.replace('_', '-')}",
         "package": f"rts_{module}",
         "class_name": "".join(word.capitalize() for word in module.split("_")),
-        "least": f"{major}.{minor}",
+        "least": least,
         "below": f"{major}.{minor + 1}",
     }
