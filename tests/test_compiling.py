@@ -240,7 +240,7 @@ print(sum(several.double.stats.cache_hits.values()), "rts.compiling.numba_intern
     [
         ("", True),
         ("del numba.core.caching.FunctionCache", False),
-        ("del event.Listener, event.register", False),
+        ("del event.Listener", False),
         (
             "njit = numba.njit\nnumba.njit = lambda **o: njit(**o) if 'cache' in o else "
             "lambda f: type('Other', (), {'__slots__': ()})()",

@@ -17,8 +17,8 @@ from contextlib import contextmanager, suppress
 from typing import IO, Any
 
 import numba
-from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.event import Listener, register
 from numba.core.serialize import dumps
 
 try:
@@ -83,11 +83,11 @@ class _Checked(CompileResultCacheImpl):
         code = dumps(super().reduce(cres))
         return zlib.crc32(code), code
 
-    def rebuild(self, target_context: Any, reduced_data: Any) -> Any:
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
         """The code of what `reduce` made; None for the form of earlier versions, which have no checksum."""
-        if len(reduced_data) != 2:
+        if len(payload) != 2:
             return None
-        checksum, code = reduced_data
+        checksum, code = payload
         if zlib.crc32(code) != checksum:
             raise ValueError("these are not the bytes that were written")
         return super().rebuild(target_context, pickle.loads(code))
@@ -125,7 +125,7 @@ class _Cache(FunctionCache):
             _tell(f"rts: compiled loops in {self.cache_path} are damaged; what is damaged is compiled anew …")
 
 
-class _Watch(event.Listener):
+class _Watch(Listener):
     """Listener to the compilation of the library's loops and their helpers. The compiler holds its lock meanwhile.
 
     It prints one message once all compilations together have taken `TOLD_AFTER` seconds. It also pauses garbage
@@ -172,4 +172,4 @@ def _tell(line: str) -> None:
             stream.flush()
 
 
-event.register("numba:compile", _Watch())
+register("numba:compile", _Watch())
