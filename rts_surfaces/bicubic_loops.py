@@ -276,8 +276,9 @@ def _unit_product(work, normal):
     for c in range(3):
         p, q = (c + 1) % 3, (c + 2) % 3
         normal[c] = work[4, p] * work[5, q] - work[4, q] * work[5, p]
-    square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
-    length = np.sqrt(square) if square > 0 else square + normal.dtype.type(1)
+    x, y, z = np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2])  # Squares beyond float32's range.
+    square = x * x + y * y + z * z
+    length = normal.dtype.type(np.sqrt(square) if square > 0 else square + 1)
     for c in range(3):
         normal[c] /= length
     return length

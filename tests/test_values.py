@@ -5,11 +5,12 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, arrays, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, gradient, to_numpy
 
 import rts
 from rts import Camera, InputError, Part
 from rts.arrays.array_functions import is_finite
+from rts.arrays.trees import leaves
 from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.rendering
@@ -141,6 +142,48 @@ def test_nan_that_no_sample_sees_hurts_nobody():
     colors[hidden] = np.nan
     expected = show(made("unlit"), layers=1)
     np.testing.assert_array_equal(show(made("unlit", colors=colors), layers=1), expected)
+
+
+COLORS = "colours", "texture", "colour", "colour of light", "ambient light", "specular"
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+@pytest.mark.parametrize("what", COLORS)
+def test_colours_too_bright_for_their_derivatives_are_refused_by_name(what, target):
+    for value in (3e38, -1.1e30):
+        part = HOLED[what](value)
+        with pytest.raises(InputError, match=r"holds a number of 1e\+30 or more; expected") as error:
+            show(part.replace(theta=arrays(target, part.theta)))
+        named = "the surface's 'color'" if what == "colours" else NAMED[what]
+        assert named in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("what", COLORS)
+def test_colours_just_below_that_have_finite_gradients(what, target):
+    part = HOLED[what](9e29)
+    found = gradient(target, lambda t: show(part.replace(theta=t))[..., :3].mean(), arrays(target, part.theta))
+    assert all(np.isfinite(x).all() for x in leaves(found))
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+def test_colours_of_a_shader_and_of_a_background_too_bright_are_refused(target):
+    def bright(theta, gbuffer, camera):
+        return gbuffer["position"][:, [0, 1, 2, 2]] * 0 + 3e38
+
+    part = PART.replace(theta=arrays(target, PART.theta))
+    with pytest.raises(InputError, match="what the shader .*bright.* of part 0 holds a number of 1e.30 or more"):
+        show(part.replace(shader=bright))
+    with pytest.raises(InputError, match="background holds a number of 1e.30 or more"):
+        show(part, background=arrays(target, np.full(3, 3e38)))
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_depths_of_black_and_white_that_are_one_are_refused(target):
+    for given in (np.array([4.0, 4.0]), np.array([4.0, 4.0 + 1e-9])):  # One number in float32.
+        part = made("depth", depth_range=given)
+        with pytest.raises(InputError, match=r"theta\['depth_range'\] is .*4.*; expected two different depths"):
+            show(part.replace(theta=arrays(target, part.theta)))
 
 
 def test_numbers_too_large_to_be_squared_are_finite():

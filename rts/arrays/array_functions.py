@@ -151,9 +151,22 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
 def unit(x: Array) -> Array:
     """Vectors scaled to length one; a zero vector stays zero, and has the identity for derivative."""
     xp = namespace(x)
-    square = dot(x, x)
+    with np.errstate(over="ignore"):  # NumPy warns of squares that are too large.
+        square = dot(x, x)
+    if not _is_moderate(square):
+        # Float32 holds no square of a length below 1e-19 or above 1e19, so the largest component becomes 1 before.
+        size = xp.max(abs(engine_of(x).stop_gradient(x)), axis=-1, keepdims=True)
+        x = x / xp.where(size > 0, size, xp.ones_like(size))
+        square = dot(x, x)
     safe = xp.where(square > 0, square, xp.ones_like(square))
     return x / xp.sqrt(safe)
+
+
+def _is_moderate(square: Array) -> bool:
+    """True if squares are known, on the host, and far from the ends of float32; zeros are not, and may be underflow."""
+    engine = engine_of(square)
+    values = engine.known(square) if engine.on_host(square) else None
+    return values is not None and bool(values.min(initial=1.0) > 1e-24 and values.max(initial=1.0) < 1e24)
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -171,15 +184,18 @@ def without_border(image: Array, border: int) -> Array:
     return image[border : height - border, border : width - border, ...] if border else image
 
 
-def is_finite(*arrays: Array) -> bool:
-    """True if no array holds NaN or infinity; traced arrays pass. Quick if all are finite."""
-    return all(map(_is_finite, arrays))
+def is_finite(*arrays: Array, below: float = math.inf) -> bool:
+    """True if no array holds NaN, infinity, or a number that is not `below` in size; traced arrays pass.
+
+    Quick if it is true.
+    """
+    return all([_is_finite(x, below) for x in arrays])
 
 
-def _is_finite(x: Array) -> bool:
+def _is_finite(x: Array, below: float) -> bool:
     engine = engine_of(x)
     if not engine.on_host(x):
-        values = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
+        values = value_of(engine.namespace.all(abs(x) < below))
         return values is None or bool(values.all())
     values = engine.known(x)
     if values is None or not values.size:
@@ -187,4 +203,4 @@ def _is_finite(x: Array) -> bool:
     from rts.arrays.extremes import largest
 
     # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
-    return math.isfinite(largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]))
+    return largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below

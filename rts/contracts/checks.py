@@ -67,6 +67,9 @@ def _memory() -> float:
 
 MEMORY = _memory()
 
+BRIGHTEST = 1e30
+"""The size that colours stay below: derivatives of sums of larger ones overflow float32."""
+
 
 def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[CheckedPart], Camera]:
     """A list of the parts, checked, and the camera, turned to look along −z; wrong ones raise an `InputError`.
@@ -323,9 +326,15 @@ def check_background(background: Any, size: tuple[int, int], channels: int) -> A
             f"({height}, {width}, {all_})"
         )
     check_floating("background", background)
-    if not is_finite(background):
-        raise InputError("background holds NaN or infinity; expected finite colours")
+    check_bounded("background", background)
     return background
+
+
+def check_bounded(name: str, value: Array) -> None:
+    """Refuse floats that are NaN or infinite, or not below `BRIGHTEST` in size; traced arrays pass."""
+    if not is_finite(value, below=BRIGHTEST):
+        fault = f"a number of {BRIGHTEST:g} or more" if is_finite(value) else "NaN or infinity"
+        raise InputError(f"{name} holds {fault}; expected finite numbers below {BRIGHTEST:g}")
 
 
 def check_floating(name: str, value: Array) -> None:
@@ -348,7 +357,7 @@ def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
 def check_splats(
     index: int, part: CheckedPart, gbuffer: GBuffer, positions: Array, rgba: Array, row: Array, first: int
 ) -> None:
-    """Refuse samples of a part whose position or colour is NaN or infinite, and name the cause.
+    """Refuse samples whose position or colour is NaN or infinite, and colours of `BRIGHTEST` or more; name the cause.
 
     Traced values are skipped, and rows that no cell refers to. No shader or splatter of the library turns NaN into a
     number.
@@ -362,7 +371,7 @@ def check_splats(
         row: (K, H, W) int32, the row of each cell's sample, counted over all parts.
         first: the first row of this part.
     """
-    if is_finite(positions, rgba):
+    if is_finite(positions) and is_finite(rgba, below=BRIGHTEST):
         return
     rows = value_of(row)
     if rows is None:
@@ -370,14 +379,19 @@ def check_splats(
     count = positions.shape[-2]
     used = np.unique(rows[(rows >= first) & (rows < first + count)]) - first
 
-    def wrong(x: Any) -> bool:
-        """True if a value holds NaN or infinity; if it has a row for each sample, only visible rows are checked."""
+    def wrong(x: Any, below: float = math.inf) -> bool:
+        """True if a number is not `below` in size; if there is a row for each sample, only visible rows are checked."""
         array = value_of(x)
         if array is None or array.dtype.kind != "f":
             return False
-        return not np.isfinite(array[..., used, :] if array.shape[-2:-1] == (count,) else array).all()
+        return not (np.abs(array[..., used, :] if array.shape[-2:-1] == (count,) else array) < below).all()
 
     if not (wrong(positions) or wrong(rgba)):  # Unused rows may hold anything.
+        if wrong(rgba, BRIGHTEST):
+            raise InputError(
+                f"what the shader {quoted(part.shader)} returned of part {index} holds a number of {BRIGHTEST:g} or "
+                f"more; expected smaller colours"
+            )
         return
     for place, value in placed_leaves(part.theta):
         if wrong(value):

@@ -17,15 +17,17 @@ The base colour is the texture where θ has one and the surface has uv, else the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, dot, is_finite, shape_of, unit
 from rts.arrays.engines import engine_of, is_constant, namespace, value_of
 from rts.arrays.trees import Array, Tree, map_leaves
+from rts.contracts.checks import BRIGHTEST, check_bounded
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
@@ -82,7 +84,10 @@ class Depth(Shader):
         depth = camera.depth(gbuffer["position"])
         xp = namespace(depth)
         if "depth_range" in theta:
-            near, far = (_entry(theta, "depth_range", (2,))[i] for i in (0, 1))
+            ends = _entry(theta, "depth_range", (2,))
+            known, (near, far) = value_of(ends), (ends[0], ends[1])
+            if known is not None and (known[..., 0] == known[..., 1]).any():
+                raise InputError(f"theta['depth_range'] is {quoted(known)}; expected two different depths")
         else:
             near, far = camera.depth_range()
         grey = xp.clip((depth - near) / (far - near), 0.0, 1.0)
@@ -130,11 +135,13 @@ class Unlit(Shader):
                 xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1) if weighed else texture
             )
             base = sample_texture(texture, gbuffer["uv"], self.wrap, footprint)
+            _check_base("theta['texture']", base)
             if weighed:
                 alpha = base[:, 3:]
                 base = xp.concat([base[:, :3] / xp.where(alpha > 0, alpha, 1.0), alpha], axis=1)
         elif "color" in gbuffer:
             base = gbuffer["color"]
+            _check_base("the surface's 'color'", base)
         else:
             base = xp.ones_like(position)
         one = xp.ones_like(position[:, :1])
@@ -277,8 +284,15 @@ def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
         raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
     if not number and not namespace(value).isdtype(value.dtype, "real floating"):
         raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
-    if not (math.isfinite(value) if number else is_finite(value)):
-        raise InputError(f"theta{entry} holds NaN or infinity; expected finite numbers")
+    check_bounded(f"theta{entry}", np.asarray(value, float) if number else value)
+
+
+def _check_base(name: str, base: Array) -> None:
+    """Refuse base colours (N, C) of `BRIGHTEST` or more; NaN is refused with the shader's result, by its cause."""
+    if not is_finite(base, below=BRIGHTEST):
+        values = value_of(base)
+        if values is not None and not np.isnan(values).any():
+            raise InputError(f"{name} holds a number of {BRIGHTEST:g} or more; expected smaller colours")
 
 
 def _positive(x: Array) -> Array:
