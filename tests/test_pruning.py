@@ -136,6 +136,20 @@ def test_nothing_is_dropped_that_may_be_seen_through():
     np.testing.assert_array_equal(same, whole)
 
 
+@pytest.mark.parametrize("name", ["sphere before a card", "closed box"])
+@pytest.mark.parametrize("options", [{"layers": 3}, {"layers": 3, "supersample": rts.Adaptive(2)}, {"layers": "auto"}])
+def test_scenes_with_a_translucent_part_keep_all_samples(options, name):
+    def count(parts, splatter):
+        sampled = sample(parts, CAMERA, SIZE, splatter=splatter, **options)
+        fine = () if sampled.fine is None else sampled.fine.samples
+        return sum(len(s.ids) for s in (*sampled.samples, *fine))
+
+    solid, glass = card(0.9), card(0.9).replace(shader=rts.plugin("shaders", "unlit")(opaque=False))
+    kept, every = (count([glass, *SCENES[name]], s) for s in ("visible", Keeping("visible")))
+    assert kept == every
+    assert count([solid, *SCENES[name]], "visible") < every
+
+
 def test_constant_surfaces_are_evaluated_only_where_needed():
     calls = []
 

@@ -1,0 +1,231 @@
+"""Ways of rendering a mixed scene that have to give one image and one gradient, and how far they are apart.
+
+`python tests/mixed_ways.py 0:500` renders the scenes of these numbers in all ways, and counts the differences by kind.
+"""
+
+import argparse
+import collections
+import contextlib
+import functools
+import itertools
+import warnings
+
+import numpy as np
+from helpers import arrays, derivative, gradient, to_numpy
+from mixed_scenes import mixed_of
+
+import rts
+from rts.arrays.trees import leaves, map_leaves
+from rts.splatting import Visible
+
+FLAGS = ("whole", "views", "prepared", "enough", "specified", "forward", "numpy", "jax", "jit")
+"""How a way differs from `rts.render` of torch arrays, and a gradient in reverse mode.
+
+- whole: no hidden sample is left out.
+- views: `rts.render_views` of both cameras, in place of one call each.
+- prepared: by `rts.prepare`.
+- enough: with the least capacity that drops nothing.
+- specified: by the splatter in array code, on the samples of the compiled one.
+- forward: a derivative in forward mode.
+- numpy, jax, jit: arrays of NumPy, of jax, and of jax in a compiled program.
+"""
+
+NEVER = ({"numpy", "jax"}, {"numpy", "jit"}, {"jax", "jit"}, {"numpy", "forward"}, {"specified", "whole"})
+SINGLES = [frozenset([flag]) for flag in FLAGS]
+PAIRS = [frozenset(pair) for pair in itertools.combinations(FLAGS, 2) if set(pair) not in NEVER]
+MOST = 1e-5
+"""The largest difference of images, and of derivatives as a share of the largest, in float64."""
+
+IGNORED = rts.errors.EmptyImageWarning, rts.errors.LayersWarning, rts.errors.InputWarning
+
+
+def name_of(way):
+    """The way in words."""
+    return " ".join(sorted(way, key=FLAGS.index)) or "plain"
+
+
+def differences(number, way):
+    """How a way differs from the plain one: pairs (what, how far), without those of at most `MOST`.
+
+    The share is that of a gradient's largest entry. In forward mode, along one direction, it is that of its length.
+    """
+    scene = mixed_of(number)
+    (image, slopes), (expected, known) = result_of(scene, way), _plain(number, "views" in way, _layers(scene, way))
+    off = {"image": np.abs(image - expected).max()}
+    if "forward" in way:
+        push = known @ _flat(_along(scene))
+        off["derivative"] = np.abs(slopes - push) / max(np.linalg.norm(known), MOST)
+    elif slopes is not None:
+        off["gradient"] = np.abs(slopes - known).max() / max(np.abs(known).max(), MOST)
+    return [(what, float(x)) for what, x in off.items() if not x <= MOST]
+
+
+@functools.lru_cache(4)
+def _plain(number, both, layers):
+    """The result of the plain way, of one view or both."""
+    scene = mixed_of(number)._replace(layers=layers)
+    if not both:
+        return result_of(scene, frozenset())
+    (first, slope), (second, other) = (
+        result_of(scene._replace(cameras=[camera]), frozenset(), i) for i, camera in enumerate(scene.cameras)
+    )
+    return np.concatenate([first, second]), slope + other
+
+
+def _layers(scene, way):
+    """The number of layers, which has to be known in compiled programs."""
+    return 6 if "jit" in way and scene.layers == "auto" else scene.layers
+
+
+def result_of(scene, way, view=0):
+    """The images (B, H, W, 4) of a scene, and their derivative: a flat gradient, or a number in forward mode.
+
+    Args:
+        scene: a `Mixed`.
+        way: its flags.
+        view: the index of the first view, whose weights count.
+    """
+    cameras = scene.cameras if "views" in way else scene.cameras[:1]
+    engine = "numpy" if "numpy" in way else "jax" if {"jax", "jit"} & way else "torch-cpu"
+    compiled = __import__("jax").jit if "jit" in way else lambda f: f
+    weights = np.random.default_rng(0).normal(size=(2, *scene.size, 4))[view : view + len(cameras)]
+    options = {"layers": _layers(scene, way), "supersample": scene.supersample}
+    with _float64(engine), warnings.catch_warnings():
+        for kind in IGNORED:
+            warnings.simplefilter("ignore", kind)
+        if "enough" in way:
+            options["capacity"] = least_capacity(scene, cameras, _splatter(way), options)
+        weights, still = arrays(engine, (weights, _values(scene)), np.float64)
+
+        def images(values):
+            parts = _prepared(scene, values, still) if "prepared" in way else _parts(scene, values)
+            return _images(parts, cameras, scene.size, way, options)
+
+        if engine == "numpy":
+            return images(still), None
+        if "forward" in way:
+            image, push = derivative(engine, compiled(images), still, arrays(engine, _along(scene), np.float64))
+            return image, (push * to_numpy(weights)).sum()
+        slopes = gradient(engine, compiled(lambda values: (images(values) * weights).sum()), still)
+        return to_numpy(compiled(images)(still)), _flat(slopes)
+
+
+def least_capacity(scene, cameras, splatter, options):
+    """The least capacity with which no sample is dropped in any view."""
+    parts = _parts(scene, _values(scene))
+
+    def drops(capacity):
+        sampled = (rts.sample(parts, c, scene.size, splatter=splatter, capacity=capacity, **options) for c in cameras)
+        return any(int(s.overflow) for s in sampled)
+
+    low, high = 0, 1
+    while drops(high):
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if drops(middle) else (low, middle)
+    return high
+
+
+def _values(scene):
+    """The arrays that move: a pose of each part, or the vertices and colours of each."""
+    return [{"pose": np.zeros(6)} if scene.poses else dict(part.theta) for part in scene.parts]
+
+
+def _along(scene):
+    """A direction of `_values`."""
+    rng = np.random.default_rng(1)
+    return map_leaves(lambda x: rng.normal(size=x.shape), _values(scene))
+
+
+def _changes(scene, values):
+    return [{"transform": rts.rigid(v["pose"])} if scene.poses else {"theta": v} for v in values]
+
+
+def _parts(scene, values):
+    return [part.replace(**change) for part, change in zip(scene.parts, _changes(scene, values), strict=True)]
+
+
+def _prepared(scene, values, still):
+    """The parts prepared at values that are not traced, and moved to the same values."""
+    prepared = rts.prepare(scene.parts if scene.poses else _parts(scene, still))
+    for i, change in enumerate(_changes(scene, values)):
+        prepared = prepared.replace(i, **change)
+    return prepared
+
+
+def _images(parts, cameras, size, way, options):
+    if "specified" in way and "views" not in way:  # On the very samples of the compiled splatter.
+        sampled = [rts.sample(parts, c, size, splatter="visible", settles=True, **options) for c in cameras]
+        parts = parts if isinstance(parts, list) else list(parts.parts)
+        pairs = zip(sampled, cameras, strict=True)
+        images = [rts.render_samples(own, parts, camera, splatter=Visible()) for own, camera in pairs]
+    elif "views" in way:
+        return rts.render_views(parts, cameras, size, splatter=_splatter(way), **options)
+    else:
+        images = [rts.render(parts, camera, size, splatter=_splatter(way), **options) for camera in cameras]
+    return rts.namespace(images[0]).stack(images)
+
+
+def _splatter(way):
+    if "whole" in way:
+        return type("Every", (rts.plugin("splatters", "visible"),), {"needed": rts.Splatter.needed})()
+    return Visible() if "specified" in way else "visible"
+
+
+def _flat(tree):
+    return np.concatenate([np.ravel(x) for x in leaves(tree)])
+
+
+@contextlib.contextmanager
+def _float64(engine):
+    """Numbers of jax in float64."""
+    if engine != "jax":
+        yield
+        return
+    config = __import__("jax").config
+    config.update("jax_enable_x64", True)
+    try:
+        yield
+    finally:
+        config.update("jax_enable_x64", False)
+
+
+def ways_of(number, every):
+    """The ways that the scene of a number is tried in.
+
+    All single ones and three pairs, so that each pair has its turn; those of jax, which compile for seconds, at every
+    `every`-th number.
+    """
+    ways = [*SINGLES, *(PAIRS[(3 * number + i) % len(PAIRS)] for i in range(3))]
+    return [way for way in ways if not way & {"jax", "jit"} or number % every == 0]
+
+
+def main():
+    """Count the differences of the scenes of a range of numbers."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("numbers", help="such as 0:500")
+    parser.add_argument("--jax", type=int, default=5, help="jax at every so many numbers")
+    given = parser.parse_args()
+    first, last = map(int, given.numbers.split(":"))
+    tried, found, worst = collections.Counter(), collections.defaultdict(set), collections.defaultdict(float)
+    for number in range(first, last):
+        scene = mixed_of(number)
+        kind = "translucent" if scene.translucent else "opaque"
+        kind += ", Adaptive" if isinstance(scene.supersample, rts.Adaptive) else ""
+        for way in ways_of(number, given.jax):
+            tried[kind, name_of(way)] += 1
+            for what, off in differences(number, way):
+                key = kind, name_of(way), what
+                found[key].add(number)
+                worst[key] = max(worst[key], off)
+                print(f"{number} {kind}, {name_of(way)}: {what} off by {off:.2g}", flush=True)
+    print(f"\n{last - first} scenes; scenes that differ, of so many tried")
+    for key in sorted(found):
+        print(
+            f"{' | '.join(key)}: {len(found[key])} of {tried[key[:2]]}, by up to {worst[key]:.2g}; {sorted(found[key])}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Scenes of opaque and translucent parts give one image and one gradient, in whatever way they are rendered.
+
+`mixed_ways.py` tries as many scenes as one likes. Scenes that fail have their numbers here, as expected failures.
+"""
+
+import numpy as np
+import pytest
+from mixed_scenes import mixed_of
+from mixed_ways import PAIRS, SINGLES, differences, name_of
+
+import rts
+
+pytestmark = pytest.mark.rendering
+
+pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+FIRST, JAX, SHARED = 10, (10, 2), range(12)
+"""The scene of `make test`; those that jax compiles; and those of all other ways."""
+
+SIDES = "exits at outlines find no room where a capacity just fits the samples, and nothing counts them"
+PICTURE = "gradients of translucent layers differ between views side by side and views alone"
+LOOPS = "compiled gradients of translucent layers differ from the specification's"
+MODES = "derivatives of translucent layers differ between forward and reverse mode"
+KNOWN = {
+    (4, "enough"): SIDES,
+    (6, "specified"): LOOPS,
+    (8, "specified"): LOOPS,
+    (14, "views"): PICTURE,
+    (14, "enough"): SIDES,
+    (17, "views"): PICTURE,
+    (17, "specified"): LOOPS,
+    (125, "forward"): MODES,
+}
+"""Numbers of scenes and names of ways that fail, and why."""
+
+
+def cases():
+    """Scenes and single ways; then each pair of ways, on one scene."""
+    singles = [(n, way) for way in SINGLES for n in (JAX if way & {"jax", "jit"} else SHARED)]
+    singles += [(n, frozenset([name])) for n, name in KNOWN if n not in SHARED]
+    for number, way in singles + [(FIRST, way) for way in PAIRS]:
+        quick = number == FIRST and len(way) == 1 and not way & {"jax", "jit"}
+        marks = [] if quick else [pytest.mark.thorough]
+        if reason := KNOWN.get((number, name_of(way))):
+            marks.append(pytest.mark.xfail(strict=True, reason=reason))
+        yield pytest.param(number, way, marks=marks, id=f"{number}-{name_of(way)}")
+
+
+@pytest.mark.parametrize(("number", "way"), list(cases()))
+def test_every_way_of_rendering_gives_one_image_and_one_gradient(number, way):
+    assert differences(number, way) == []
+
+
+def test_mixed_scenes_are_of_all_kinds_and_the_same_every_time():
+    scenes = [mixed_of(number) for number in range(80)]
+    assert sum(scene.translucent for scene in scenes) == 60
+    assert all(any(part.shader.opaque for part in scene.parts) for scene in scenes)
+    assert {size for scene in scenes for size in scene.size} <= set(range(5, 41))
+    assert {scene.layers for scene in scenes} == {1, 2, 3, 4, 6, "auto"}
+    assert sum(isinstance(scene.supersample, rts.Adaptive) for scene in scenes) > 20
+    for scene, again in zip(scenes, map(mixed_of, range(80)), strict=True):
+        assert scene[2:] == again[2:]
+        for part, other in zip(scene.parts, again.parts, strict=True):
+            np.testing.assert_array_equal(part.theta["vertices"], other.theta["vertices"])
+            np.testing.assert_array_equal(part.theta["colors"], other.theta["colors"])
