@@ -44,11 +44,30 @@ class Reference(TriangleSampler):
             within = np.arange(len(triangle)) - np.repeat(np.cumsum(counts[chunk]) - counts[chunk], counts[chunk])
             columns = (last - first + 1)[triangle, 0]
             x, y = first[triangle, 0] + within % columns, first[triangle, 1] + within // columns
-            hits.append(_hits(triangle, x, y, corners, depth, size))
+            hits.append(_hits(triangle, y * width + x, x + 0.5, y + 0.5, corners, depth, size))
         if not hits:
             return _empty(size, layers)
         triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*hits, strict=True))
         return _nearest(triangle, pixel, barycentrics, depth, size, layers)
+
+    def rasterize_points(
+        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
+    ) -> Fragments:
+        """See `TriangleSampler.rasterize_points`: every triangle against every point."""
+        homogeneous = np.concatenate([prepared.vertices.astype(np.float64), np.ones((len(prepared.vertices), 1))], 1)
+        in_camera = homogeneous @ camera.view.T
+        corners, depth = (in_camera @ camera.projection.T)[prepared.faces], -in_camera[prepared.faces, 2]
+        kept = np.ones(len(corners), bool)
+        if cull != "none":
+            kept = _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
+        triangles, hits = np.flatnonzero(kept), []
+        for chunk in _chunks(np.full(len(points), len(triangles))):
+            triangle, place = np.tile(triangles, len(chunk)), np.repeat(chunk, len(triangles))
+            hits.append(_hits(triangle, place, *points[place].T, corners, depth, size))
+        line = 1, len(points)
+        if not hits:
+            return _empty(line, layers)
+        return _nearest(*map(np.concatenate, zip(*hits, strict=True)), line, layers)
 
     def between(
         self, prepared: Proxy, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
@@ -154,14 +173,14 @@ def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
     return (outward * toward).sum(axis=1) > 0
 
 
-def _hits(triangle, x, y, corners, depth, size):
-    """Triangles, flat pixel indices, first two barycentrics and depths of those candidates that hit.
+def _hits(triangle, place, x, y, corners, depth, size):
+    """Triangles, places, first two barycentrics and depths of those candidates that hit.
 
-    Candidate n is triangle `triangle[n]` at pixel (x[n], y[n]); `corners` (T, 3, 4) are in clip space, `depth` (T, 3)
-    are linear depths of corners.
+    Candidate n is triangle `triangle[n]` at the position (x[n], y[n]), in pixels, of place `place[n]`; `corners`
+    (T, 3, 4) are in clip space, `depth` (T, 3) are linear depths of corners.
     """
     height, width = size
-    ndc_x, ndc_y = (x + 0.5) * 2 / width - 1, 1 - (y + 0.5) * 2 / height
+    ndc_x, ndc_y = x * 2 / width - 1, 1 - y * 2 / height
     c = corners[triangle]
     gx, gy = c[..., 0] - ndc_x[:, None] * c[..., 3], c[..., 1] - ndc_y[:, None] * c[..., 3]
     edges = np.stack([_cross(gx[:, i], gy[:, i], gx[:, j], gy[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], -1)
@@ -172,13 +191,13 @@ def _hits(triangle, x, y, corners, depth, size):
     owned = np.where(slope_x * sign[:, None] != 0, slope_x * sign[:, None] > 0, slope_down * sign[:, None] > 0)
     oriented = edges * sign[:, None]
     hit = ((oriented > 0) | ((oriented == 0) & owned)).all(axis=1) & (total != 0)
-    triangle, x, y, c = triangle[hit], x[hit], y[hit], c[hit]
+    triangle, place, c = triangle[hit], place[hit], c[hit]
     b = edges[hit] / total[hit, None]
     near, far = (b * (c[..., 2] + c[..., 3])).sum(1) >= 0, (b * (c[..., 3] - c[..., 2])).sum(1) >= 0
     # Σ bᵢ wᵢ > 0 tells a point in front of the viewer from one behind that projects to the same pixel.
     seen = near & far & ((b * c[..., 3]).sum(1) > 0)
     z = (b * depth[triangle]).sum(axis=1)
-    return triangle[seen], (y * width + x)[seen], b[seen, :2], z[seen]
+    return triangle[seen], place[seen], b[seen, :2], z[seen]
 
 
 def _cross(ax, ay, bx, by):

@@ -334,8 +334,10 @@ class Outlines:
         ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
             the other. −1 in second place if a break is alone.
         side: (S, 2) int32, the sides of the square that these breaks lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
-        beyond: (S, 4) int32, the breaks along the same outline before and after these two: the last but one, the last,
-            the next, and the next but one; −1 for none.
+        beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
+        corner: (S, 2) float64, x and y of a point between the two where the outline turns.
+        pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
+            is the motion of the corner.
         joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y?
     """
 
@@ -350,6 +352,8 @@ class Outlines:
     ties: Array
     side: Array
     beyond: Array
+    corner: Array
+    pull: Array
     joined: Array
 
 

@@ -21,7 +21,8 @@ class Splatter(Plugin):
     Attributes:
         layers: the number of layers it reads, from the front; None for all.
         reach: the largest distance, in cells along either axis, at which a sample has an effect; at least 1.
-        reads: the fields of `Cells` that it reads, out of "facing" and "exit"; samplers compute no others.
+        reads: the fields that it reads, out of `Cells.facing` and `Cells.exit` (samplers compute no others) and
+            `Splats.outlines`, by name.
         fills_interiors: a promise on samples of one opaque colour, on cells' centres, that move by little. A cell shows
             this colour if the nine cells in and around it have samples in layer 0, and no sample behind these is
             `needed`. It shows nothing if all nine are empty. A cell that is `settled` shows the colour of its sample,

@@ -16,8 +16,8 @@ from rts.errors import InputError
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
 from rts.rendering.scene import Grid, Scene
-from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
-from rts.sampling.segments import joined
+from rts.sampling.gaps import Fronts, Oracle, find_breaks, more_breaks
+from rts.sampling.segments import joined, tips
 from rts.sampling.sheets import Sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
@@ -30,8 +30,12 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid) -> Sampled:
         InputError: arrays are traced; or a sampler cannot sample single points.
     """
     points = _Points.of(scene, grid)
-    breaks = find_breaks(points.at_centres(sampled), points.oracle())
+    fronts, oracle = points.at_centres(sampled), points.oracle()
+    breaks = find_breaks(fronts, oracle)
     segments = joined(breaks)
+    further = more_breaks(breaks, *tips(breaks, segments), fronts, oracle)
+    if further is not breaks:
+        breaks, segments = further, joined(further)
     samples, rows, first = [], np.full(breaks.parts.shape, -1, np.int32), 0
     for part, own in enumerate(sampled.samples):
         asked = breaks.parts == part

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
+from rts.errors import InputError
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned
 
@@ -46,13 +47,19 @@ class RenderSettings:
             capacity: as in `rts.render`.
 
         Raises:
-            InputError: an argument is of another kind, or makes no image.
+            InputError: an argument is of another kind, or makes no image; or a splatter that finds outlines is to have
+                an `Adaptive`.
         """
         finest = supersample.samples if isinstance(supersample, Adaptive) else supersample
         size = check_size(size, layers, capacity, finest)
         if not isinstance(supersample, Adaptive):
             supersample = int(supersample)
         splatter = check_splatter(splatter)
+        if isinstance(supersample, Adaptive) and "outlines" in splatter.reads:
+            raise InputError(
+                f"supersample is {supersample!r}, and {splatter!r} finds outlines without further samples; give 1, or a "
+                f"number of samples along each side of a pixel"
+            )
         if splatter.layers is not None:  # More would not be read.
             layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))
         return size, cls(splatter, layers if layers == "auto" else int(layers), supersample, capacity)
@@ -61,6 +68,11 @@ class RenderSettings:
     def side(self) -> int | None:
         """Number of cells along each side of a pixel; None for `Adaptive`."""
         return None if isinstance(self.supersample, Adaptive) else self.supersample
+
+    @property
+    def finds_outlines(self) -> bool:
+        """True if the splatter reads the outlines between centres."""
+        return "outlines" in self.reader.reads
 
     @property
     def contrast(self) -> float | None:

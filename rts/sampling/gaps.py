@@ -144,39 +144,67 @@ class _Lines(NamedTuple):
 def find_breaks(fronts: Fronts, oracle: Oracle) -> Breaks:
     """The breaks between the fronts at the centres of all cells, whose arrays are (H, W)."""
     height, width = fronts.part.shape
-    found, lines = [], []
-    joined = np.zeros((2, height, width), bool)
+    gaps = []
     for axis in (1, 0):
-        first = np.zeros((height, width), bool)
-        first[: height - (axis == 0), : width - (axis == 1)] = True
-        y, x = np.nonzero(first)
-        lines.append(np.column_stack([y, x, np.full(len(y), axis)]))
-    gap = np.concatenate(lines).astype(np.int32)
-    y, x, axis = gap.T
-    one, other = _flat(fronts, y, x), _flat(fronts, y + (axis == 0), x + (axis == 1))
-    seen = (one.part >= 0) | (other.part >= 0)
-    start, step = np.column_stack([x, y]) + 0.5, np.column_stack([axis == 1, axis == 0]).astype(float)
-    same = (one.part == other.part) & (one.part >= 0)
-    whole = np.zeros(len(gap), bool)
-    at = np.flatnonzero(same)
+        y, x = np.mgrid[: height - (axis == 0), : width - (axis == 1)].reshape(2, -1)
+        gaps.append(np.column_stack([y, x, np.full(len(y), axis)]))
+    gap = np.concatenate(gaps).astype(np.int32)
+    one, other, start, step = _ends(gap, fronts)
+    same, seen = (one.part == other.part) & (one.part >= 0), (one.part >= 0) | (other.part >= 0)
+    whole, at = np.zeros(len(gap), bool), np.flatnonzero(same)
     whole[at] = oracle.leads(one.at(at), start[at], other.at(at), (start + step)[at])
-    whole |= same & ~(oracle.knows(one) & oracle.knows(other)) & _smooth(fronts, oracle.width, y, x, axis)
-    chosen = np.flatnonzero(seen & ~whole)
-    gaps = _Lines(start[chosen], step[chosen])
-    found = _halved(_cut(gaps, one.at(chosen), other.at(chosen), oracle), gaps, oracle)
+    whole |= same & ~(oracle.knows(one) & oracle.knows(other)) & _smooth(fronts, oracle.width, *gap.T)
+    joined = np.zeros((2, height, width), bool)
+    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = same
+    nothing = _no_breaks(joined)
+    return _with_breaks(nothing, gap[seen & ~whole], np.zeros((0, 2)), fronts, oracle)
+
+
+def more_breaks(breaks: Breaks, gap: np.ndarray, places: np.ndarray, fronts: Fronts, oracle: Oracle) -> Breaks:
+    """Breaks with those of further gaps (M, 3), whose fronts may differ from both centres' at given places (M,).
+
+    Gaps that have breaks are passed over.
+    """
+    known = {tuple(g) for g in breaks.gap.tolist()}
+    new = np.array([tuple(g) not in known for g in gap.tolist()], bool)
+    return _with_breaks(breaks, gap[new], places[new, None], fronts, oracle) if new.any() else breaks
+
+
+def _with_breaks(breaks: Breaks, gap: np.ndarray, places: np.ndarray, fronts: Fronts, oracle: Oracle) -> Breaks:
+    """Breaks with those of further gaps (M, 3), which are cut at places (M, P), and where their sheets end."""
+    one, other, start, step = _ends(gap, fronts)
+    gaps = _Lines(start, step)
+    places = places if len(places) else np.zeros((len(gap), 0))
+    found = _halved(_cut(gaps, one, other, places, oracle), gaps, oracle)
     found = found.at(np.lexsort((found.low, found.gap)))
     place, near, slope, kept = _classified(found, gaps, oracle)
-    found = found.at(kept)
-    number = found.gap
-    broken = np.zeros(len(gap), bool)
-    broken[chosen[number]] = True
-    joined[1 - axis, y, x] = same & ~broken
-    points = np.stack([gaps.points(number, found.low), gaps.points(number, found.high)], 1)
-    ends = np.stack([np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0], 1)
-    parts = np.stack([found.before.part, found.behind.part], 1)
-    return Breaks(
-        gap[chosen[number]], gaps.points(number, place[kept]), near[kept], slope[kept], ends, points, parts, joined
+    found, number = found.at(kept), found.gap[kept]
+    joined = breaks.joined.copy()
+    y, x, axis = gap[number].T
+    joined[1 - axis, y, x] = False
+    own = (
+        gap[number],
+        gaps.points(number, place[kept]),
+        near[kept],
+        slope[kept],
+        np.stack([np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0], 1),
+        np.stack([gaps.points(number, found.low), gaps.points(number, found.high)], 1),
+        np.stack([found.before.part, found.behind.part], 1),
     )
+    return Breaks(*(np.concatenate(pair) for pair in zip(breaks[:-1], own, strict=True)), joined)
+
+
+def _no_breaks(joined: np.ndarray) -> Breaks:
+    shapes = ((0, 3), np.int32), ((0, 2), float), (0, np.int32), ((0, 2, 2), float), ((0, 2), bool), ((0, 2, 2), float)
+    return Breaks(*(np.zeros(shape, dtype) for shape, dtype in shapes), np.zeros((0, 2), np.int32), joined)
+
+
+def _ends(gap: np.ndarray, fronts: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
+    """The fronts at both centres of gaps (M, 3), the first centres (M, 2), and steps (M, 2) to the others."""
+    y, x, axis = gap.T
+    step = np.column_stack([axis == 1, axis == 0])
+    first, second = (_flat(fronts, y + k * step[:, 1], x + k * step[:, 0]) for k in (0, 1))
+    return first, second, np.column_stack([x, y]) + 0.5, step.astype(float)
 
 
 def _flat(fronts: Fronts, y: np.ndarray, x: np.ndarray) -> Fronts:
@@ -195,8 +223,16 @@ def _smooth(fronts: Fronts, width: np.ndarray, y: np.ndarray, x: np.ndarray, axi
     return change <= STEEP * beside + RISE * (width[0] + width[1] * fronts.depth[y, x])
 
 
-def _cut(gaps: _Lines, one: Fronts, other: Fronts, oracle: Oracle) -> _Intervals:
-    """Gaps cut where the sheets of either end come to an end, or their depths meet; intervals that are not joined."""
+def _cut(gaps: _Lines, one: Fronts, other: Fronts, more: np.ndarray, oracle: Oracle) -> _Intervals:
+    """Gaps cut where the sheets of either end come to an end, or their depths meet; intervals that are not joined.
+
+    Args:
+        gaps: the gaps.
+        one: the fronts at their first centres.
+        other: the fronts at their second centres.
+        more: (M, P), further places to cut at.
+        oracle: the scene.
+    """
     end, count = gaps.start + gaps.step, len(gaps.start)
     ahead, ahead_depth, _ = oracle.walk(one, gaps.start, end)
     back, back_depth, _ = oracle.walk(other, end, gaps.start)
@@ -206,8 +242,8 @@ def _cut(gaps: _Lines, one: Fronts, other: Fronts, oracle: Oracle) -> _Intervals
     guesses = np.column_stack([ahead, 1 - back, meet])
     guesses[~((guesses > 0) & (guesses < 1))] = np.nan
     half = FINE * 0.4
-    places = np.concatenate([guesses - half, guesses + half, np.full((count, 1), 0.5)], axis=1)
-    places[np.isfinite(guesses).any(axis=1), -1] = np.nan
+    middle = np.where(np.isfinite(guesses).any(axis=1), np.nan, 0.5)
+    places = np.column_stack([guesses - half, guesses + half, middle, more])
     places = np.sort(np.clip(places, FINE / 8, 1 - FINE / 8), axis=1)
     gap, column = np.nonzero(np.isfinite(places))
     place = places[gap, column]

@@ -16,13 +16,17 @@ class Segments(NamedTuple):
         square: (S, 2) int32.
         ties: (S, 2) int32.
         side: (S, 2) int32.
-        beyond: (S, 4) int32.
+        beyond: (S, 2) int32.
+        corner: (S, 2) float64.
+        pull: (S, 4) float64.
     """
 
     square: np.ndarray
     ties: np.ndarray
     side: np.ndarray
     beyond: np.ndarray
+    corner: np.ndarray
+    pull: np.ndarray
 
 
 def joined(breaks: Breaks) -> Segments:
@@ -63,11 +67,16 @@ def joined(breaks: Breaks) -> Segments:
     ties = np.column_stack([number[i], np.where(lone, -1, number[j])])
     sides = np.column_stack([side[i], np.where(lone, -1, side[j])])
     beyond = _beyond(ties, len(y))
-    return Segments(*(x.astype(np.int32) for x in (squares[i], ties, sides, beyond)))
+    corner, pull = _corners(squares[i] + 0.5, ties, beyond, breaks.place)
+    tables = (x.astype(np.int32) for x in (squares[i], ties, sides, beyond[:, 1:3]))
+    return Segments(*tables, corner, pull)
 
 
 def _beyond(ties: np.ndarray, count: int) -> np.ndarray:
-    """`Outlines.beyond` (S, 4) of segments between `count` breaks."""
+    """(S, 4): the last break but one along the same outline, the last, the next, and the next but one; −1 for none.
+
+    `ties` (S, 2) are the ends of segments, between `count` breaks.
+    """
     # Each break ends at most two segments, in the squares on its two sides.
     s, end = np.nonzero(ties >= 0)
     order = np.argsort(ties[s, end], kind="stable")
@@ -89,3 +98,93 @@ def _beyond(ties: np.ndarray, count: int) -> np.ndarray:
         one, far, found[:, columns[0]] = step(segments, np.full(len(ties), at))
         _, _, found[:, columns[1]] = step(one, far)
     return found
+
+
+def _corners(
+    origin: np.ndarray, ties: np.ndarray, beyond: np.ndarray, place: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Outlines.corner` and `Outlines.pull` of segments.
+
+    Args:
+        origin: (S, 2), y and x of the first corner of each square.
+        ties: (S, 2), the ends of segments.
+        beyond: (S, 4), the result of `_beyond`.
+        place: (B, 2), x and y of breaks.
+    """
+    start, end, corner, alone, meets = _turns(ties, beyond, place)
+    inside = ((corner >= origin[:, ::-1]) & (corner <= origin[:, ::-1] + 1)).all(axis=1)
+    chord = end - start
+    length = np.maximum((chord**2).sum(1), 1e-12)
+    share = np.clip(((corner - start) * chord).sum(1) / length, 0, 1)
+    foot = start + share[:, None] * chord
+    weight = np.where(meets & inside, (1 + 2 * alone) / 3, 0.0)
+    share, foot = np.where(weight > 0, share, 0.5), np.where(weight[:, None] > 0, foot, start + chord / 2)
+    corner = np.where(weight[:, None] > 0, foot + weight[:, None] * (corner - foot), foot)
+    # The corner of two straight lines moves as both of them say; a point of a curve as the ends of its chord do.
+    pull = np.column_stack([0 * share, 1 - share, share, 0 * share])
+    far = np.where(meets & inside & (alone > 0), alone, 0.0)
+    before, after = place[beyond[:, 1]], place[beyond[:, 2]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        on = np.linalg.norm(corner - start, axis=1) / np.linalg.norm(start - before, axis=1)
+        back = np.linalg.norm(corner - end, axis=1) / np.linalg.norm(after - end, axis=1)
+    on, back = (np.where(far > 0, x, 0.0) for x in (on, back))
+    lines = np.column_stack([-on, 1 + on, 1 + back, -back]) / 2
+    steady = (on < 2) & (back < 2)
+    return corner, np.where((far * steady)[:, None] > 0, (1 - far[:, None]) * pull + far[:, None] * lines, pull)
+
+
+def _turns(ties: np.ndarray, beyond: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Where outlines turn: starts and ends of segments, and where the lines before and after meet, (S, 2) each.
+
+    Also (S,) how much of the turn is this segment's alone, from 0 for a curve to 1 for a corner, and True where the
+    lines meet between start and end.
+    """
+    start, end = place[ties[:, 0]], place[np.where(ties[:, 1] >= 0, ties[:, 1], ties[:, 0])]
+    points, known = place[np.where(beyond >= 0, beyond, 0)], beyond >= 0
+    ahead, back = start - points[:, 1], points[:, 2] - end
+    turn = _cross(ahead, back)
+    meets = known[:, 1] & known[:, 2] & (np.abs(turn) > 1e-9)
+    corner = start + (_cross(end - start, back) / np.where(meets, turn, 1.0))[:, None] * ahead
+    meets &= (((corner - start) * ahead).sum(1) >= 0) & (((end - corner) * back).sum(1) >= 0)
+    beside = np.where(known[:, 0], _angle(points[:, 1] - points[:, 0], ahead), 0.0)
+    beside += np.where(known[:, 3], _angle(back, points[:, 3] - points[:, 2]), 0.0)
+    whole = _angle(ahead, back)
+    return start, end, corner, np.clip(1 - beside / np.maximum(whole, 1e-6), 0, 1), meets
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (S,) between vectors (S, 2), 0 to π."""
+    return np.abs(np.arctan2(_cross(a, b), (a * b).sum(1)))
+
+
+def tips(breaks: Breaks, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Gaps (M, 3) that corners outside of their squares may reach over, and where (M,): tips that no centre sees."""
+    beyond = _beyond(segments.ties, len(breaks.place))
+    start, end, corner, alone, meets = _turns(segments.ties, beyond, breaks.place)
+    origin = segments.square[:, ::-1] + 0.5
+    local, size = corner - origin, np.array(breaks.joined.shape[1:])
+    far = meets & (alone > 0.5) & ~((local >= 0) & (local <= 1)).all(axis=1) & (np.abs(local - 0.5) < 1.5).all(axis=1)
+    gaps, places = [], []
+    for side, (axis, at) in enumerate(((1, 0), (0, 1), (1, 1), (0, 0))):
+        across = 1 if axis == 1 else 0  # The coordinate that is constant along the side.
+        out = far & (local[:, across] < 0 if at == 0 else local[:, across] > 1)
+        out &= (segments.side != side).all(axis=1)
+        # Where both lines cross the side; the tip lies between.
+        crossed = []
+        for tie in (start, end):
+            begin = tie - origin
+            way = local - begin
+            there = np.abs(way[:, across]) > 1e-9
+            t = np.where(there, at - begin[:, across], 0.0) / np.where(there, way[:, across], 1.0)
+            crossed.append((begin + t[:, None] * way)[:, 1 - across])
+        place = (crossed[0] + crossed[1]) / 2
+        out &= (place > 0) & (place < 1)
+        cell = segments.square[out] + np.array([at, 0] if axis == 1 else [0, at])
+        inside = ((cell >= 0) & (cell < size - (np.array([0, 1]) if axis == 1 else np.array([1, 0])))).all(axis=1)
+        gaps.append(np.column_stack([cell, np.full(len(cell), axis)])[inside].astype(np.int32))
+        places.append(place[out][inside])
+    return np.concatenate(gaps), np.concatenate(places)

@@ -46,7 +46,9 @@ class Sheets(NamedTuple):
     def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int]) -> Sheets:
         """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
         vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-        return cls(vertices, np.ascontiguousarray(proxy.faces, np.int32), _beyond(proxy.faces), pixel_rows(camera, size))
+        return cls(
+            vertices, np.ascontiguousarray(proxy.faces, np.int32), _beyond(proxy.faces), pixel_rows(camera, size)
+        )
 
     def walk(self, triangle: np.ndarray, start: np.ndarray, end: np.ndarray) -> Walk:
         """Walks along lines from `start` (M, 2) to `end` (M, 2), each from the triangle (M,) that its start lies on."""

@@ -115,9 +115,7 @@ class _Breaks(NamedTuple):
         motion = [xp.where(seen[i][:, None], found[i][:, :2] - points[:, i], 0.0) for i in (0, 1)]
         # Where surfaces pass through one another, the line moves to where their depths are equal.
         slope = xp.astype(outlines.slope, positions.dtype)
-        still = [
-            found[i][:, 2] - stopped(found[i][:, 2]) - xp.sum(slope[:, i] * motion[i], axis=-1) for i in (0, 1)
-        ]
+        still = [found[i][:, 2] - stopped(found[i][:, 2]) - xp.sum(slope[:, i] * motion[i], axis=-1) for i in (0, 1)]
         apart = slope[:, 0] - slope[:, 1]
         square = xp.sum(apart * apart, axis=-1)
         crossing = outlines.near == 2
@@ -139,7 +137,7 @@ class _Segments(NamedTuple):
         side: (S, 2) int, the sides of the square that start and end lie on.
         ties: (S, 2) int, the breaks at start and end.
         jump: (2, S, C), at start and end, the colour on the right of the way less that on the left.
-        moves: (2, S, 2), the motion of start and end.
+        moves: (3, S, 2), the motion of start, corner and end.
     """
 
     square: Array
@@ -163,7 +161,8 @@ class _Segments(NamedTuple):
         along = xp.take(breaks.step, ties[:, 0], axis=0)
         end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
         start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
-        corner = _corners(start, end, outlines.beyond, breaks.place, origin)
+        corner = xp.astype(outlines.corner, origin.dtype) - origin
+        corner = xp.where(lone[:, None], (start + end) / 2, corner)
         jump, moves = [], []
         for i in (0, 1):
             before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
@@ -172,6 +171,13 @@ class _Segments(NamedTuple):
             jump.append(xp.where(forward[:, None], before - behind, behind - before))
             moves.append(xp.take(breaks.moves, ties[:, i], axis=0))
         jump[1] = xp.where(lone[:, None], jump[0], jump[1])
+        beyond = [
+            xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0)
+            for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
+        ]
+        pull = xp.astype(outlines.pull, origin.dtype)
+        pulled = (beyond[0], *moves, beyond[1])
+        moves.insert(1, sum(pull[:, i, None] * x for i, x in enumerate(pulled)))
         return cls(square, lone, xp.stack([start, corner, end]), side, ties, xp.stack(jump), xp.stack(moves))
 
     def parts(self) -> list[tuple[Array, Array, Array]]:
@@ -253,50 +259,13 @@ class _Segments(NamedTuple):
                 t = ((low + high) / 2)[:, None]
                 at, piece = start + t * way, (high - low)[:, None] * way
                 u = (1 - t) * shares[i][:, None] + t * shares[i + 1][:, None]
-                moves, jumps = ((1 - u) * x[0] + u * x[1] for x in (self.moves, jump))
+                moves, jumps = (1 - t) * self.moves[i] + t * self.moves[i + 1], (1 - u) * jump[0] + u * jump[1]
                 flux = moves[:, 0] * piece[:, 1] - moves[:, 1] * piece[:, 0]
                 # A lone break's edge ends amid the square.
                 beside = xp.sum(xp.abs(at - self.path[0]), axis=-1) <= 0.5
                 flux = xp.where(self.lone & ~beside, 0.0, flux)
                 pieces.append((at, piece, flux[:, None] * jumps))
         return pieces
-
-
-def _corners(start: Array, end: Array, beyond: Array, place: Array, origin: Array) -> Array:
-    """Points (S, 2) between start and end, where outlines turn.
-
-    The lines through the breaks before the start and after the end meet in a point. Where an outline turns there alone,
-    this is its corner. Where it turns as much before and after, it is a curve, whose area beyond the chord is a third
-    of the triangle's. Without such a point in the square, the middle of the chord.
-    """
-    xp = namespace(place)
-    points = [xp.take(place, xp.where(beyond[:, i] >= 0, beyond[:, i], 0), axis=0) - origin for i in range(4)]
-    known = [beyond[:, i] >= 0 for i in range(4)]
-    ahead, back = start - points[1], points[2] - end
-    area = _cross(ahead, back)
-    usable = known[1] & known[2] & (xp.abs(area) > 1e-6)
-    meet = start + (_cross(end - start, back) / xp.where(usable, area, 1.0))[:, None] * ahead
-    chord = end - start
-    inside = xp.all((meet >= 0) & (meet <= 1), axis=-1)
-    usable = usable & inside & (xp.sum((meet - start) * ahead, axis=-1) > 0) & (xp.sum((end - meet) * back, axis=-1) > 0)
-    turns = xp.where(known[0], _angle(points[1] - points[0], ahead), 0.0), xp.where(known[3], _angle(back, points[3] - points[2]), 0.0)
-    whole = _angle(ahead, back)
-    alone = xp.clip(1 - (turns[0] + turns[1]) / xp.where(whole > 1e-6, whole, 1.0), 0.0, 1.0)
-    weight = (1 + 2 * alone) / 3
-    length = xp.sum(chord * chord, axis=-1)
-    share = xp.clip(xp.sum((meet - start) * chord, axis=-1) / xp.where(length > 0, length, 1.0), 0.0, 1.0)
-    foot = start + share[:, None] * chord
-    return xp.where(usable[:, None], foot + weight[:, None] * (meet - foot), start + chord / 2)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _angle(a: Array, b: Array) -> Array:
-    """Angles (S,) between vectors (S, 2), 0 to π."""
-    xp = namespace(a)
-    return xp.abs(xp.atan2(_cross(a, b), xp.sum(a * b, axis=-1)))
 
 
 def _beside_breaks(

@@ -232,6 +232,33 @@ class SamplerConformance(Conformance):
             near = np.abs(np.asarray(listed.depth).reshape(row.shape) - depth) <= 1e-5 * np.abs(depth)
             claim((near | ~covered).all(), f"part {index}: depths are not those of the cells in the whole grid")
 
+    def test_points_are_sampled_as_centres_are(self, sampler: Any, parts: list[Part]) -> None:
+        """A sampler that follows `Request.points` finds at centres what it finds there in the grid.
+
+        At other points it finds what it would find at the centres of an image moved by as much.
+        """
+        chosen, (height, width) = check_sampler(sampler), scenes.SIZE
+        y, x = np.divmod(np.random.default_rng(0).permutation(height * width)[: height * width // 3], width)
+        for index, part in enumerate(map(scenes.checked, parts)):
+            for move in ((0.0, 0.0), (0.3, -0.21)):
+                points, moved = np.column_stack([x, y]) + 0.5 + move, scenes.CAMERA.for_size(scenes.SIZE)
+                shift = np.eye(4)
+                shift[:2, 3] = -2 * move[0] / width, 2 * move[1] / height
+                centred = moved.replace(projection=shift @ moved.projection)
+                whole = chosen.sample(part, centred.within(part.transform), scenes.SIZE, 2, Request())
+                own = moved.within(part.transform)
+                found = chosen.sample(part, own, scenes.SIZE, 2, Request(points=points, triangles=True))
+                if "points" not in found.followed:
+                    pytest.skip("the sampler samples whole grids")
+                row, depth = np.asarray(whole.row)[:, y, x], np.asarray(whole.depth)[:, y, x]
+                claim(found.row.shape == (len(row), 1, len(x)), f"part {index}: row has shape {found.row.shape}")
+                seen, deep = np.asarray(found.row)[:, 0] >= 0, np.asarray(found.depth)[:, 0]
+                # On an edge rounding decides, and a surface may have other triangles for another view.
+                same = seen == (row >= 0)
+                claim(same.mean() >= 0.995, f"part {index}: {np.sum(~same)} points are covered, or not, unlike centres")
+                near = np.abs(deep - depth) <= 1e-3 * np.abs(depth)
+                claim((near | ~same | ~seen).mean() >= 0.995, f"part {index}: depths are not those of centres")
+
     def test_exits_lie_on_the_part_behind_its_front(self, sampler: Any, parts: list[Part]) -> None:
         """Exits, if a sampler gives any, lie where rays meet their culled part, and not before its front.
 

@@ -1,0 +1,233 @@
+"""Found edges: images and derivatives in closed form, flux that adds up, and what is refused."""
+
+import numpy as np
+import pytest
+from polygons import covered
+
+import rts
+from rts import InputError
+
+torch = pytest.importorskip("torch")
+forward = pytest.importorskip("torch.autograd.forward_ad")
+
+pytestmark = pytest.mark.splatting
+
+SIZE = 24, 24
+SQUARE = np.array([[-7.0, -6], [7, -6], [7, 6], [-7, 6]])
+TWO = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def in_pixels(size=SIZE):
+    """A camera that sees points (x, y, −z) at the pixel (x, y), at depth z."""
+    height, width = size
+    projection = np.array([[2 / width, 0, 0, -1], [0, -2 / height, 0, 1], [0, 0, -0.02, -1], [0, 0, 0, 1]])
+    return rts.Camera(np.eye(4), projection)
+
+
+def turned(corners, angle, at):
+    c, s = np.cos(angle), np.sin(angle)
+    return corners @ np.array([[c, s], [-s, c]]) + at
+
+
+def flat(corners, depth=3.0):
+    return np.column_stack([corners, np.full(len(corners), -depth)]).astype(np.float32)
+
+
+def card(vertices, color=(1.0, 1, 1), faces=TWO):
+    return rts.Part(rts.Mesh(faces), {"vertices": vertices, "color": np.asarray(color, np.float32)}, "unlit")
+
+
+def edges(parts, size=SIZE, **options):
+    return rts.render(parts, in_pixels(size), size, splatter="edges", **options)
+
+
+def pushed(f):
+    """Image and derivative of a function of a number, at 0, by forward mode, as NumPy."""
+    with forward.dual_level():
+        result = forward.unpack_dual(f(forward.make_dual(torch.zeros(()), torch.ones(()))))
+    return result.primal.detach().numpy(), result.tangent.numpy()
+
+
+def moved(vertices, velocity):
+    """A function of t: vertices + t · velocity."""
+    start, velocity = torch.as_tensor(vertices), torch.as_tensor(np.asarray(velocity, np.float32))
+    return lambda t: start + t * velocity
+
+
+ANGLES = [0.0, 0.03, 0.3, 0.62]
+PLACES = [(12.0, 12.0), (12.3, 12.2), (12.5, 12.5)]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("place", PLACES)
+def test_a_card_has_the_area_and_the_motion_of_its_polygon(angle, place):
+    corners = turned(SQUARE, angle, place)
+    velocity = np.column_stack([np.tile([1.0, 0.3], (4, 1)), np.zeros(4)])
+    image, derivative = pushed(lambda t: edges(card(moved(flat(corners), velocity)(t))))
+    step = 1e-5
+    truth = [covered(corners + sign * step * velocity[:, :2], SIZE) for sign in (1, -1)]
+    # An edge on a border belongs to both pixels, by halves, whichever way it moves.
+    np.testing.assert_allclose(image[..., 3], covered(corners, SIZE), atol=2e-4)
+    np.testing.assert_allclose(derivative[..., 3], (truth[0] - truth[1]) / (2 * step), atol=2e-3)
+
+
+def test_a_card_that_turns_and_grows_has_the_motion_of_its_polygon():
+    corners = turned(SQUARE, 0.3, (12.2, 11.7))
+    away = corners - (12.2, 11.7)
+    velocity = 0.05 * away + 0.08 * np.column_stack([-away[:, 1], away[:, 0]])
+    _, derivative = pushed(lambda t: edges(card(moved(flat(corners), np.column_stack([velocity, np.zeros(4)]))(t))))
+    step = 1e-5
+    truth = (covered(corners + step * velocity, SIZE) - covered(corners - step * velocity, SIZE)) / (2 * step)
+    assert np.linalg.norm(derivative[..., 3] - truth) < 0.01 * np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize("shape", ["ball", "spot-like"])
+def test_a_rigid_shift_of_a_closed_silhouette_sums_to_zero(shape):
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(2, radius=6.3) if shape == "ball" else trimesh.creation.box((9, 5, 7))
+    turn = trimesh.transformations.euler_matrix(0.5, 0.3, 0.2)[:3, :3]
+    vertices = (np.asarray(mesh.vertices) @ turn.T + [12.1, 12.4, -20]).astype(np.float32)
+    for direction in ([1.0, 0, 0], [0, 1, 0]):
+        _, derivative = pushed(lambda t, d=direction: edges(card(moved(vertices, d)(t), faces=np.asarray(mesh.faces))))
+        assert np.abs(derivative[..., 3]).sum() > 5
+        assert abs(derivative[..., 3].sum()) < 2e-4
+
+
+def test_planes_that_cross_have_the_line_where_they_meet():
+    # Depths 20 + a (x − 12) and 20 − a (x − 12) + t: the line is at x = 12 + t / (2 a).
+    tilt = 0.7
+    corners = np.array([[-5.0, -5], [30, -5], [30, 30], [-5, 30]])
+    one = np.column_stack([corners, -(20 + tilt * (corners[:, 0] - 12.2))]).astype(np.float32)
+    two = np.column_stack([corners, -(20 - tilt * (corners[:, 0] - 12.2))]).astype(np.float32)
+
+    def scene(t):
+        back = moved(two, np.tile([0, 0, -1.0], (4, 1)))(t)
+        return edges([card(one, (1, 0, 0)), card(back, (0, 1, 0))])
+
+    image, derivative = pushed(scene)
+    np.testing.assert_allclose(image[5:-5, 12, 1], 0.8, atol=1e-3)
+    np.testing.assert_allclose(derivative[5:-5, 12, 0], 1 / (2 * tilt), rtol=1e-3)
+    np.testing.assert_allclose(derivative[5:-5, 12, 1], -1 / (2 * tilt), rtol=1e-3)
+    assert np.abs(derivative[:, :11]).max() < 1e-5
+
+
+def test_sheets_of_one_part_that_cross_have_the_line_where_they_meet():
+    tilt = 0.7
+    corners = np.array([[-5.0, -5], [30, -5], [30, 30], [-5, 30]])
+    sheets = [np.column_stack([corners, -(20 + s * tilt * (corners[:, 0] - 12.2))]) for s in (1, -1)]
+    vertices = np.concatenate(sheets).astype(np.float32)
+    part = rts.Part(
+        rts.Mesh(np.concatenate([TWO, TWO + 4])),
+        {"vertices": None, "colors": np.repeat(np.eye(3, dtype=np.float32)[:2], 4, axis=0)},
+        "unlit",
+    )
+    velocity = np.concatenate([np.zeros((4, 3)), np.tile([0, 0, -1.0], (4, 1))])
+
+    def scene(t):
+        return edges(part.replace(theta={**part.theta, "vertices": moved(vertices, velocity)(t)}))
+
+    image, derivative = pushed(scene)
+    np.testing.assert_allclose(image[5:-5, 12, 1], 0.8, atol=1e-3)
+    np.testing.assert_allclose(derivative[5:-5, 12, 0], 1 / (2 * tilt), rtol=1e-3)
+
+
+def test_an_edge_uncovers_the_front_of_its_neighbour_with_one_layer():
+    near, far = turned(SQUARE, 0.2, (10.2, 12)), turned(SQUARE * 1.2, -0.3, (14, 11.6))
+
+    def scene(t):
+        return edges(
+            [card(moved(flat(near), np.tile([1.0, 0, 0], (4, 1)))(t), (1, 0, 0)), card(flat(far, 4), (0, 1, 0))]
+        )
+
+    image, derivative = pushed(scene)
+    step = 1e-5
+    red, other = covered(near, SIZE), covered(far, SIZE)
+    truth = (covered(near + [step, 0], SIZE) - covered(near - [step, 0], SIZE)) / (2 * step)
+    np.testing.assert_allclose(image[..., 0], red, atol=0.02)
+    assert np.linalg.norm(derivative[..., 0] - truth) < 0.02 * np.linalg.norm(truth)
+    amid = (other == 1) & (red < 1)
+    # Where an edge of the far card ends at the near one, the pixel is off by an eighth.
+    np.testing.assert_allclose(derivative[amid, 1], -truth[amid], atol=0.03)
+
+
+@pytest.mark.parametrize("sampler", ["raster", "embree", "reference"])
+def test_forward_mode_and_reverse_mode_agree(sampler):
+    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7))).astype(np.float64)
+    weights = torch.as_tensor(np.random.default_rng(0).normal(size=(*SIZE, 4)))
+    velocity = torch.as_tensor(np.random.default_rng(1).normal(size=(4, 3)))
+
+    def loss(t):
+        return (edges(card(torch.as_tensor(corners) + t * velocity), sampler=sampler) * weights).sum()
+
+    with forward.dual_level():
+        result = loss(forward.make_dual(torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)))
+        by_forward = float(forward.unpack_dual(result).tangent)
+    t = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    loss(t).backward()
+    assert t.grad is not None
+    assert float(t.grad) == pytest.approx(by_forward, rel=1e-5)
+
+
+def test_numpy_draws_what_torch_draws():
+    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
+    drawn = edges(card(torch.as_tensor(corners)))
+    np.testing.assert_allclose(edges(card(corners)), drawn.numpy(), atol=1e-5)
+
+
+def test_the_area_of_a_square_that_shifts_has_no_curvature():
+    """d² of a pixel's area is 0 but where a corner turns: at most 0.02 px⁻² for each pixel of perimeter."""
+    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
+
+    def area(t):
+        return edges(card(moved(corners, np.tile([1.0, 0, 0], (4, 1)))(t)))[..., 3].sum()
+
+    t = torch.zeros((), requires_grad=True)
+    (first,) = torch.autograd.grad(area(t), t, create_graph=True)
+    second = torch.autograd.grad(first, t)[0] if first.requires_grad else torch.zeros(())
+    assert abs(float(second)) <= 0.02 * 52
+
+
+def test_losses_have_no_steps_as_a_card_moves():
+    """In steps of 1/200 pixel, the largest change of a pixel is that of an edge that moves by as much."""
+    images = [edges(card(flat(turned(SQUARE, 0.3, (12.2 + i / 200, 11.7)))))[..., 3] for i in range(60)]
+    assert np.abs(np.diff(images, axis=0)).max() < 0.01
+
+
+def test_supersampling_keeps_the_area():
+    corners = turned(SQUARE, 0.3, (12.2, 11.7))
+    image = edges(card(flat(corners)), supersample=3)
+    np.testing.assert_allclose(image[..., 3], covered(corners, SIZE), atol=2e-4)
+
+
+def test_views_are_drawn_as_one_by_one():
+    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
+    cameras = [in_pixels(), in_pixels().replace(view=rts.rigid(np.array([0, 0, 0.1, 0.3, 0.2, 0])))]
+    views = rts.render_views(card(corners), cameras, SIZE, splatter="edges")
+    for camera, image in zip(cameras, views, strict=True):
+        np.testing.assert_array_equal(image, rts.render(card(corners), camera, SIZE, splatter="edges"))
+
+
+def test_prepared_parts_and_samples_are_drawn_alike():
+    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
+    whole = edges(card(corners))
+    np.testing.assert_array_equal(edges(rts.prepare(card(corners), "raster")), whole)
+    sampled = rts.sample(card(corners), in_pixels(), SIZE, splatter="edges")
+    np.testing.assert_array_equal(rts.render_samples(sampled, card(corners), in_pixels(), splatter="edges"), whole)
+
+
+def test_two_layers_ask_for_no_second_sample():
+    sampled = rts.sample(card(flat(SQUARE + 12)), in_pixels(), SIZE, splatter="edges", layers=2)
+    assert sampled.row.shape[0] == 1
+
+
+def test_adaptive_samples_are_refused():
+    with pytest.raises(InputError, match="finds outlines without further samples"):
+        edges(card(flat(SQUARE + 12)), supersample=rts.Adaptive(4))
+
+
+def test_traced_samples_are_refused():
+    jax = pytest.importorskip("jax")
+    vertices = jax.numpy.asarray(flat(SQUARE + 12))
+    with pytest.raises(InputError, match="these samples are traced"):
+        jax.jit(lambda v: edges(card(v)))(vertices)
