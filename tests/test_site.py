@@ -35,13 +35,17 @@ def attribute(place):
     raise LookupError(place)
 
 
+OF_THE_LIBRARY = ("warn", "warn_deprecated", "in_one_line")
+"""Functions of `rts.errors` that only the library itself calls."""
+
+
 def public_names():
     """Every name that users and plugins may import, as it is written."""
     yield from (f"rts.{name}" for name in {*rts.__all__, *registry.built_in_attributes()})
     for module in ("rts.errors", "rts.regularizers", "rts.splatting", "rts.testing", "rts_compare"):
         found = import_module(module)
         own = [name for name, value in vars(found).items() if getattr(value, "__module__", None) == module]
-        names = getattr(found, "__all__", [name for name in own if name != "warn"])
+        names = getattr(found, "__all__", [name for name in own if name not in OF_THE_LIBRARY])
         yield from (f"{module}.{name}" for name in names)
     for path in sorted((ROOT / "rts/plugin_api").glob("[a-z]*.py")):
         module = f"rts.plugin_api.{path.stem}"
