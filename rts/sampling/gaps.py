@@ -88,7 +88,12 @@ class Oracle(NamedTuple):
         same = np.flatnonzero((a.part == b.part) & self.knows(a) & (b.triangle >= 0))
         one, other = a.at(same), b.at(same)
         reached, depth, triangle = self.walk(one, at[same], to[same])
-        near = np.abs(depth - other.depth) <= SAME_DEPTH * other.depth
+        # Rounding may tell neighbours apart; sheets that pass through one another are as near, but share no corner.
+        near = (np.abs(depth - other.depth) <= SAME_DEPTH * other.depth) & (triangle != other.triangle)
+        for part, sheets in enumerate(self.sheets):
+            close = np.flatnonzero(near & (one.part == part))
+            if sheets is not None and len(close):
+                near[close] = sheets.touch(triangle[close], other.triangle[close])
         leads[same] = (reached == 1) & ((triangle == other.triangle) | near)
         return leads
 

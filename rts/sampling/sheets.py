@@ -61,6 +61,10 @@ class Sheets(NamedTuple):
         parallel(sheets_loops.walk, count, *lines, *mesh, *found, work=500 * count)
         return found
 
+    def touch(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """(M,) True for pairs of triangles that have a corner in common."""
+        return (self.faces[one][:, :, None] == self.faces[other][:, None, :]).any(axis=(1, 2))
+
     def planes(self, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
         """(M, 3) depths of triangles' planes at points (M, 2), and their slopes along x and y, a cell."""
         from rts.sampling import sheets_loops
