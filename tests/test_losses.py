@@ -7,7 +7,7 @@ from fractions import Fraction
 import numba
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, icosphere, quad, to_numpy
+from helpers import DIFFERENTIABLE, arrays, icosphere, quad, quick, to_numpy
 from scipy.optimize import least_squares
 
 import rts
@@ -15,7 +15,8 @@ from rts import splatting
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
-from rts_backends.fused.losses import cost_and_weight, in_numbers
+from rts.fitting.losses import FORMS, _Form
+from rts_backends.fused.losses import NUMBERS, cost_and_weight, curvature, in_numbers
 
 pytestmark = pytest.mark.fitting
 
@@ -142,6 +143,49 @@ def test_losses_of_huge_residuals_are_finite_and_right(name, target):
             assert 0 <= curvatures[0] <= weights[0] <= 1
             if target != "numpy":
                 np.testing.assert_allclose(gradient(loss, given), [expected[1]], rtol=1e-5, atol=1e-30)
+
+
+# ----------------------------------------------------------------------------------- losses that are not compiled
+
+
+def geman_mcclure(monkeypatch):
+    """A fifth loss of this name, ρ(z) = z / (1 + z), of which there is array code alone."""
+    form = _Form(
+        lambda xp, r, s: r * r / (1 + (r / s) ** 2),
+        lambda xp, r, s: 1 / (1 + (r / s) ** 2) ** 2,
+        lambda xp, weight: 4 * xp.sqrt(weight) - 3,
+    )
+    monkeypatch.setitem(FORMS, "geman_mcclure", form)
+    return "geman_mcclure"
+
+
+@pytest.mark.parametrize("target", quick(DIFFERENTIABLE))
+def test_normal_equations_of_a_loss_that_is_not_compiled_are_array_code(target, monkeypatch):
+    pose, name = arrays(target, POSE), geman_mcclure(monkeypatch)
+    swept = residuals("lambert", 3, loss=name, f_scale=0.1)
+    r = swept(pose)
+    expected = to_numpy(normal_equations(swept, pose, engine_of(pose), swept.loss))
+    assert float(expected[0]) == pytest.approx(float((r**2 / (1 + (r / 0.1) ** 2)).mean()), rel=1e-5)
+    for found, array in zip(swept.normal_equations(pose), expected, strict=True):
+        np.testing.assert_allclose(to_numpy(found), array, rtol=1e-4, atol=1e-7)
+
+
+def test_every_loss_is_compiled_and_another_number_is_an_error():
+    assert set(NUMBERS) == set(FORMS)
+    compiled_curvature = numba.njit(lambda weight, loss: curvature(weight, loss))
+    for name, number in NUMBERS.items():
+        loss = rts.Loss(name, 0.5)
+        assert in_numbers(loss, np.float64) == (number, loss.f_scale)
+        for r in (-3.0, 0.2, 0.7):
+            value, weight = compiled_cost(r, in_numbers(loss, np.float64))
+            expected = loss.weights(np.array([r]))
+            assert value == pytest.approx(float(loss(np.array([r]))), rel=1e-12)
+            found = weight, compiled_curvature(weight, in_numbers(loss, np.float64))
+            np.testing.assert_allclose(found, np.ravel(expected), rtol=1e-12)
+    unknown = max(NUMBERS.values()) + 1, np.float64(0.5)
+    for compiled in compiled_cost, compiled_curvature:
+        with pytest.raises(ValueError, match="not compiled"):
+            compiled(0.7, unknown)
 
 
 # ------------------------------------------------------------------------------------- other implementations

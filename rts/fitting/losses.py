@@ -78,7 +78,7 @@ FORMS = {
         lambda xp, weight: 2 * weight - 1,
     ),
 }
-"""Name → form. Compiled loops know forms by their index in this order."""
+"""Name → form."""
 
 LEAST_SHARE = 0.1
 """Least curvature of a residual, as a share of its weight."""
@@ -151,11 +151,6 @@ class Loss:
     def robust(self) -> bool:
         """True for every loss but the square."""
         return self.name != "linear"
-
-    @property
-    def place(self) -> int:
-        """Index of the loss in `FORMS`; 0 is the square."""
-        return list(FORMS).index(self.name)
 
 
 def _checked_scale(value: Any) -> float:

@@ -10,12 +10,14 @@ from rts import Loss
 from rts.plugin_api.loops import compiled
 
 LINEAR, SOFT_L1, HUBER, CAUCHY = range(4)
+NUMBERS = {"linear": LINEAR, "soft_l1": SOFT_L1, "huber": HUBER, "cauchy": CAUCHY}
+"""The losses that are compiled. Normal equations of others are array code."""
 FAR, LEAST_SHARE = Loss.FAR, Loss.LEAST_SHARE
 
 
 def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:
-    """A loss in the form that loops take: its number, such as HUBER, and its scale in the residuals' dtype."""
-    return loss.place, np.dtype(dtype).type(loss.f_scale)
+    """A loss of `NUMBERS` as loops take it: its number, such as HUBER, and its scale in the residuals' dtype."""
+    return NUMBERS[loss.name], np.dtype(dtype).type(loss.f_scale)
 
 
 @compiled
@@ -33,19 +35,25 @@ def cost_and_weight(residual, loss):
     if place == SOFT_L1:
         root = abs(ratio) if far else math.sqrt(one + z)
         return (residual + residual) * (scale * (ratio / (one + root))), one / root
-    log = math.log(abs(ratio)) if far else math.log1p(z)
-    return scale * (scale * (log + log if far else log)), one / (one + z)
+    if place == CAUCHY:
+        log = math.log(abs(ratio)) if far else math.log1p(z)
+        return scale * (scale * (log + log if far else log)), one / (one + z)
+    raise ValueError("a loss of this number is not compiled")
 
 
 @compiled
 def curvature(weight, loss):
     """The weight of a residual in the Hessian, the second result of `Loss.weights`, from its weight ρ'."""
     place, scale = loss
-    share, one = weight, type(scale)(1)
-    if place == SOFT_L1:
+    one = type(scale)(1)
+    if place == LINEAR:
+        share = one
+    elif place == SOFT_L1:
         share = weight * weight
-    elif place == HUBER and weight < one:
-        share = type(scale)(0)
+    elif place == HUBER:
+        share = type(scale)(0) if weight < one else one
     elif place == CAUCHY:
         share = weight + weight - one
+    else:
+        raise ValueError("a loss of this number is not compiled")
     return weight * max(share, type(scale)(LEAST_SHARE))

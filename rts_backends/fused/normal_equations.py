@@ -22,7 +22,7 @@ from rts.plugin_api.threads import parallel, read_only
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
 from rts_backends.fused.image import rows_of
-from rts_backends.fused.losses import LINEAR, cost_and_weight, curvature, in_numbers
+from rts_backends.fused.losses import LINEAR, NUMBERS, cost_and_weight, curvature, in_numbers
 from rts_backends.fused.mixed_targets import changes_of, composited
 from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
@@ -53,8 +53,8 @@ OPACITY = 3 * PITCH
 def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tuple[Array, ...] | None:
     """`normal_equations` of arrays of any engine on the host, traced or not.
 
-    None for arrays on other devices, for positions and rgba that are not both float32 or both float64, or if a pixel
-    has more cells than a tile along an axis.
+    None for arrays on other devices, for positions and rgba that are not both float32 or both float64, for losses that
+    are not compiled, or if a pixel has more cells than a tile along an axis.
 
     Args:
         settings: the splatter, as numbers.
@@ -66,7 +66,7 @@ def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tu
     positions, rgba, row, _, _, _, _, _, t_positions, _, target = given[:11]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
     there = [x for x in given if x is not None]
-    if kind is None or rgba.dtype != positions.dtype or not engine.on_host(*there):
+    if kind is None or rgba.dtype != positions.dtype or loss.name not in NUMBERS or not engine.on_host(*there):
         return None
     if _cells_a_pixel(row.shape, settings.border, target.shape) > FINEST:
         return None
