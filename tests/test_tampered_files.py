@@ -16,6 +16,8 @@ from test_views import blender, llff
 import rts
 from rts import RtsError
 
+pytestmark = pytest.mark.files
+
 ADVICE = ("weights_only", "allow_pickle", "pickle.load", "set_int_max_str_digits")
 """Advice of others to switch a protection off."""
 
@@ -79,7 +81,6 @@ def opencv_tree(folder):
 TREES = {"transforms.json": nerf_tree, "cameras.json": opencv_tree}
 
 
-@pytest.mark.files
 @pytest.mark.parametrize("chosen", seeds(6, 40))
 @pytest.mark.parametrize("name", TREES)
 def test_tampered_cameras_of_json_are_read_or_refused_in_one_line(tmp_path, name, chosen):
@@ -93,7 +94,6 @@ def test_tampered_cameras_of_json_are_read_or_refused_in_one_line(tmp_path, name
         outcome(lambda: seen(path))
 
 
-@pytest.mark.files
 @pytest.mark.parametrize("chosen", seeds(3, 15))
 def test_tampered_cameras_of_llff_are_read_or_refused_in_one_line(tmp_path, chosen):
     folder = tmp_path / f"a{tampered.MARK}b"
@@ -113,7 +113,6 @@ def test_tampered_cameras_of_llff_are_read_or_refused_in_one_line(tmp_path, chos
 WRITERS = {"bin": binary_model, "txt": text_model}
 
 
-@pytest.mark.files
 @pytest.mark.parametrize("chosen", seeds(3, 20))
 @pytest.mark.parametrize("table", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("form", WRITERS)
@@ -156,7 +155,6 @@ def state_of(kind):
     return tampered.tampered_torch_state if kind.split()[1] != "lm" and "torch" in kind else tampered.tampered_archive
 
 
-@pytest.mark.fitting
 @pytest.mark.parametrize("chosen", seeds(1, 25))
 @pytest.mark.parametrize("kind", METHODS)
 def test_tampered_checkpoints_are_gone_on_from_or_refused_in_one_line(tmp_path, kind, chosen):
