@@ -1,13 +1,16 @@
 """Compilation: few loops, each once; a message on terminals alone."""
 
 import gc
+import importlib.util
 import io
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers import quick
 
 import rts
 
@@ -216,6 +219,64 @@ def test_loops_are_written_by_one_process_at_a_time(tmp_path):
         process.communicate(timeout=60)
     assert [process.returncode for process in processes] == [0, 0]
     assert len(list(kept.glob("several.double*.nbc"))) == 2 and len(list(kept.glob("several.double*.nbi"))) == 1
+
+
+DAMAGES = {
+    "a bit of the code": (
+        ".nbc",
+        lambda data: data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 1]) + data[len(data) // 2 + 1 :],
+    ),
+    "code cut short": (".nbc", lambda data: data[: len(data) // 2]),
+    "empty code": (".nbc", lambda data: b""),
+    "code of zeros": (".nbc", lambda data: bytes(len(data))),
+    "index cut short": (".nbi", lambda data: data[: len(data) // 2]),
+    "index of noise": (".nbi", lambda data: bytes(255 - i % 256 for i in range(len(data)))),
+}
+
+
+DOUBLE = "from rts.compiling.loops import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n"
+
+
+def called(folder):
+    """The folder of kept loops, and hits and misses there, where a new process would call a loop with two types."""
+    spec = importlib.util.spec_from_file_location("several", folder / "several.py")
+    assert spec is not None and spec.loader is not None
+    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    for x, doubled in ((np.ones(3), [2, 2, 2]), (np.arange(3), [0, 2, 4])):
+        module.double(x)
+        assert x.tolist() == doubled
+    stats = module.double.stats
+    return stats.cache_path, sum(stats.cache_hits.values()), sum(stats.cache_misses.values())
+
+
+@pytest.mark.parametrize("damage", quick(DAMAGES))
+def test_damaged_loops_are_compiled_anew_and_told_once(damage, tmp_path, monkeypatch, capsys):
+    (tmp_path / "several.py").write_text(DOUBLE)
+    monkeypatch.setattr(compiling._Cache, "_told", False)
+    kept, *counts = called(tmp_path)
+    assert counts == [0, 2] and called(tmp_path) == (kept, 2, 0) and not capsys.readouterr().err
+    kind, damaged = DAMAGES[damage]
+    files = [path for path in Path(kept).glob("several.double*") if path.suffix == kind]
+    assert len(files) == {".nbc": 2, ".nbi": 1}[kind]
+    for path in files:
+        path.write_bytes(damaged(path.read_bytes()))
+    assert called(tmp_path) == (kept, 0, 2)
+    line = f"rts: compiled loops in {kept} are damaged; what is damaged is compiled anew …\n"
+    assert capsys.readouterr().err == line
+    assert called(tmp_path) == (kept, 2, 0) and not capsys.readouterr().err
+
+
+@pytest.mark.thorough
+def test_loops_run_where_damage_cannot_be_mended(tmp_path, monkeypatch, capsys):
+    (tmp_path / "several.py").write_text(DOUBLE)
+    kept = called(tmp_path)[0]
+    (index,) = Path(kept).glob("several.double*.nbi")
+    index.unlink()
+    index.mkdir()  # Neither to be read nor to be replaced.
+    for _ in range(2):
+        monkeypatch.setattr(compiling._Cache, "_told", False)
+        assert called(tmp_path) == (kept, 0, 2)
+        assert capsys.readouterr().err.count("\n") == 1
 
 
 WITHOUT_PRIVATE_NAMES = """
