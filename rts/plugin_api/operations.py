@@ -3,6 +3,7 @@
 from rts.operations.combine import combine, interpolate
 from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
+from rts.operations.room import filled_up, with_room
 from rts.operations.take import take
 
-__all__ = ["Operation", "combine", "gradient", "interpolate", "take"]
+__all__ = ["Operation", "combine", "filled_up", "gradient", "interpolate", "take", "with_room"]

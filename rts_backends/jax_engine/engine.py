@@ -37,6 +37,18 @@ def bucket(rows: int) -> int:
     return size
 
 
+SMALL = 64
+"""The most numbers of an array, such as a camera's matrix, whose shape is one of few."""
+
+
+def _on_device(x: np.ndarray) -> jax.Array:
+    """A copy of `x` as a jax array.
+
+    `jnp.asarray` takes half the time, but since jax 0.10 it compiles a program for each shape, and keeps it.
+    """
+    return jnp.asarray(x) if x.size <= SMALL else jax.device_put(x, may_alias=False)
+
+
 def _pad(x: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate([x, np.zeros((rows - x.shape[0], *x.shape[1:]), x.dtype)])
 
@@ -63,7 +75,7 @@ class JaxEngine(Engine):
             array = array.astype(np.float64 if like is not None and like.dtype == np.float64 else np.float32)
         elif array.dtype == np.int64:
             array = array.astype(np.int32)
-        return jnp.asarray(array)
+        return _on_device(array)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[jax.Array, ...]:
         """Call `fn` without derivative. Packed results are padded with zeros.
@@ -76,7 +88,7 @@ class JaxEngine(Engine):
         if not any(isinstance(a, Tracer) for a in args):
             results = fn(*map(np.asarray, args))
             return tuple(
-                jnp.asarray(_pad(r, bucket(r.shape[0])) if spec.packed else r)
+                _on_device(_pad(r, bucket(r.shape[0])) if spec.packed else np.asarray(r))
                 for r, spec in zip(results, specs, strict=True)
             )
 
@@ -160,6 +172,10 @@ class JaxEngine(Engine):
         """True: packed arrays may be padded to a bucket, or to the capacity."""
         return True
 
+    def room(self, rows: int, x: jax.Array) -> int:
+        """See `Engine.room`: a `bucket`, or `rows` while `x` is traced, since a program has its shapes anyway."""
+        return rows if isinstance(jax.lax.stop_gradient(x), Tracer) else bucket(rows)
+
     def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
         """See `Engine.fill_unused`: by selection, which XLA can fuse with later code; all ones if no row is in use."""
         used = jnp.max(row) + 1
@@ -187,7 +203,7 @@ class JaxEngine(Engine):
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
-        return jax.ops.segment_sum(values, jnp.asarray(segments), num_segments=count)
+        return jax.ops.segment_sum(values, _on_device(segments), num_segments=count)
 
     def to_numpy(self, x: jax.Array) -> np.ndarray:
         """The value on the host."""

@@ -5,7 +5,9 @@ is linear in the tangents or the gradients, and the transpose of the other. Thei
 second derivatives of the operation, are taken of its specification, which is array code. On devices other than the CPU,
 all is computed by the specification.
 
-Tangents and gradients have a leading axis T: one sweep takes T of them. Under `vmap`, operands that differ from item to
+Tangents and gradients have a leading axis T: one sweep takes T of them. A call with the parameter `single` takes one of
+each, without this axis. Eager derivatives are such calls, since eager jax compiles, for each shape and for ever, what
+would add the axis and take it away. Under `vmap`, operands that differ from item to
 item have an axis B before that. Two numbers may follow the operands of an operation: how many rows are in use, and a
 note, the number under which its value has kept arrays for the derivatives.
 """
@@ -25,7 +27,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
 from jax.interpreters import ad
 
 from rts.plugin_api.operations import Operation
@@ -123,11 +125,13 @@ class _Differentiable:
         count = self.count = given + operation.keeps
         varied, shape, inputs = self.varied, operation.result_shape, self._inputs
 
-        def pulled(*shapes: tuple, wanted: Wanted, **_: Any) -> list[tuple]:
-            return [(shapes[count][0], *x) for x, wish in zip(shapes[:varied], wanted, strict=True) if wish]
+        def pulled(*shapes: tuple, wanted: Wanted, single: bool, **_: Any) -> list[tuple]:
+            lead = () if single else shapes[count][:1]
+            return [(*lead, *x) for x, wish in zip(shapes[:varied], wanted, strict=True) if wish]
 
-        def pushed(*shapes: tuple, wanted: Wanted, **params: Any) -> list[tuple]:
-            return [(shapes[count][0], *shape(*shapes[:inputs], **params))]
+        def pushed(*shapes: tuple, wanted: Wanted, single: bool, **params: Any) -> list[tuple]:
+            lead = () if single else shapes[count][:1]
+            return [(*lead, *shape(*shapes[:inputs], **params))]
 
         def valued(*shapes: tuple, **params: Any) -> list[tuple]:
             return [shape(*shapes[:inputs], **params), *[()] * operation.keeps]
@@ -190,9 +194,12 @@ class _Differentiable:
             results[1][...] = -1 if kept is None else _kept.add(kept)
 
     def _host_push(
-        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
+        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, single: bool, **params: Any
     ) -> None:
         """Fill `results`: the value's tangents (T, ·), from those of operands marked `wanted`, last in `given`."""
+        if single:
+            given = [*given[: self.count], *(t[None] for t in given[self.count :])]
+            results = [x[None] for x in results]
         operands, used, kept = self._in_use(given)
         tangents: list[Any] = _spread(given[self.count :], wanted)
         for i in self.operation.packed:
@@ -206,12 +213,14 @@ class _Differentiable:
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
     def _host_pull(
-        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
+        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, single: bool, **params: Any
     ) -> None:
         """Fill `results`, gradients (T, ·) of the operands that `wanted` marks; zeros in rows not in use.
 
         The last of `given` are the value's gradients (T, ·). A result may share the memory of its operand.
         """
+        if single:
+            given, results = [*given[:-1], given[-1][None]], [x[None] for x in results]
         operands, used, kept = self._in_use(given)
         places = _spread(results, wanted)
         for t, g in enumerate(given[-1]):
@@ -237,13 +246,15 @@ class _Differentiable:
         note = [jnp.zeros((), np.int32)] * self.operation.keeps
         return [self.operation.specification(*operands[: self._inputs], **params), *note]
 
-    def _specified_push(self, *operands: jax.Array, wanted: Wanted, **params: Any) -> list[jax.Array]:
+    def _specified_push(self, *operands: jax.Array, wanted: Wanted, single: bool, **params: Any) -> list[jax.Array]:
         function, given = self._among(wanted, operands[: self.count], params)
-        return [jax.vmap(jax.linearize(function, *given)[1])(*operands[self.count :])]
+        push = jax.linearize(function, *given)[1]
+        return [(push if single else jax.vmap(push))(*operands[self.count :])]
 
-    def _specified_pull(self, *operands: jax.Array, wanted: Wanted, **params: Any) -> list[jax.Array]:
+    def _specified_pull(self, *operands: jax.Array, wanted: Wanted, single: bool, **params: Any) -> list[jax.Array]:
         function, given = self._among(wanted, operands[: self.count], params)
-        return list(jax.vmap(jax.vjp(function, *given)[1])(operands[-1]))
+        pull = jax.vjp(function, *given)[1]
+        return list((pull if single else jax.vmap(pull))(operands[-1]))
 
     def _among(self, wanted: Wanted, operands: Sequence, params: dict) -> tuple[Callable, list[jax.Array]]:
         """The operation's array code as a function of the wanted operands alone, and the list of these operands."""
@@ -262,11 +273,14 @@ class _Differentiable:
         given, wanted = _present(tangents[: self.varied])
         if not given:
             return found, _zeros(found)
+        if not any(isinstance(x, Tracer) for x in primals):
+            (pushed,) = self._push(*primals, *found[1:], *given, wanted=wanted, single=True, **params)
+            return found, [pushed, *_zeros(found[1:])]
         at = 1 if found[0].ndim > self.rank else 0
         # Tangents of operands by item have the axes B and T, in this order; tangents of others T alone.
         ranks = (r for r, wish in zip(self._value.ranks, wanted, strict=False) if wish)
         swept = [jnp.expand_dims(t, t.ndim - rank) for t, rank in zip(given, ranks, strict=True)]
-        (pushed,) = self._push(*primals, *found[1:], *swept, wanted=wanted, **params)
+        (pushed,) = self._push(*primals, *found[1:], *swept, wanted=wanted, single=False, **params)
         return found, [jax.lax.squeeze(pushed, (at,)), *_zeros(found[1:])]
 
     def _push_jvp(self, primals: Sequence, tangents: Sequence, *, wanted: Wanted, **params: Any) -> tuple[list, list]:

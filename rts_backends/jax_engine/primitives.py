@@ -34,6 +34,8 @@ class HostPrimitive:
         even: see `Operation`.
         noted: True if the last result is a note, () int32 (see `operations.py`).
         some: True if the operands after the samples are only those that a parameter `wanted` marks.
+            Operands after the samples, tangents or gradients, have an axis T first, which a true parameter `single`
+            leaves out.
         in_place: indices of operands whose gradients may take over their memory: then `host` gets an operand and a
             result that share memory. Only for pullbacks, whose results are the gradients (T, ·) that the parameter
             `wanted` marks.
@@ -80,7 +82,7 @@ class HostPrimitive:
         samples, rest = self.ranks[: self.samples], self.ranks[self.samples :]
         if self._some:
             rest = (r for r, wish in zip(rest, params["wanted"], strict=True) if wish)
-        return [*samples, *rest]
+        return [*samples, *(r - params["single"] for r in rest)]
 
     def _by_item(self, operands: Sequence[Any], params: dict) -> list[bool]:
         """A mark for each operand: True if it has the axis B."""
@@ -150,15 +152,19 @@ class HostPrimitive:
         if any(mapped[: self.samples]):
             return self._over_samples(operands, mapped, size, ranks, params)
         # The batch is more tangents or gradients of the same samples: one sweep for all.
-        folded, by_item = [], False
+        folded, by_item, single = [], False, params.get("single", False)
         for x, m, rank in zip(operands, mapped, ranks, strict=True):
             by_item |= x.ndim - m > rank
             if len(folded) >= self.samples:
                 x = x if m else jnp.broadcast_to(x, (size, *x.shape))
                 at = x.ndim - 1 - rank
                 x = jnp.moveaxis(x, 0, at)
-                x = x.reshape(*x.shape[:at], size * x.shape[at + 1], *x.shape[at + 2 :])
+                if not single:
+                    x = x.reshape(*x.shape[:at], size * x.shape[at + 1], *x.shape[at + 2 :])
             folded.append(x)
+        if single:
+            results = self(*folded, **{**params, "single": False})
+            return results, [int(by_item)] * len(results)
         results, at = self(*folded, **params), int(by_item)
         return [x.reshape(*x.shape[:at], size, -1, *x.shape[at + 1 :]) for x in results], [at] * len(results)
 

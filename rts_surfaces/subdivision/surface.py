@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from rts import GBuffer, InputError, Part, engine_of
 from rts.plugin_api.arrays import Array, Tree, constants, shape_of, unit
 from rts.plugin_api.checks import fingerprint, quoted
-from rts.plugin_api.operations import combine, take
+from rts.plugin_api.operations import combine, filled_up, take, with_room
 from rts.plugin_api.records import ArraySpec, Rays, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
@@ -230,8 +230,13 @@ class Subdivision(Parametric):
         if not engine.owns(vertices):
             vertices = engine.constant(vertices, samples.params)
         params, faces = constants((samples.params, samples.ids[:, 0]), engine, vertices)
+        vertices = with_room(vertices)
         at = partial(self._weights, vertices, faces, params)
-        ids = take(engine.constant(self.limit.table, vertices), faces)
+
+        def ids_of(table: Any) -> Array:
+            return take(engine.constant(filled_up(table, engine.room(len(table), vertices)), vertices), faces)
+
+        ids = ids_of(self.limit.table)
         (weights,) = at(VERTEX, False)
         gbuffer = GBuffer(position=combine(vertices, ids, weights))
 
@@ -241,7 +246,7 @@ class Subdivision(Parametric):
 
         def varying() -> Array:
             (own,) = at(UV, False)
-            return combine(theta["uv"], take(engine.constant(self.limit.uv_table, vertices), faces), own)
+            return combine(theta["uv"], ids_of(self.limit.uv_table), own)
 
         gbuffer.defer("normal", normal)
         for name in self.reads(theta)[1:]:
