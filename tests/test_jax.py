@@ -3,6 +3,8 @@
 `make test` runs of jax what is here and not marked `thorough`: programs take seconds to compile.
 """
 
+import sys
+
 import numpy as np
 import pytest
 from helpers import arrays, relative_error, rigid, to_numpy
@@ -209,3 +211,62 @@ def test_map_rows_is_one_loop_in_a_compiled_program(jax):
     rows = np.arange(23, dtype=np.float32)
     np.testing.assert_array_equal(jax.jit(lambda x: engine.map_rows(f, x, 5))(rows), 2 * rows + 1)
     assert set(calls) == {5} and len(calls) < 5
+
+
+def fan(count):
+    """A shallow cone of `count` triangles, as vertices and faces."""
+    turn, around = np.linspace(0, 2 * np.pi, count, endpoint=False), np.arange(count)
+    rim = np.stack([np.cos(turn), np.sin(turn), 0.2 * np.cos(3 * turn)], axis=-1)
+    faces = np.stack([around, (around + 1) % count, np.full(count, count)], axis=-1)
+    return np.concatenate([rim, [[0, 0, 0.3]]]).astype(np.float32), faces
+
+
+def mesh_of(i):
+    vertices, faces = fan(200 + i)
+    return rts.Mesh(faces), {"vertices": vertices}
+
+
+def cage_of(i):
+    count = 20 + i
+    (rim, _), around = fan(count), np.arange(count)
+    shift = np.array([0, 0, 0.5], np.float32)
+    sides = np.stack([around, (around + 1) % count, (around + 1) % count + count, around + count], axis=-1)
+    return rts.Subdivision(sides), {"vertices": np.concatenate([rim[:-1] - shift, rim[:-1] + shift])}
+
+
+def level_set_of(i):
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, 17)] * 3, indexing="ij")
+    values = np.sqrt(x * x + y * y + z * z) - 0.5 - 0.1 * np.sin(i + 7 * x) * np.sin(5 * y)
+    return rts.Isosurface(((-1, -1, -1), (1, 1, 1))), {"values": values.astype(np.float32)}
+
+
+def resident_and_maps():
+    """Mebibytes of memory, and the number of memory maps, of this process."""
+    with open("/proc/self/statm") as file:
+        pages = int(file.read().split()[1])
+    with open("/proc/self/maps") as file:
+        return pages * 4096 / 2**20, sum(1 for _ in file)
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc tells of memory")
+@pytest.mark.parametrize("surface_of", [mesh_of, cage_of, level_set_of])
+def test_a_fit_with_ever_new_topologies_keeps_nothing(jax, surface_of):
+    camera = rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=40)
+    try:
+        surface_of(0)
+    except AttributeError as error:
+        pytest.skip(str(error))
+    known = None
+    for i in range(34):
+        surface, theta = surface_of(i)
+
+        def loss(theta, surface=surface):
+            return (rts.render(rts.Part(surface, theta, "lambert"), camera, (32, 32)) ** 2).mean()
+
+        _, gradient = jax.value_and_grad(loss)(jax.device_put(theta))
+        assert all(np.abs(np.asarray(x)).max() > 0 for x in gradient.values())
+        if i == 3:  # The programs are compiled.
+            known = resident_and_maps()
+    memory, maps = (later - first for later, first in zip(resident_and_maps(), known, strict=True))
+    assert memory < 30 and maps < 30, f"30 topologies kept {memory:.0f} MB and {maps} memory maps"

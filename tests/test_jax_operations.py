@@ -9,7 +9,7 @@ import pytest
 from helpers import icosphere
 
 import rts
-from rts.operations.combine import COMBINE, interpolate
+from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.projection import PROJECTION, projective_map
 
 pytestmark = pytest.mark.engines
@@ -356,3 +356,35 @@ for _ in range(5):
     jax.block_until_ready([program(x + i) for i in range(8)])
 """
     subprocess.run([sys.executable, "-c", code], env=os.environ | {"JAX_PLATFORMS": "cpu"}, check=True, timeout=100)
+
+
+def test_eager_derivatives_in_batches_are_those_one_by_one():
+    rng = np.random.default_rng(4)
+    rows, weights, ids = rng.normal(size=(5, 3)), rng.random((7, 2)), rng.integers(0, 5, (7, 2)).astype(np.int32)
+    rows, weights = jax.device_put(rows.astype(np.float32)), jax.device_put(weights.astype(np.float32))
+
+    def f(rows, weights):
+        return combine(rows, ids, weights)
+
+    def alike(found, expected):
+        for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(np.asarray(x), np.asarray(y), atol=1e-6)
+
+    _, pull = jax.vjp(f, rows, weights)
+    gradients = rng.normal(size=(2, 4, 7, 3)).astype(np.float32)
+    by_one = [[pull(g) for g in some] for some in gradients]
+    expected = jax.tree.map(lambda *x: np.reshape(np.stack(x), (2, 4, *x[0].shape)), *by_one[0], *by_one[1])
+    alike(jax.vmap(jax.vmap(pull))(gradients), expected)
+    alike(jax.jit(jax.vmap(jax.vmap(pull)))(gradients), expected)
+
+    _, push = jax.linearize(f, rows, weights)
+    along, other = rng.normal(size=(4, 5, 3)).astype(np.float32), rng.normal(size=(7, 2)).astype(np.float32)
+    expected = np.stack([push(x, other) for x in along])
+    alike(jax.vmap(push, (0, None))(along, other), expected)
+    alike(jax.jit(jax.vmap(push, (0, None)))(along, other), expected)
+
+    # The gradient of a batch: rows are of all items, weights of each.
+    many = rng.random((4, 7, 2)).astype(np.float32)
+    _, pull = jax.vjp(jax.vmap(f, (None, 0)), rows, jax.device_put(many))
+    by_one = [jax.vjp(f, rows, w)[1](g) for w, g in zip(many, gradients[0], strict=True)]
+    alike(pull(gradients[0]), (sum(r for r, _ in by_one), np.stack([w for _, w in by_one])))
