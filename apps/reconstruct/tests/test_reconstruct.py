@@ -1,11 +1,13 @@
 """Reconstructions from small pictures: the whole, its files, and bad input."""
 
 import csv
+import http.client
 import json
 import re
 import socket
 import struct
 import sys
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -239,14 +241,22 @@ def free_port():
 def test_a_fit_may_be_watched(folder, tmp_path, monkeypatch):
     viewer = pytest.importorskip("rts_viewer")
     pytest.importorskip("viser")
-    steps = []
-    monkeypatch.setattr(viewer.Watch, "wait", lambda self: self.close())
+    steps, statuses = [], []
+
+    def wait(watch):
+        for name in ("127.0.0.1", "evil.example"):
+            with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+                connection.request("GET", "/", headers={"Host": name})
+                statuses.append(connection.getresponse().status)
+        watch.close()
+
+    monkeypatch.setattr(viewer.Watch, "wait", wait)
     step = viewer.Watch.step
     monkeypatch.setattr(viewer.Watch, "step", lambda self, *a: (steps.append(a), step(self, *a))[1])
     words = ["--watch", "--port", str(port := free_port()), "--steps", "6", "--size", str(SIZE), "--texture", "0"]
     run = CliRunner().invoke(app, ["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--quick", *words])
     assert run.exit_code == 0 and f"http://127.0.0.1:{port} shows the fit" in run.output
-    assert f"http://127.0.0.1:{port} shows the result" in run.output
+    assert f"http://127.0.0.1:{port} shows the result" in run.output and statuses == [200, 403]
     number, loss, vertices, faces, colors = steps[0]
     assert number == 0 and loss > 0 and faces.max() < len(vertices) == len(colors)
     np.testing.assert_allclose(colors, ((0.5 + 0.055) / 1.055) ** 2.4, rtol=1e-5)  # Grey, made linear.

@@ -1,4 +1,4 @@
-"""The page in the browser: viser's server, and the meshes and cameras that it shows."""
+"""The page in the browser: viser's server behind `Front`, and the meshes and cameras that it shows."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import rich
 
 import rts
 from rts_viewer.address import check_address, url
+from rts_viewer.front import Front, hidden_address
 from rts_viewer.glb import Triangles, glb
 from rts_viewer.pictures import small
 
@@ -28,7 +29,7 @@ class Page:
 
     Args:
         port: the port of the server.
-        host: the address that it listens at; "0.0.0.0" lets other machines see the page.
+        host: the address that it listens at; "0.0.0.0" lets other machines see the page. Pages of other sites do not.
         label: the title of the panel.
 
     Attributes:
@@ -47,10 +48,10 @@ class Page:
         except ImportError as error:
             raise rts.PluginError(f"the viewer needs viser ({error}): pip install ./apps/viewer") from error
         check_address(host, port)
-        before = set(threading.enumerate())
+        before, (address, free) = set(threading.enumerate()), hidden_address()
         with _quiet():
-            self._server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
-        self._threads = set(threading.enumerate()) - before
+            self._server = viser.ViserServer(host=address, port=free, label=label, verbose=False)
+        self._threads, self._front = set(threading.enumerate()) - before, None
         self._turn = SO3.from_matrix
         self.url, self.gui = url(host, port), self._server.gui
         self._meshes: dict[str, Any] = {}
@@ -58,10 +59,12 @@ class Page:
         self._lock = threading.Lock()
         self._up = np.array([0.0, 1.0, 0.0])
         self._sphere: tuple[np.ndarray, float] | None = None
-        if self._server.get_port() != port:  # Taken since it was tried.
+        try:
+            self._front = Front(host, port, (address, self._server.get_port()))
+        except OSError:  # Taken since it was tried.
             self.close()
             check_address(host, port)
-            raise rts.InputError(f"port {port} of {host} is in use; give another port (--port)")
+            raise rts.InputError(f"port {port} of {host} is in use; give another port (--port)") from None
         # No button that would send the scene to a server elsewhere.
         self.gui.configure_theme(show_logo=False, show_share_button=False)
         self.turn_up(self._up)
@@ -76,6 +79,8 @@ class Page:
                 self._server.stop()
             for thread in self._threads:
                 thread.join(timeout=5)
+        if self._front is not None:
+            self._front.close()
 
     def turn_up(self, direction: np.ndarray) -> None:
         """Show a direction (3,) of world space upright."""

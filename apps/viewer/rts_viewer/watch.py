@@ -35,12 +35,12 @@ class Watch:
         watch.end()
         watch.wait()  # until "close" is pressed, or Ctrl-C
 
-    viser, which serves the page, does not check where connections come from: until it is closed, any web page that is
-    open in a browser of this machine could look at the mesh and the pictures, and press the buttons.
+    Pages of other sites that are open in a browser are refused: they can neither look nor press buttons.
 
     Args:
         port: the port of the page.
-        host: the address that the page is served at. By default only this machine sees it; "0.0.0.0" is for all.
+        host: the address that the page is served at. By default only this machine sees it; "0.0.0.0" is for all, who
+            then open it by the machine's address or its name.
 
     Attributes:
         url: the address to open.

@@ -1,5 +1,6 @@
 """Models in the viewer: parts as triangles, the files that browsers are sent, and the command `rts view`."""
 
+import http.client
 import io
 import json
 import os
@@ -7,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -137,6 +139,10 @@ def test_the_command_shows_a_model_until_it_is_interrupted(model):
     )
     first = process.stdout.readline()
     assert first == f"http://127.0.0.1:{port} shows two.glb, 640 triangles, 1 cameras; Ctrl-C ends it\n", first
+    for name, status in (("127.0.0.1", 200), ("evil.example", 403)):
+        with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+            connection.request("GET", "/", headers={"Host": name})
+            assert connection.getresponse().status == status
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out, err) == (0, "", "")

@@ -1,17 +1,22 @@
 """The page that shows a fit: where it is served, its controls, and what a browser sees."""
 
+import http.client
 import socket
 import sys
 import threading
 import urllib.request
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import viser
 from browser import Browser, program, until
 from helpers import GREEN, RED, ball, free_port, view, watching
 from rts_viewer.history import History, State
 from rts_viewer.pictures import loss_curve, small
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
 import rts
 
@@ -29,7 +34,90 @@ def other_address():
     return None if address.startswith("127.") else address
 
 
+def answer(watch, name="127.0.0.1", origin=None, address="127.0.0.1"):
+    """The status with which a websocket is opened, 101 if the scene is sent, by a browser that knows a name for it."""
+    port = int(watch.url.rpartition(":")[2])
+    with socket.create_connection((address, port), timeout=10) as opened:
+        protocol = f"viser-v{viser.__version__}"
+        try:
+            with connect(f"ws://{name}:{port}", sock=opened, origin=origin, subprotocols=[protocol]) as page:
+                assert isinstance(page.recv(timeout=10), bytes)
+                return 101
+        except InvalidStatus as refused:
+            assert b"other sites" in refused.response.body
+            return refused.response.status_code
+
+
 # --------------------------------------------------------------------------------------------- where it is served
+
+
+def test_pages_of_other_sites_are_refused():
+    evil = "http://evil.example"
+    with watching() as watch:
+        port = watch.url.rpartition(":")[2]
+        assert answer(watch) == 101  # No browser: without an origin.
+        for name in ("127.0.0.1", "localhost", "[::1]"):
+            assert answer(watch, name, f"http://{name}:{port}") == 101
+        assert answer(watch, "LOCALHOST", "http://127.0.0.1:9000") == 101  # Led here by ssh, say.
+        for origin in (evil, f"{evil}:{port}", "https://127.0.0.1.evil.example", "http://[broken", "null"):
+            assert answer(watch, origin=origin) == 403
+        assert answer(watch, "evil.example", f"{evil}:{port}") == 403  # By DNS rebinding both are the site's.
+        assert answer(watch, "evil.example") == answer(watch, "0.0.0.0", evil) == answer(watch, "192.0.2.1") == 403
+
+
+def test_without_a_websocket_the_page_is_refused_too():
+    with watching() as watch:
+        port = int(watch.url.rpartition(":")[2])
+        for name, status in ((f"127.0.0.1:{port}", 200), ("localhost", 200), ("evil.example", 403), ("a:b", 403)):
+            with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+                connection.request("GET", "/", headers={"Host": name})
+                found = connection.getresponse()
+                assert found.status == status and (b"<html" in found.read()) == (status == 200)
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as opened:
+            opened.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            assert opened.recv(100).startswith(b"HTTP/1.1 403 ")
+
+
+def test_a_host_that_is_asked_for_widens_who_is_served():
+    address, own = other_address(), socket.gethostname()
+    if address is None:
+        pytest.skip("the machine has no other address")
+    with watching(host="0.0.0.0") as watch:
+        port = watch.url.rpartition(":")[2]
+        for name in (address, own, own + ".local", "localhost"):
+            assert answer(watch, name, f"http://{name}:{port}", address) == 101
+        assert answer(watch, address, "http://192.0.2.1", address) == 403
+        assert answer(watch, "evil.example", "http://evil.example", address) == 403
+        assert answer(watch, address, "http://evil.example", address) == 403
+    with watching(host=address) as watch:
+        assert answer(watch, address, f"http://{address}:{port}", address) == 101
+        assert answer(watch, "192.0.2.1", None, address) == 403
+
+
+def test_the_server_behind_listens_where_no_page_looks():
+    with watching() as watch:
+        port, front = int(watch.url.rpartition(":")[2]), watch._page._front
+        address, hidden = front._behind
+        assert address.startswith("127.") and address != "127.0.0.1" and hidden != port
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", hidden), timeout=10)
+
+
+def test_an_end_with_open_connections_is_quiet_and_ends_them(capfd):
+    with watching() as watch:
+        port, protocol = int(watch.url.rpartition(":")[2]), f"viser-v{viser.__version__}"
+        page = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol])
+        page.recv(timeout=10)
+        silent = socket.create_connection(("127.0.0.1", port), timeout=10)
+        silent.sendall(b"GET")
+    with pytest.raises(ConnectionClosed):
+        while True:
+            page.recv(timeout=10)
+    assert silent.recv(10) == b""
+    silent.close()
+    assert not watch._page._front._thread.is_alive()
+    out = capfd.readouterr()
+    assert not out.out and not out.err
 
 
 def test_only_this_machine_sees_the_page():
