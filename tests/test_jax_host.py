@@ -14,15 +14,17 @@ jnp = jax.numpy
 mlir = pytest.importorskip("jax.interpreters.mlir")
 
 
-@pytest.fixture(params=["_in_place", "_copying"], autouse=True)
-def way(request):
-    """Both ways of calling; the second is that of other devices."""
+@pytest.fixture(params=["_in_place", "_copying", "_emitted"], autouse=True)
+def way(request, monkeypatch):
+    """All ways of calling; the second is that of other devices, the third that of jax before 0.6.1."""
 
     def use(name):
         rule = mlir.lower_fun(getattr(jax_host, name), multiple_results=True)
         mlir.register_lowering(jax_host._call, rule, platform="cpu")
 
-    use(request.param)
+    if request.param == "_emitted":
+        monkeypatch.setattr(jax_host, "buffer_callback", None)
+    use("_copying" if request.param == "_copying" else "_in_place")
     yield
     use("_in_place")
 
@@ -135,3 +137,13 @@ def test_all_items_of_a_batch_take_one_branch():
             np.testing.assert_allclose(slopes, [3, 3] if all(which) else -2 * x)
     along = jax.jit(jax.jacfwd(chosen, argnums=1))(True, x)
     np.testing.assert_allclose(along, 3 * np.eye(2))
+
+
+@pytest.mark.parametrize("live", [(), ([True],)], ids=["before jax 0.12", "jax 0.12"])
+def test_results_that_a_program_does_not_use_are_left_out_of_its_call(live):
+    shapes = [jax.ShapeDtypeStruct((2,), np.float32)] * 2
+    traced = jax.make_jaxpr(lambda x: jax_host.call(lambda x: (x, x), shapes, x))(jnp.zeros(2))
+    (equation,) = traced.jaxpr.eqns
+    read, less = jax_host._without_unused([False, True], *live, equation)
+    assert read == [True] and less.params["used"] == (1,) and less.outvars == equation.outvars[1:]
+    assert jax_host._without_unused([False, False], *live, equation) == ([False], None)

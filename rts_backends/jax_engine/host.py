@@ -116,11 +116,12 @@ def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, l
     return results, [0] * len(results)
 
 
-def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], Any]:
+def _without_unused(wanted: Sequence[bool], *rest: Any) -> tuple[list[bool], Any]:
     """Marks of the operands that the call reads, and the call with only the wanted results, or None if none is wanted.
 
-    A rule for jax's removal of dead code.
+    A rule for jax's removal of dead code. The equation is the last argument; jax 0.12 gives another before it.
     """
+    equation = rest[-1]
     if not any(wanted):
         return [False] * len(equation.invars), None
     used = tuple(i for i, wish in zip(equation.params["used"], wanted, strict=True) if wish)
