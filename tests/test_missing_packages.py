@@ -1,9 +1,11 @@
 """Without each optional package all else works and the error says what to install; the same without a display."""
 
+import shutil
 import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -459,3 +461,23 @@ def test_a_broken_framework_that_something_has_imported_is_no_matter_for_numpy()
         assert rts.render(part, rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (12, 15))[..., 3].max() > 0.9
     """
     subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True, timeout=120)
+
+
+@pytest.mark.thorough
+def test_a_folder_named_rts_does_not_hide_an_editable_install(tmp_path):
+    pytest.importorskip("setuptools", minversion="77")
+    clone, site, beside = (tmp_path / name for name in ("clone", "site", "beside"))
+    root = Path(__file__).resolve().parent.parent
+    for name in ("rts", "rts_backends", "rts_compare", "rts_surfaces"):
+        (clone / name).mkdir(parents=True)
+        (clone / name / "__init__.py").write_text('__version__ = "1.2.3"\n')
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(root / name, clone)
+    build = f"from setuptools import build_meta; build_meta.build_editable({str(tmp_path)!r})"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", build], cwd=clone, capture_output=True, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    shutil.unpack_archive(wheel, site, "zip")
+    (beside / "rts").mkdir(parents=True)
+    code = f"import site; site.addsitedir({str(site)!r}); import rts; print(rts.__file__, rts.__version__)"
+    done = subprocess.run([sys.executable, "-S", "-c", code], cwd=beside, capture_output=True, text=True)
+    assert done.stdout.split() == [str(clone / "rts/__init__.py"), "1.2.3"], done.stderr
