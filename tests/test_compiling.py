@@ -284,7 +284,6 @@ import sys
 import numpy as np
 import numba
 import numba.core.caching
-from numba.core import event
 numba.njit(lambda: None)()  # numba imports more of itself.
 {change}
 sys.path.insert(0, {folder!r})
@@ -301,14 +300,13 @@ print(sum(several.double.stats.cache_hits.values()), "rts.compiling.numba_intern
     [
         ("", True),
         ("del numba.core.caching.FunctionCache", False),
-        ("del event.Listener", False),
         (
             "njit = numba.njit\nnumba.njit = lambda **o: njit(**o) if 'cache' in o else "
             "lambda f: type('Other', (), {'__slots__': ()})()",
             True,
         ),
     ],
-    ids=["as it is", "no FunctionCache", "no events", "no cache of dispatchers"],
+    ids=["as it is", "no FunctionCache", "no cache of dispatchers"],
 )
 @pytest.mark.thorough
 def test_loops_are_kept_by_a_numba_without_private_names(change, private, tmp_path):
