@@ -324,8 +324,11 @@ class Outlines:
     Attributes:
         place: (B, 2) float64, x and y of each break, in cells from the grid's corner.
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
-        rows: (B, 2) int32, indices of the last samples before and behind each break, along its gap, or −1.
+        rows: (B, 2) int32, indices of the last samples before and behind each break, along its gap, or −1. Breaks move
+            as they do.
         points: (B, 2, 2) float64, x and y of these samples.
+        inner: (B, 2) int32, indices of samples of the same surfaces a little farther from the break, or −1. They tell
+            colours: in the last hair before an outline normals may turn away, and colours with them.
         near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
             surfaces pass through one another.
         slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
@@ -345,6 +348,7 @@ class Outlines:
     gap: Array
     rows: Array
     points: Array
+    inner: Array
     near: Array
     slope: Array
     ends: Array

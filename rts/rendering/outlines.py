@@ -36,10 +36,12 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid) -> Sampled:
     further = more_breaks(breaks, *tips(breaks, segments), fronts, oracle)
     if further is not breaks:
         breaks, segments = further, joined(further)
-    samples, rows, first = [], np.full(breaks.parts.shape, -1, np.int32), 0
+    # For each break the two last samples, and the two that tell colours.
+    parts, every = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
+    samples, rows, first = [], np.full(parts.shape, -1, np.int32), 0
     for part, own in enumerate(sampled.samples):
-        asked = breaks.parts == part
-        more = points.sample(part, breaks.points[asked], evaluated=True)
+        asked = parts == part
+        more = points.sample(part, every[asked], evaluated=True)
         count = own.ids.shape[-2]
         found = _known(more.row)[0, 0]
         rows[asked] = np.where(found >= 0, first + count + found, -1)
@@ -47,7 +49,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid) -> Sampled:
         first += samples[-1].ids.shape[-2]
     shifted = _renumbered(sampled, samples)
     fields = {name: getattr(breaks, name) for name in ("place", "gap", "points", "near", "slope", "ends", "joined")}
-    outlines = Outlines(rows=rows, **fields, **segments._asdict())
+    outlines = Outlines(rows=rows[:, :2], inner=rows[:, 2:], **fields, **segments._asdict())
     return replace(sampled, samples=tuple(samples), cells=shifted, outlines=outlines)
 
 

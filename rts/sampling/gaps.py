@@ -16,6 +16,9 @@ from rts.sampling.sheets import Sheets
 FINE = 1e-4
 """Length of the interval, in cells, in which a break is known to lie; then the sheets tell where exactly."""
 
+INNER = 0.1
+"""Distance from a break, in cells, of the samples that tell colours; half the way to the next break if that is less."""
+
 BESIDE = 0.05
 """Distance beyond a break, in cells, up to which a sheet is followed to tell if it goes on behind the other."""
 
@@ -108,6 +111,7 @@ class Breaks(NamedTuple):
         slope: (B, 2, 2) float64.
         ends: (B, 2) bool.
         points: (B, 2, 2) float64, x and y of the last samples before and behind each break.
+        inner: (B, 2, 2) float64, x and y of the samples that tell colours.
         parts: (B, 2) int32, their parts, or −1.
         joined: (2, H, W) bool: does each cell's front go on to the next one's, along x and along y?
     """
@@ -118,6 +122,7 @@ class Breaks(NamedTuple):
     slope: np.ndarray
     ends: np.ndarray
     points: np.ndarray
+    inner: np.ndarray
     parts: np.ndarray
     joined: np.ndarray
 
@@ -187,21 +192,29 @@ def _with_breaks(breaks: Breaks, gap: np.ndarray, places: np.ndarray, fronts: Fr
     joined = breaks.joined.copy()
     y, x, axis = gap[number].T
     joined[1 - axis, y, x] = False
+    first, last = np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0
+    low, high = found.low, found.high
+    inner = [
+        low - np.minimum(INNER, (low - np.where(first, 0.0, np.roll(high, 1))) / 2),
+        high + np.minimum(INNER, (np.where(last, 1.0, np.roll(low, -1)) - high) / 2),
+    ]
     own = (
         gap[number],
         gaps.points(number, place[kept]),
         near[kept],
         slope[kept],
-        np.stack([np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0], 1),
-        np.stack([gaps.points(number, found.low), gaps.points(number, found.high)], 1),
+        np.stack([first, last], 1),
+        np.stack([gaps.points(number, low), gaps.points(number, high)], 1),
+        np.stack([gaps.points(number, at) for at in inner], 1),
         np.stack([found.before.part, found.behind.part], 1),
     )
     return Breaks(*(np.concatenate(pair) for pair in zip(breaks[:-1], own, strict=True)), joined)
 
 
 def _no_breaks(joined: np.ndarray) -> Breaks:
-    shapes = ((0, 3), np.int32), ((0, 2), float), (0, np.int32), ((0, 2, 2), float), ((0, 2), bool), ((0, 2, 2), float)
-    return Breaks(*(np.zeros(shape, dtype) for shape, dtype in shapes), np.zeros((0, 2), np.int32), joined)
+    shapes = ((0, 3), np.int32), ((0, 2), float), (0, np.int32), ((0, 2, 2), float), ((0, 2), bool)
+    fields = [np.zeros(shape, dtype) for shape, dtype in shapes]
+    return Breaks(*fields, np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2), np.int32), joined)
 
 
 def _ends(gap: np.ndarray, fronts: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:

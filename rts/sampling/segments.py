@@ -105,32 +105,40 @@ def _corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`Outlines.corner` and `Outlines.pull` of segments.
 
+    Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
+    at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
+    curve is two thirds as far from the chord as their meeting.
+
     Args:
         origin: (S, 2), y and x of the first corner of each square.
         ties: (S, 2), the ends of segments.
         beyond: (S, 4), the result of `_beyond`.
         place: (B, 2), x and y of breaks.
     """
-    start, end, corner, alone, meets = _turns(ties, beyond, place)
-    inside = ((corner >= origin[:, ::-1]) & (corner <= origin[:, ::-1] + 1)).all(axis=1)
-    chord = end - start
-    length = np.maximum((chord**2).sum(1), 1e-12)
-    share = np.clip(((corner - start) * chord).sum(1) / length, 0, 1)
-    foot = start + share[:, None] * chord
-    weight = np.where(meets & inside, (1 + 2 * alone) / 3, 0.0)
-    share, foot = np.where(weight > 0, share, 0.5), np.where(weight[:, None] > 0, foot, start + chord / 2)
-    corner = np.where(weight[:, None] > 0, foot + weight[:, None] * (corner - foot), foot)
+    start, end, sharp, alone, meets = _turns(ties, beyond, place)
+    low = origin[:, ::-1]
+
+    def inside(corner: np.ndarray) -> np.ndarray:
+        return ((corner >= low) & (corner <= low + 1)).all(axis=1)
+
+    before, after, chord = place[beyond[:, 1]], place[beyond[:, 2]], end - start
+    known = (beyond[:, 1] >= 0) & (beyond[:, 2] >= 0)
+    round_, rounds = _meeting(start, end - before, end, after - start)
+    rounds &= known & inside(round_)
+    middle = start + chord / 2
+    round_ = np.where(rounds[:, None], middle + (2 / 3) * (round_ - middle), middle)
+    alone = np.where(meets & inside(sharp), alone, 0.0)[:, None]
+    corner = np.where(alone > 0, (1 - alone) * round_ + alone * sharp, round_)
+    share = np.clip((((corner - start) * chord).sum(1) / np.maximum((chord**2).sum(1), 1e-12)), 0, 1)
     # The corner of two straight lines moves as both of them say; a point of a curve as the ends of its chord do.
     pull = np.column_stack([0 * share, 1 - share, share, 0 * share])
-    far = np.where(meets & inside & (alone > 0), alone, 0.0)
-    before, after = place[beyond[:, 1]], place[beyond[:, 2]]
     with np.errstate(invalid="ignore", divide="ignore"):
         on = np.linalg.norm(corner - start, axis=1) / np.linalg.norm(start - before, axis=1)
         back = np.linalg.norm(corner - end, axis=1) / np.linalg.norm(after - end, axis=1)
-    on, back = (np.where(far > 0, x, 0.0) for x in (on, back))
+    steady = (alone[:, 0] > 0) & (on < 2) & (back < 2)
+    on, back = np.where(steady, on, 0.0), np.where(steady, back, 0.0)
     lines = np.column_stack([-on, 1 + on, 1 + back, -back]) / 2
-    steady = (on < 2) & (back < 2)
-    return corner, np.where((far * steady)[:, None] > 0, (1 - far[:, None]) * pull + far[:, None] * lines, pull)
+    return corner, np.where(steady[:, None], (1 - alone) * pull + alone * lines, pull)
 
 
 def _turns(ties: np.ndarray, beyond: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -142,14 +150,20 @@ def _turns(ties: np.ndarray, beyond: np.ndarray, place: np.ndarray) -> tuple[np.
     start, end = place[ties[:, 0]], place[np.where(ties[:, 1] >= 0, ties[:, 1], ties[:, 0])]
     points, known = place[np.where(beyond >= 0, beyond, 0)], beyond >= 0
     ahead, back = start - points[:, 1], points[:, 2] - end
-    turn = _cross(ahead, back)
-    meets = known[:, 1] & known[:, 2] & (np.abs(turn) > 1e-9)
-    corner = start + (_cross(end - start, back) / np.where(meets, turn, 1.0))[:, None] * ahead
-    meets &= (((corner - start) * ahead).sum(1) >= 0) & (((end - corner) * back).sum(1) >= 0)
+    corner, meets = _meeting(start, ahead, end, back)
     beside = np.where(known[:, 0], _angle(points[:, 1] - points[:, 0], ahead), 0.0)
     beside += np.where(known[:, 3], _angle(back, points[:, 3] - points[:, 2]), 0.0)
-    whole = _angle(ahead, back)
-    return start, end, corner, np.clip(1 - beside / np.maximum(whole, 1e-6), 0, 1), meets
+    alone = np.clip(1 - beside / np.maximum(_angle(ahead, back), 1e-6), 0, 1)
+    return start, end, corner, alone, meets & known[:, 1] & known[:, 2]
+
+
+def _meeting(start: np.ndarray, ahead: np.ndarray, end: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where lines from `start` along `ahead` and to `end` along `back` meet (S, 2), and True if that is between them."""
+    turn = _cross(ahead, back)
+    there = np.abs(turn) > 1e-9
+    meeting = start + (_cross(end - start, back) / np.where(there, turn, 1.0))[:, None] * ahead
+    between = (((meeting - start) * ahead).sum(1) >= 0) & (((end - meeting) * back).sum(1) >= 0)
+    return meeting, there & between
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -109,7 +109,9 @@ class _Breaks(NamedTuple):
         check_rows(rows, rgba.shape[0], "outlines.rows")
         seen = xp.stack([rows[:, 0] >= 0, rows[:, 1] >= 0])
         at = [xp.where(rows[:, i] >= 0, rows[:, i], 0) for i in (0, 1)]
-        color = xp.stack([xp.where(seen[i][:, None], xp.take(rgba, at[i], axis=0), 0.0) for i in (0, 1)])
+        shown = xp.where(outlines.inner >= 0, outlines.inner, rows)
+        shown = xp.where(shown >= 0, shown, 0)
+        color = xp.stack([xp.where(seen[i][:, None], xp.take(rgba, shown[:, i], axis=0), 0.0) for i in (0, 1)])
         found = [xp.take(positions, at[i], axis=0) for i in (0, 1)]
         points = xp.astype(outlines.points, positions.dtype)
         motion = [xp.where(seen[i][:, None], found[i][:, :2] - points[:, i], 0.0) for i in (0, 1)]
@@ -271,24 +273,44 @@ class _Segments(NamedTuple):
 def _beside_breaks(
     breaks: _Breaks, segments: _Segments, outlines: Outlines, color: Array, motion: Array
 ) -> list[tuple[Array, Array, Array]]:
-    """What changes in the cells on both sides of gaps: colours there change on up to the break, and no farther."""
-    xp = namespace(color)
+    """What changes in the two cells of each gap: on each surface the colour goes on as far as the break.
+
+    From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
+    change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
+    the outline's normal n, with the mean motion of both samples. The mean colour of what is seen differs from C, or X
+    beyond the border, by half the slope times the length; in a cell seen on both sides of its centre, these cancel.
+    """
+    xp, (height, width) = namespace(color), color.shape[:2]
     y, x, row = (outlines.gap[:, i] for i in range(3))
-    parts = []
     normal = segments.normals(breaks)
+    ahead = xp.sum(normal * breaks.step, axis=-1)
     flat_color, flat_motion = (xp.reshape(t, (-1, t.shape[-1])) for t in (color, motion))
-    for i in (0, 1):
-        cx, cy = (x, y) if i == 0 else (x + row, y + 1 - row)
-        index = cy * color.shape[1] + cx
+    joined, parts = xp.reshape(outlines.joined, (2, -1)), []
+    for i, way in enumerate((1, -1)):
+        cells = [(x, y), (x + row, y + 1 - row)]
+        (cx, cy), beyond = cells[i], cells[1 - i]
+        index = cy * width + cx
+        here, last = xp.take(flat_color, index, axis=0), breaks.color[i]
         counts = (outlines.ends[:, i] & breaks.seen[i])[:, None]
-        rise = stopped(breaks.color[i] - xp.take(flat_color, index, axis=0)) * (1 if i == 0 else -1)
+        centre = xp.stack([xp.astype(cx, color.dtype), xp.astype(cy, color.dtype)], axis=-1) + 0.5
+        length = xp.clip(xp.sum((breaks.place - centre) * breaks.step, axis=-1) * way, 0.0, 1.0)
+        inside, outside = xp.clip(length, None, 0.5), xp.clip(length - 0.5, 0.0, None)
+        share = (inside / xp.where(length > 1e-6, length, 1.0))[:, None]
         moves = (breaks.motion[i] + xp.take(flat_motion, index, axis=0)[:, :2]) / 2
-        if PROJECT:
-            own = xp.sum(moves * normal, axis=-1) * xp.sum(normal * breaks.step, axis=-1)
-        else:
-            own = xp.sum(moves * breaks.step, axis=-1)
-        parts.append((cx, cy, xp.where(counts, -rise * own[:, None], 0.0)))
+        moved = -stopped(last - here) * (way * ahead * xp.sum(moves * normal, axis=-1))[:, None]
+        # The slope from the centre before, where it shows the same surface, since d may be short.
+        before = xp.clip(cx - way * row, 0, width - 1), xp.clip(cy - way * (1 - row), 0, height - 1)
+        former = before[1] * width + before[0]
+        first = former if way == 1 else index
+        on = xp.where(row == 1, xp.take(joined[0], first), xp.take(joined[1], first))[:, None]
+        slope = xp.where(
+            on,
+            (last - xp.take(flat_color, former, axis=0)) / (1 + length)[:, None],
+            (last - here) / xp.clip(length, 0.5, None)[:, None],
+        )
+        weight = (ahead**2)[:, None]
+        nearer = -weight * slope * ((0.5 - inside) ** 2 / 2)[:, None]
+        farther = -weight * slope * (outside**2 / 2)[:, None]
+        parts.append((cx, cy, xp.where(counts, share * moved + nearer, 0.0)))
+        parts.append((*beyond, xp.where(counts, (1 - share) * moved + farther, 0.0)))
     return parts
-
-
-PROJECT = True
