@@ -18,7 +18,7 @@ def rows(*batch):
 
 
 def own(x, index=INDEX):
-    return torch.index_select(x, 0, index)
+    return torch.index_select(x, 0, index.long())  # torch 2.4 has no second derivatives by indices of 32 bits.
 
 
 def weighted(f):

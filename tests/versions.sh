@@ -47,7 +47,8 @@ names = ("torch", "jax", "numpy", "numba", "trimesh", "typer")
 print("Python", platform.python_version(), *(f"{name} {version(name)}" for name in names))
 assert all(p.ready for p in rts.plugins("engines", details=True))
 PYTHON
-export NUMBA_CACHE_DIR=$PWD/$venv/numba
+NUMBA_CACHE_DIR=$(realpath "$venv")/numba
+export NUMBA_CACHE_DIR
 "$bin/python" -m pytest -n "${WORKERS:-2}" --dist loadfile -p no:cacheprovider -m "${MARKS:-engines or files}"
 # A pose's fit, from far off: found, in torch and in jax.
 for engine in torch jax; do

@@ -15,7 +15,7 @@ NEWEST = {
     "trimesh": "5.2",
     "typer": "0.29",
 }
-"""Newest minor version of each package with which `tests/versions.sh` has run."""
+"""Newest minor version of each package that was run: see the table of docs/start/install.md."""
 
 
 def untried() -> str:
