@@ -42,7 +42,7 @@ def quiet_forward_mode() -> None:
     """Have torch load the modules of its forward mode, once, and hide its warning of `torch.jit.script`."""
     if not _loaded:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+            warnings.filterwarnings("ignore", "`torch.jit")  # A FutureWarning from torch 2.15 on.
             torch.func.jvp(torch.clone, (torch.zeros(()),), (torch.ones(()),))
         _loaded.append(True)
 
