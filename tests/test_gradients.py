@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, quad
+from helpers import DIFFERENTIABLE, TORCH, arrays, quad, to_numpy
 
 import rts
 from rts.diagnostics import finite_difference_steps, gradients
@@ -223,3 +223,87 @@ def test_a_derivative_of_the_wrong_sign_differs_however_small_beside_others():
     ]
     check = gradients.GradientCheck(slopes, 0.1)
     assert check.agrees(slopes[0]) and not check.agrees(slopes[1]) and not check.ok
+
+
+# ------------------------------------------------------------------------------------------- second derivatives
+
+TURNED = 7.0 * np.array([(np.cos(a), np.sin(a), 0) for a in 0.3 + np.pi / 2 * np.arange(4)])
+"""A square of side 7 √2, of area 98; a world unit is a pixel."""
+LARGER = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=20)
+
+
+def square(shift):
+    """A square that the parameters (3,) shift."""
+    return rts.Part(MESH(FACES), {"vertices": arrays_like(shift, TURNED) + shift}, "silhouette"), LARGER
+
+
+def checked(target, loss, **options):
+    given = {"entries": 3, "samples": 2, "hessian": True, "budget_s": 600, **options}
+    return rts.check_gradient(square, arrays(target, np.array([0.1, 0.2, 0.0])), (20, 20), loss=loss, **given)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_the_area_of_a_square_that_shifts_has_hessian_zero_where_weights_of_splats_are_curved(target):
+    hessian = checked(target, lambda image: image[..., 3].sum()).hessian
+    np.testing.assert_allclose(hessian.difference, 0, atol=1e-4)
+    curvature = np.diag(hessian.autodiff)[:2] / (28 * np.sqrt(2))  # By perimeter.
+    assert (curvature < -0.8).all() and (curvature > -1.1).all()
+    np.testing.assert_array_equal(hessian.agreement, ~np.diag([True, True, False]))
+    assert not hessian.ok
+    rows = [line for line in str(hessian).splitlines() if line.endswith("differs")]
+    assert [row.split()[0] for row in rows] == ["parameters[0]", "parameters[1]"] and "Gauss–Newton" in str(hessian)
+
+
+@pytest.mark.thorough
+def test_differences_of_gradients_are_right_to_a_hundredth():
+    # The second derivative of the integral of (x + 1.3)² / 2 over a shape that shifts along x is its area.
+    weights = arrays("torch-cpu", (np.arange(20) + 0.5 - 10 + 1.3) ** 2 / 2)
+    hessian = checked("torch-cpu", lambda image: (image[..., 3] * weights).sum(), supersample=2).hessian
+    expected = np.zeros((3, 3))
+    expected[0, 0] = 98
+    np.testing.assert_allclose(hessian.difference, expected, atol=0.98)
+    assert np.abs(hessian.autodiff - expected).max() > 98
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("target", TORCH)
+def test_second_derivatives_in_colours_agree(target):
+    """An image is linear in colours, so the sum of its squares has Hessian 2 Σ α² in each."""
+
+    def scene(color):
+        part = rts.Part(MESH(FACES), {"vertices": arrays_like(color, VERTICES), "color": color}, "unlit")
+        return part, CAMERA
+
+    color = arrays(target, np.array([0.8, 0.5, 0.2]))
+    options = {"loss": lambda image: (image[..., :3] ** 2).sum(), "samples": 2, "budget_s": 600, "hessian": True}
+    hessian = rts.check_gradient(scene, color, SIZE, **options).hessian
+    alpha = to_numpy(rts.render(*scene(color), SIZE))[..., 3]
+    assert hessian.ok and hessian.names == ["parameters[0]", "parameters[1]", "parameters[2]"]
+    for found in hessian.autodiff, hessian.difference:
+        np.testing.assert_allclose(found, 2 * (alpha**2).sum() * np.eye(3), rtol=2e-3, atol=0.05)
+    values = hessian.eigenvalues(hessian.autodiff)
+    np.testing.assert_allclose(values, 2 * (alpha**2).sum() * finite_difference_steps.STEP_COLOR**2, rtol=1e-3)
+
+
+def test_without_asking_there_are_no_second_derivatives():
+    assert rts.check_gradient(card, parameters_of("torch-cpu"), SIZE, entries=1, samples=1).hessian is None
+
+
+def test_what_an_engine_cannot_differentiate_twice_is_refused_before_anything_is_measured():
+    torch = pytest.importorskip("torch")
+
+    class Once(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return 2 * x
+
+        @staticmethod
+        def backward(ctx, g):
+            return 2 * g
+
+    with pytest.raises(rts.InputError, match="hessian=True: torch cannot differentiate this scene .* twice") as error:
+        rts.check_gradient(lambda p: square(Once.apply(p)), torch.zeros(3), (20, 20), hessian=True, budget_s=1e-9)
+    assert "\n" not in str(error.value)
+    with pytest.raises(rts.InputError, match="hessian is 'yes'; expected True or False"):
+        rts.check_gradient(square, torch.zeros(3), (20, 20), hessian="yes")

@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.argument_checks import quoted
+from rts.arrays.argument_checks import check_flag, quoted
 from rts.arrays.array_functions import from_numbers, kind_of
 from rts.arrays.engines import Engine, engine_of, is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import check_size, is_count, is_real
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
+from rts.diagnostics.explanation.second_derivatives import HessianCheck, curvatures, require_second_derivatives
 from rts.diagnostics.explanation.selection import explained
 from rts.diagnostics.explanation.shared_budget import Clock, looked_at
-from rts.diagnostics.explanation.slopes import Slope
+from rts.diagnostics.explanation.slopes import NEGLIGIBLE, Slope
 from rts.diagnostics.explanation.subject import Scene, Subject
 from rts.diagnostics.progress import phases
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
@@ -29,8 +30,6 @@ from rts.fitting.parameter_names import named_leaves
 from rts.fitting.run import untraceable
 from rts.rendering.image import render
 
-NEGLIGIBLE = 0.01
-"""The largest negligible effect, as a share of the largest effect of a step."""
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
 
@@ -112,6 +111,7 @@ class GradientCheck(NamedTuple):
         reasons: why slopes differ or vanish, those that explain most first.
         picture: (H, W, 3) linear RGB for `rts.save_image`: the scene, dark, and the pixels of reasons in their colours.
         note: omissions, for example because the budget was spent; empty if there are none.
+        hessian: second derivatives, where they were asked for.
     """
 
     slopes: list[Slope]
@@ -119,6 +119,7 @@ class GradientCheck(NamedTuple):
     reasons: Sequence[Reason] = ()
     picture: np.ndarray | None = None
     note: str = ""
+    hessian: HessianCheck | None = None
 
     def agrees(self, slope: Slope) -> bool:
         """True if autodiff and the difference agree.
@@ -133,7 +134,7 @@ class GradientCheck(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """True if all slopes agree."""
+        """True if all slopes agree; second derivatives have an `ok` of their own."""
         return all(map(self.agrees, self.slopes))
 
     def __str__(self) -> str:
@@ -147,7 +148,8 @@ class GradientCheck(NamedTuple):
             )
         lines += [f"- {reason.kind}: {reason.text}" for reason in self.reasons]
         colors = legend(self.reasons)
-        return "\n".join([*lines, *([f"In the picture: {colors}."] if colors else []), *filter(None, [self.note])])
+        lines += [f"In the picture: {colors}."] if colors else []
+        return "\n".join([*lines, *map(str, filter(None, [self.hessian, self.note]))])
 
 
 def check_gradient(
@@ -159,6 +161,7 @@ def check_gradient(
     entries: int = 6,
     samples: int = 8,
     tolerance: float = 0.1,
+    hessian: bool = False,
     budget_s: float = 60.0,
     progress: bool | None = None,
     **options: Any,
@@ -178,6 +181,8 @@ def check_gradient(
         entries: the most numbers of each array to check: those of largest gradient, and some at random.
         samples: samples a pixel along each axis.
         tolerance: the largest error of a derivative, relative to it.
+        hessian: True to compare second derivatives of the numbers, too: those of autodiff with differences of
+            gradients two pixels ahead and behind. See `HessianCheck`.
         budget_s: seconds after which nothing more is begun; the result covers what was checked until then, at least
             one number. If time is short, all numbers are checked with few samples before any is with more.
         progress: True to show a bar on standard error, False for none; None to show it on a terminal.
@@ -188,8 +193,9 @@ def check_gradient(
 
     Raises:
         InputError: parameters that have no derivative or are traced; nothing that depends on them; an argument out of
-            its range; results of another kind from `scene` or `loss`; or what `rts.render` refuses.
-        EngineError: arrays of two engines.
+            its range; results of another kind from `scene` or `loss`; with `hessian`, a scene that cannot be
+            differentiated twice; or what `rts.render` refuses.
+        EngineError: arrays of two engines; with `hessian`, an engine without forward mode.
     """
     clock = Clock(budget_s)
     _check_function("scene", scene, "a function: parameters → (parts, camera)")
@@ -202,6 +208,7 @@ def check_gradient(
             raise InputError(f"{name} is {quoted(count)}; expected an integer of at least 1")
     if not (is_real(tolerance) and 0 <= tolerance < math.inf):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
+    check_flag("hessian", hessian)
     if not (progress is None or isinstance(progress, bool)):
         raise InputError(f"progress is {quoted(progress)}; expected True, False, or None for where there is a terminal")
     known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size")]
@@ -215,13 +222,18 @@ def check_gradient(
         warnings.simplefilter("ignore", EmptyImageWarning)
         warnings.simplefilter("ignore", LayersWarning)
         subject.require_dependence()
+        if hessian:
+            require_second_derivatives(subject)
         numbers, count, rough = looked_at(subject, entries, samples, clock, phase)
-        check = GradientCheck([n.slope for n in numbers], tolerance)
+        second = curvatures(subject, numbers, tolerance, clock.going, phase) if hessian else None
+        check = GradientCheck([n.slope for n in numbers], tolerance, hessian=second)
         plain = [n for n in numbers if n.forward]
         reasons, left = explained(subject, plain, check.agrees, own, clock.turn, phase)
         picture = marked(subject.seen, reasons)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
     notes += [f"the differences of {rough} are of fewer samples than asked for"] if rough else []
+    if second is not None and len(second.names) < len(numbers):
+        notes.append(f"second derivatives are of {len(second.names)} numbers")
     notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
     told = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
     if len(plain) < len(numbers):

@@ -14,6 +14,8 @@ from rts.diagnostics.smoothing import low_pass
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
+NEGLIGIBLE = 0.01
+"""The largest negligible effect, as a share of the largest effect of a step."""
 STEP_UNSEEN = 1e-2
 """The step of finite differences for a number that nothing seems to depend on."""
 
