@@ -96,10 +96,10 @@ def result_of(scene, way, view=0):
         if "enough" in way:
             options["capacity"] = least_capacity(scene, cameras, _splatter(way), options)
         weights, still = arrays(engine, (weights, _values(scene)), np.float64)
+        prepared = rts.prepare(scene.parts if scene.poses else _parts(scene, still)) if "prepared" in way else None
 
         def images(values):
-            parts = _prepared(scene, values, still) if "prepared" in way else _parts(scene, values)
-            return _images(parts, cameras, scene.size, way, options)
+            return _images(_parts(scene, values, prepared), cameras, scene.size, way, options)
 
         if engine == "numpy":
             return images(still), None
@@ -138,18 +138,12 @@ def _along(scene):
     return map_leaves(lambda x: rng.normal(size=x.shape), _values(scene))
 
 
-def _changes(scene, values):
-    return [{"transform": rts.rigid(v["pose"])} if scene.poses else {"theta": v} for v in values]
-
-
-def _parts(scene, values):
-    return [part.replace(**change) for part, change in zip(scene.parts, _changes(scene, values), strict=True)]
-
-
-def _prepared(scene, values, still):
-    """The parts prepared at values that are not traced, and moved to the same values."""
-    prepared = rts.prepare(scene.parts if scene.poses else _parts(scene, still))
-    for i, change in enumerate(_changes(scene, values)):
+def _parts(scene, values, prepared=None):
+    """The parts at some values; with the structures of `prepared` parts, if there are any."""
+    changes = [{"transform": rts.rigid(v["pose"])} if scene.poses else {"theta": v} for v in values]
+    if prepared is None:
+        return [part.replace(**change) for part, change in zip(scene.parts, changes, strict=True)]
+    for i, change in enumerate(changes):
         prepared = prepared.replace(i, **change)
     return prepared
 
@@ -201,6 +195,14 @@ def ways_of(number, every):
     return [way for way in ways if not way & {"jax", "jit"} or number % every == 0]
 
 
+def _differences_or_error(number, way):
+    """The differences; an error that is raised is one, too, so that a long run goes on."""
+    try:
+        return differences(number, way)
+    except Exception as error:
+        return [(f"{type(error).__name__}: {str(error).splitlines()[0]}", np.inf)]
+
+
 def main():
     """Count the differences of the scenes of a range of numbers."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -215,7 +217,7 @@ def main():
         kind += ", Adaptive" if isinstance(scene.supersample, rts.Adaptive) else ""
         for way in ways_of(number, given.jax):
             tried[kind, name_of(way)] += 1
-            for what, off in differences(number, way):
+            for what, off in _differences_or_error(number, way):
                 key = kind, name_of(way), what
                 found[key].add(number)
                 worst[key] = max(worst[key], off)
