@@ -118,8 +118,11 @@ def cache_folder() -> Path:
 
     Later processes read them. Without a home folder, it is a folder of this process alone.
     """
-    folder = platformdirs.user_cache_path("rts", appauthor=False)
-    return folder if folder.is_absolute() else Path(own_folder().name)  # Without a home, "~" stays as it is.
+    try:
+        folder = platformdirs.user_cache_path("rts", appauthor=False)
+    except RuntimeError:  # There is no home.
+        return Path(own_folder().name)
+    return folder if folder.is_absolute() else Path(own_folder().name)  # Older platformdirs leave "~" as it is.
 
 
 @functools.cache
