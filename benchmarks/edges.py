@@ -1,8 +1,8 @@
 """Found edges beside `visible`: errors of images and of their derivatives, each against area-sampled images.
 
 Truth is a central difference over ±0.15 pixels of images with 32 × 32 samples a pixel. A row has, for each method, the
-relative L2 error of the derivative image, in each pixel and after a Gaussian of 2 pixels, its gain, and the error of the
-image itself, root mean square.
+relative L2 error of the derivative image, in each pixel and after a Gaussian of 2 pixels, its gain, and the error of
+the image itself, root mean square.
 
     python -m benchmarks.edges                # all scenes
     python -m benchmarks.edges "cards 5°"     # some
@@ -56,13 +56,13 @@ def turn(x: float, y: float, z: float = 0.0) -> np.ndarray:
 
 
 def shifted(vertices, move=(1.0, 0.0, 0.0)) -> Callable[[torch.Tensor], torch.Tensor]:
-    """t → vertices moved by t pixels along a direction."""
+    """Vertices as a function of t: moved by t pixels along a direction."""
     start, step = tensor(vertices), tensor(np.asarray(move) * PIXEL)
     return lambda t: start + t * step
 
 
 def swung(vertices, axis=(0.0, 1, 0)) -> Callable[[torch.Tensor], torch.Tensor]:
-    """t → vertices turned about an axis, so that the farthest from it move by t pixels."""
+    """Vertices as a function of t: turned about an axis, so that the farthest from it move by t pixels."""
     start = tensor(vertices)
     step = torch.linalg.cross(tensor(axis).expand_as(start), start)
     return lambda t: start + t * PIXEL * step / step.norm(dim=1).max()

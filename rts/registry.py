@@ -242,9 +242,7 @@ def plugin(group: str, name: str) -> Any:
     except (PluginError, KeyboardInterrupt):
         raise
     except BaseException as error:  # SystemExit, and panics of compiled code, would end the program.
-        raise PluginError(
-            f"the {kind} {name!r} of {_distribution(entry)} fails to import: {_reason(error)}"
-        ) from error
+        raise PluginError(f"the {kind} {name!r} of {_distribution(entry)} fails to import: {_reason(error)}") from error
 
 
 def built_in_attributes() -> dict[str, tuple[str, str]]:

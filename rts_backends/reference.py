@@ -63,11 +63,12 @@ class Reference(TriangleSampler):
         triangles, hits = np.flatnonzero(kept), []
         for chunk in _chunks(np.full(len(points), len(triangles))):
             triangle, place = np.tile(triangles, len(chunk)), np.repeat(chunk, len(triangles))
-            hits.append(_hits(triangle, place, *points[place].T, corners, depth, size))
+            hits.append(_hits(triangle, place, points[place, 0], points[place, 1], corners, depth, size))
         line = 1, len(points)
         if not hits:
             return _empty(line, layers)
-        return _nearest(*map(np.concatenate, zip(*hits, strict=True)), line, layers)
+        triangle, place, barycentrics, depth = map(np.concatenate, zip(*hits, strict=True))
+        return _nearest(triangle, place, barycentrics, depth, line, layers)
 
     def between(
         self, prepared: Proxy, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray

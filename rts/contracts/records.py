@@ -171,8 +171,8 @@ class Samples(_OnCells):
         asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
         by_sample: names of the tables that have a row for each sample; other tables are shared by all.
-        followed: the fields of the `Request`, out of "cells", "points" and "hidden", that were given and that the sampler
-            obeyed.
+        followed: the fields of the `Request`, out of "cells", "points" and "hidden", that were given and that the
+            sampler obeyed.
         ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
             None for a surface that is not refined.
         triangle: (N,) int32, the triangle of the proxy that each sample lies on; None if it was not requested, or if

@@ -67,8 +67,8 @@ def _known(x: Array) -> np.ndarray:
     value = value_of(x)
     if value is None:
         raise InputError(
-            "splatter 'edges' looks for outlines while Python runs, and these samples are traced; render outside of jit "
-            "and vmap, or give splatter='visible'"
+            "splatter 'edges' looks for outlines while Python runs, and these samples are traced; render outside of "
+            "jit and vmap, or give splatter='visible'"
         )
     return value
 
@@ -87,7 +87,7 @@ class _Points:
         for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
             camera, sheets, surface = grid.camera.within(part.transform), None, part.surface
             if isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface):
-                host = Camera(*(np.asarray(_known(m), np.float64) for m in camera.for_size(grid.size)))
+                host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
                 entry = _entry(part, sampler, entry, host, grid.size)
                 sheets = Sheets.of(entry.proxy, host, grid.size)
             parts.append((sampler, camera, entry, sheets))

@@ -57,8 +57,8 @@ class RenderSettings:
         splatter = check_splatter(splatter)
         if isinstance(supersample, Adaptive) and "outlines" in splatter.reads:
             raise InputError(
-                f"supersample is {supersample!r}, and {splatter!r} finds outlines without further samples; give 1, or a "
-                f"number of samples along each side of a pixel"
+                f"supersample is {supersample!r}, and {splatter!r} finds outlines without further samples; give 1, or "
+                f"a number of samples along each side of a pixel"
             )
         if splatter.layers is not None:  # More would not be read.
             layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))

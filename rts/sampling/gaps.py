@@ -47,6 +47,11 @@ class Fronts(NamedTuple):
         """The fronts with some indices."""
         return Fronts(*(x[index] for x in self))
 
+    @classmethod
+    def of(cls, several: Sequence[Fronts]) -> Fronts:
+        """Several fronts, one after the other."""
+        return cls(*(np.concatenate(x) for x in zip(*several, strict=True)))
+
 
 class Oracle(NamedTuple):
     """A scene that can be sampled at any point.
@@ -137,7 +142,16 @@ class _Intervals(NamedTuple):
     behind: Fronts
 
     def at(self, index: np.ndarray) -> _Intervals:
-        return _Intervals(self.gap[index], self.low[index], self.high[index], *(f.at(index) for f in self[3:]))
+        places = self.gap[index], self.low[index], self.high[index]
+        return _Intervals(*places, self.before.at(index), self.behind.at(index))
+
+    @classmethod
+    def of(cls, several: Sequence[_Intervals]) -> _Intervals:
+        """Several intervals, one after the other."""
+        gap, low, high = (np.concatenate([one[i] for one in several]) for i in range(3))
+        return cls(
+            gap, low, high, Fronts.of([one.before for one in several]), Fronts.of([one.behind for one in several])
+        )
 
 
 class _Lines(NamedTuple):
@@ -198,7 +212,7 @@ def _with_breaks(breaks: Breaks, gap: np.ndarray, places: np.ndarray, fronts: Fr
         low - np.minimum(INNER, (low - np.where(first, 0.0, np.roll(high, 1))) / 2),
         high + np.minimum(INNER, (np.where(last, 1.0, np.roll(low, -1)) - high) / 2),
     ]
-    own = (
+    own = Breaks(
         gap[number],
         gaps.points(number, place[kept]),
         near[kept],
@@ -207,14 +221,18 @@ def _with_breaks(breaks: Breaks, gap: np.ndarray, places: np.ndarray, fronts: Fr
         np.stack([gaps.points(number, low), gaps.points(number, high)], 1),
         np.stack([gaps.points(number, at) for at in inner], 1),
         np.stack([found.before.part, found.behind.part], 1),
+        joined,
     )
-    return Breaks(*(np.concatenate(pair) for pair in zip(breaks[:-1], own, strict=True)), joined)
+    names = Breaks._fields[:-1]
+    both = {name: np.concatenate([getattr(breaks, name), getattr(own, name)]) for name in names}
+    return own._replace(**both)
 
 
 def _no_breaks(joined: np.ndarray) -> Breaks:
-    shapes = ((0, 3), np.int32), ((0, 2), float), (0, np.int32), ((0, 2, 2), float), ((0, 2), bool)
-    fields = [np.zeros(shape, dtype) for shape, dtype in shapes]
-    return Breaks(*fields, np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2), np.int32), joined)
+    """No breaks at all."""
+    pairs, whole = np.zeros((0, 2, 2)), np.zeros((0, 2), np.int32)
+    gap, place, near, ends = np.zeros((0, 3), np.int32), np.zeros((0, 2)), np.zeros(0, np.int32), np.zeros((0, 2), bool)
+    return Breaks(gap, place, near, pairs, ends, pairs, pairs, whole, joined)
 
 
 def _ends(gap: np.ndarray, fronts: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
@@ -269,7 +287,7 @@ def _cut(gaps: _Lines, one: Fronts, other: Fronts, more: np.ndarray, oracle: Ora
     # All places along all gaps, with the centres before and after.
     ids = np.concatenate([np.arange(count), gap, np.arange(count)])
     along = np.concatenate([np.zeros(count), place, np.ones(count)])
-    every = Fronts(*(np.concatenate(x) for x in zip(one, told, other, strict=True)))
+    every = Fronts.of([one, told, other])
     order = np.lexsort((along, ids))
     ids, along, every = ids[order], along[order], every.at(order)
     first = np.flatnonzero(ids[:-1] == ids[1:])
@@ -311,15 +329,8 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
         changes = [np.abs(half.before.depth - half.behind.depth) for half in halves]
         drop[0] = np.where(unknown, changes[0] < changes[1], drop[0])
         drop[1] = np.where(unknown, changes[1] <= changes[0], drop[1])
-        parts = [half.at(np.flatnonzero(~d)) for half, d in zip(halves, drop, strict=True)]
-        found = _Intervals(
-            *(np.concatenate([p[i] for p in parts]) for i in range(3)),
-            *(Fronts(*(np.concatenate(x) for x in zip(parts[0][i], parts[1][i], strict=True))) for i in (3, 4)),
-        )
-    return _Intervals(
-        *(np.concatenate([p[i] for p in finished]) for i in range(3)),
-        *(Fronts(*(np.concatenate(x) for x in zip(*(p[i] for p in finished), strict=True))) for i in (3, 4)),
-    )
+        found = _Intervals.of([half.at(np.flatnonzero(~d)) for half, d in zip(halves, drop, strict=True)])
+    return _Intervals.of(finished)
 
 
 def _classified(

@@ -49,7 +49,7 @@ def joined(breaks: Breaks) -> Segments:
     other = np.where(near == 1, parts[:, 0], parts[:, 1])
     front, back = np.where(near == 2, low, own), np.where(near == 2, high, other)
     # Squares beyond the grid have no corners.
-    inside = ((squares >= 0) & (squares < np.array(breaks.joined.shape[1:]) - 1)).all(axis=1)
+    inside = np.all((squares >= 0) & (squares < np.array(breaks.joined.shape[1:]) - 1), axis=1)
     order = np.lexsort((along, squares[:, 1], squares[:, 0]))
     order = order[inside[order]]
     squares, side, number, along, sign = squares[order], side[order], number[order], along[order], sign[order]
@@ -68,8 +68,8 @@ def joined(breaks: Breaks) -> Segments:
     sides = np.column_stack([side[i], np.where(lone, -1, side[j])])
     beyond = _beyond(ties, len(y))
     corner, pull = _corners(squares[i] + 0.5, ties, beyond, breaks.place)
-    tables = (x.astype(np.int32) for x in (squares[i], ties, sides, beyond[:, 1:3]))
-    return Segments(*tables, corner, pull)
+    square, ties, sides, beyond = (np.asarray(x, np.int32) for x in (squares[i], ties, sides, beyond[:, 1:3]))
+    return Segments(square, ties, sides, beyond, corner, pull)
 
 
 def _beyond(ties: np.ndarray, count: int) -> np.ndarray:
@@ -119,7 +119,7 @@ def _corners(
     low = origin[:, ::-1]
 
     def inside(corner: np.ndarray) -> np.ndarray:
-        return ((corner >= low) & (corner <= low + 1)).all(axis=1)
+        return np.asarray(np.all((corner >= low) & (corner <= low + 1), axis=1))
 
     before, after, chord = place[beyond[:, 1]], place[beyond[:, 2]], end - start
     known = (beyond[:, 1] >= 0) & (beyond[:, 2] >= 0)
@@ -158,7 +158,7 @@ def _turns(ties: np.ndarray, beyond: np.ndarray, place: np.ndarray) -> tuple[np.
 
 
 def _meeting(start: np.ndarray, ahead: np.ndarray, end: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where lines from `start` along `ahead` and to `end` along `back` meet (S, 2), and True if that is between them."""
+    """Where lines from `start` along `ahead` and to `end` along `back` meet (S, 2); True if that is between them."""
     turn = _cross(ahead, back)
     there = np.abs(turn) > 1e-9
     meeting = start + (_cross(end - start, back) / np.where(there, turn, 1.0))[:, None] * ahead

@@ -1,4 +1,4 @@
-"""Sheets of triangles in the image: walks from triangle to triangle along a line, depths, hits of single points. Compiled.
+"""Sheets of triangles in the image: walks from triangle to triangle, depths, hits of single points. Compiled.
 
 A corner is (X, Y, w, depth), seen at the pixel (X / w, Y / w). The edge function of two corners is their cross product
 in (X, Y, w), linear in the pixel's position. So no triangle needs clipping, and neighbours evaluate opposite numbers on
@@ -17,7 +17,7 @@ STEPS = 4096
 
 @loop
 def corners_of(t, rows, vertices, faces, corners):
-    """Fill `corners` (3, 4) of a triangle; `rows` (4, 4) is `Camera.pixel_rows`. Returns the sign of its determinant."""
+    """Fill `corners` (3, 4) of a triangle; `rows` is `Camera.pixel_rows`. Returns the sign of its determinant."""
     for c in range(3):
         v = faces[t, c]
         x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
@@ -75,6 +75,27 @@ def neighbours(faces, order):
     return found
 
 
+@compiled
+def _leaves(corners, sign, came, x, y, dx, dy):
+    """Where a line leaves a triangle, as a share of it, and through the edge opposite which corner, not `came`."""
+    best, edge = np.inf, -1
+    for k in range(3):
+        ex, ey, e = _edge(corners, k, sign)
+        slope = ex * dx + ey * dy
+        if k != came and slope < 0 and -(ex * x + ey * y + e) / slope < best:
+            best, edge = -(ex * x + ey * y + e) / slope, k
+    return best, edge
+
+
+@compiled
+def _opposite(faces, t, i, j):
+    """The corner of triangle t that is neither i nor j."""
+    for k in range(3):
+        if faces[t, k] != i and faces[t, k] != j:
+            return k
+    return 0
+
+
 @loop
 def walk(first, last, triangles, start, end, rows, vertices, faces, beyond, reached, depths, final):
     """Walk from triangle to triangle along lines in the image, until the sheet ends, turns away, or the line ends.
@@ -102,35 +123,19 @@ def walk(first, last, triangles, start, end, rows, vertices, faces, beyond, reac
         dx, dy = end[m, 0] - x, end[m, 1] - y
         sign, at, came = corners_of(t, rows, vertices, faces, corners), 0.0, -1
         for _ in range(STEPS):
-            best, edge = np.inf, -1
-            for k in range(3):
-                if k == came:
-                    continue
-                ex, ey, e = _edge(corners, k, sign)
-                slope = ex * dx + ey * dy
-                if slope < 0:
-                    leave = -(ex * x + ey * y + e) / slope
-                    if leave < best:
-                        best, edge = leave, k
-            if best >= 1:
-                at = 1.0
-                break
-            at = max(at, best)
-            s = beyond[t, edge]
+            leave, edge = _leaves(corners, sign, came, x, y, dx, dy)
+            at = min(max(at, leave), 1.0)
+            s = np.int32(-1) if at == 1 else beyond[t, edge]
             if s < 0:
                 break
-            i, j = faces[t, (edge + 1) % 3], faces[t, (edge + 2) % 3]
-            turned, back = corners_of(s, rows, vertices, faces, other), -1
-            for k in range(3):
-                h, g = faces[s, (k + 1) % 3], faces[s, (k + 2) % 3]
-                if (h == i and g == j) or (h == j and g == i):
-                    back = k
+            turned = corners_of(s, rows, vertices, faces, other)
+            back = _opposite(faces, s, faces[t, (edge + 1) % 3], faces[t, (edge + 2) % 3])
             ex, ey, e = _edge(other, back, turned)
             if not ex * dx + ey * dy > 0:
-                break
+                break  # The sheet turns away: its next triangle lies on the same side of the edge.
             t, sign, came = s, turned, back
             corners, other = other, corners
-        reached[m], final[m] = min(at, 1.0), t
+        reached[m], final[m] = at, t
         depths[m] = _depth(corners, sign, x + at * dx, y + at * dy)[0]
 
 
@@ -163,63 +168,71 @@ def hits(points, begins, order, rows, clip, keep, vertices, faces, ids, weights,
         weights: (K, M, 2) float32 to fill with the first two barycentrics.
         depths: (K, M) float64, filled with infinity.
     """
-    layers, height, corners = len(ids), len(begins) - 1, np.empty((3, 4))
+    height, corners, box = len(begins) - 1, np.empty((3, 4)), np.empty(4)
     for t in range(len(faces)):
         sign = corners_of(t, rows, vertices, faces, corners)
         if sign == 0 or sign * keep < 0:
             continue
-        low, high, left, right, behind = np.inf, -np.inf, np.inf, -np.inf, False
-        for c in range(3):
-            w = corners[c, 2]
-            if not w > 0:
-                behind = True
-                continue
-            low, high = min(low, corners[c, 1] / w), max(high, corners[c, 1] / w)
-            left, right = min(left, corners[c, 0] / w), max(right, corners[c, 0] / w)
-        if behind:
-            low, high, left, right = -np.inf, np.inf, -np.inf, np.inf
-        if not (high >= 0 and low <= height):
-            continue
-        top, bottom = int(max(low, 0.0)), int(min(high, height - 1.0))
-        for line in range(top, bottom + 1):
+        _bounds(corners, height, box)
+        for line in range(int(box[0]), int(box[1]) + 1):
             a, b = begins[line], begins[line + 1]
-            if a == b:
-                continue
-            a += np.searchsorted(points[a:b, 0], left)
-            for n in range(a, b):
-                x, y = points[n, 0], points[n, 1]
-                if x > right:
-                    break
-                inside, total, deep, near, far, wa, wb = True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                for k in range(3):
-                    ex, ey, e = _edge(corners, k, sign)
-                    value = ex * x + ey * y + e
-                    # Of two triangles on one edge, the one that lies right of it, or below, has the points on it.
-                    inside &= value > 0 or (value == 0 and (ex > 0 or (ex == 0 and ey > 0)))
-                    total += value
-                    if k == 0:
-                        wa = value
-                    elif k == 1:
-                        wb = value
-                if not inside or not total > 0:
-                    continue
-                wa, wb = wa / total, wb / total
-                wc = 1 - wa - wb
-                z = wa * corners[0, 3] + wb * corners[1, 3] + wc * corners[2, 3]
-                if planes_hide(t, clip, vertices, faces, wa, wb, wc):
-                    continue
-                m = order[n]
-                k = layers - 1
-                if not (z < depths[k, m]):
-                    continue
-                while k > 0 and (z < depths[k - 1, m]):
-                    ids[k, m], depths[k, m], weights[k, m] = ids[k - 1, m], depths[k - 1, m], weights[k - 1, m]
-                    k -= 1
-                ids[k, m], depths[k, m], weights[k, m, 0], weights[k, m, 1] = t, z, wa, wb
+            n = a + np.searchsorted(points[a:b, 0], box[2])
+            while n < b and points[n, 0] <= box[3]:
+                inside, wa, wb = _weights(corners, sign, points[n, 0], points[n, 1])
+                if inside and not _hidden(t, clip, vertices, faces, wa, wb, 1 - wa - wb):
+                    z = wa * corners[0, 3] + wb * corners[1, 3] + (1 - wa - wb) * corners[2, 3]
+                    _insert(order[n], t, z, wa, wb, ids, weights, depths)
+                n += 1
 
 
 @compiled
-def planes_hide(t, clip, vertices, faces, wa, wb, wc):
+def _bounds(corners, height, box):
+    """Fill `box` with the first and last line, and the least and largest x, that a triangle may cover."""
+    low, high, left, right, behind = np.inf, -np.inf, np.inf, -np.inf, False
+    for c in range(3):
+        w = corners[c, 2]
+        behind |= not w > 0
+        low, high = min(low, corners[c, 1] / w), max(high, corners[c, 1] / w)
+        left, right = min(left, corners[c, 0] / w), max(right, corners[c, 0] / w)
+    if behind:  # Seen in part, anywhere.
+        low, high, left, right = 0.0, np.float64(height), -np.inf, np.inf
+    box[0], box[1] = min(max(low, 0.0), height), max(min(high, height - 1.0), -1.0)
+    box[2], box[3] = left, right
+
+
+@compiled
+def _weights(corners, sign, x, y):
+    """True if a triangle covers a position, and its first two barycentrics there.
+
+    Of two triangles on one edge, the one that lies right of it, or below, has the points on it.
+    """
+    inside, total, first, second = True, 0.0, 0.0, 0.0
+    for k in range(3):
+        ex, ey, e = _edge(corners, k, sign)
+        value = ex * x + ey * y + e
+        inside &= value > 0 or (value == 0 and (ex > 0 or (ex == 0 and ey > 0)))
+        total += value
+        if k == 0:
+            first = value
+        elif k == 1:
+            second = value
+    return inside and total > 0, first / total, second / total
+
+
+@compiled
+def _insert(m, t, z, wa, wb, ids, weights, depths):
+    """Insert a hit among the nearest of point m."""
+    k = len(ids) - 1
+    if not z < depths[k, m]:
+        return
+    while k > 0 and z < depths[k - 1, m]:
+        ids[k, m], depths[k, m], weights[k, m] = ids[k - 1, m], depths[k - 1, m], weights[k - 1, m]
+        k -= 1
+    ids[k, m], depths[k, m], weights[k, m, 0], weights[k, m, 1] = t, z, wa, wb
+
+
+@compiled
+def _hidden(t, clip, vertices, faces, wa, wb, wc):
     """True if a point of a triangle, by its barycentrics, is before the near or beyond the far plane."""
     a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
     for p in range(2):

@@ -688,8 +688,8 @@ class Camera:
             x = engine.constant((np.arange(width) + 0.5) * 2 / width - 1, view)[None, :]
             y = engine.constant(1 - (np.arange(height) + 0.5) * 2 / height, view)[:, None]
         else:
-            points = engine.constant(points, view)
-            x, y = points[:, 0] * (2 / width) - 1, 1 - points[:, 1] * (2 / height)
+            at: Array = engine.constant(points, view)
+            x, y = at[:, 0] * (2 / width) - 1, 1 - at[:, 1] * (2 / height)
         # A camera-space point (X, Y, −z) is seen at NDC (x, y) where two linear equations hold; Cramer's rule solves
         # them for (X, Y) = start + z step.
         a, b = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1]

@@ -6,7 +6,7 @@
     C       the colour of the centre's sample; ∇C its slope across the image, from the next centres on the same surface
     m       the motion of this sample in the image: 0 in value, it has the derivative
     J       the colour on one side of a segment less that on the other, from the last samples beside its two breaks
-    v       the motion of a break, linear between the two: that of the last sample of the nearer surface, which ends there
+    v       the motion of a break, linear between the two: that of the last sample of the surface that ends there
     n ds    along the part of the segment inside the pixel
 
 Shares have no derivative, and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the
