@@ -293,6 +293,14 @@ class TestMulti(SplatterConformance):
         return "multi"
 
 
+class TestEdges(SplatterConformance):
+    moves_edges = False  # Of splats alone: it moves the outlines that it is told.
+
+    @pytest.fixture
+    def splatter(self):
+        return "edges"
+
+
 class TestVisible(SplatterConformance):
     @pytest.fixture
     def splatter(self):
@@ -477,6 +485,15 @@ class Misplaced(type(rts.plugin("samplers", "raster")())):
         return super().sample(part, camera, size, layers, request)
 
 
+class Aside(type(rts.plugin("samplers", "raster")())):
+    """Samples half a cell beside the points that are asked for."""
+
+    def sample(self, part, camera, size, layers, request):
+        if request.points is not None:
+            request = replace(request, points=request.points + 0.5)
+        return super().sample(part, camera, size, layers, request)
+
+
 class OddExits(type(rts.plugin("samplers", "raster")())):
     """Tells exits that are altered."""
 
@@ -532,6 +549,7 @@ SAMPLERS = {
         "other depths": OddBetween(told=lambda x: 1.01 * x),
     },
     "listed_cells_are_those_of_the_whole_grid": {"those beside them": Misplaced()},
+    "points_are_sampled_as_centres_are": {"half a cell aside": Aside()},
     "it_agrees_with_the_reference": {
         "nothing culled": OddRaster(cull="none"),
         "edges lost": OddRaster(eroded),

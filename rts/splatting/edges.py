@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
 from rts.contracts.records import Outlines, Splats
@@ -44,14 +46,13 @@ class Edges(Splatter):
         check_rows(row, rgba.shape[0])
         xp, (height, width) = namespace(rgba), row.shape[1:]
         covered = row[0] >= 0
-        x = xp.arange(width, dtype=positions.dtype, device=positions.device) + 0.5
-        y = xp.arange(height, dtype=positions.dtype, device=positions.device) + 0.5
-        centres = xp.stack([*xp.meshgrid(x, y, indexing="xy"), xp.zeros((height, width), dtype=x.dtype)], axis=-1)
+        at = np.mgrid[:height, :width][::-1] + 0.5
+        centres = engine_of(positions).constant(np.stack([*at, 0 * at[0]], axis=-1), positions)
         color = xp.where(covered[..., None], unpack(rgba, row[0]), 0.0)
         motion = xp.where(covered[..., None], unpack(positions, row[0]) - centres, 0.0)
         outlines = splats.outlines
         if outlines is None:
-            return color - _inside(color, motion, _all_joined(covered))
+            return color - _inside(color, motion - stopped(motion), _all_joined(covered))
         image = color - _inside(color, motion, outlines.joined)
         if outlines.place.shape[0] == 0:
             return image
@@ -79,8 +80,9 @@ def _all_joined(covered: Array) -> Array:
     """`Outlines.joined` as if all covered cells showed one surface."""
     xp = namespace(covered)
     right, below = (xp.roll(covered, -1, axis=axis) & covered for axis in (1, 0))
-    x, y = xp.arange(covered.shape[1], device=covered.device), xp.arange(covered.shape[0], device=covered.device)
-    return xp.stack([right & (x < covered.shape[1] - 1), below & (y < covered.shape[0] - 1)[:, None]])
+    inside = np.ones((2, *covered.shape), bool)
+    inside[0, :, -1], inside[1, -1] = False, False  # Nothing follows the last cells.
+    return xp.stack([right, below]) & engine_of(covered).constant(inside, covered)
 
 
 class _Breaks(NamedTuple):
