@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts import Camera, Engine, Part, explain, namespace, render, sample
+from rts import Camera, Engine, Part, explain, namespace, plugin, render, sample
 from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError, RtsWarning
@@ -295,6 +295,8 @@ class Measurements:
     ) -> list[Setting]:
         """All combinations of these options, without layers "auto" where "auto" fails.
 
+        Splatters that find outlines take no `Adaptive`.
+
         Args:
             group: the name of a group of modes; the rates depend on the parameters that these change.
             splatters: names.
@@ -309,6 +311,7 @@ class Measurements:
             for rate in (self.at_rates(group) if rates else [""])
             for supersample in samples
             for splatter in splatters
+            if isinstance(supersample, int) or "outlines" not in plugin("splatters", splatter)().reads
             for count in layers
         )
         return [setting for setting in all_of if self.counting(group, setting) is not None]

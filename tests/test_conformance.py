@@ -577,7 +577,6 @@ SAMPLERS = {
     },
     "what_it_cannot_sample_is_refused_in_one_line": {
         "another error": Complains(AttributeError("no attribute 'proxy'")),
-        "two lines": Complains(InputError("wrong surface\ntry another")),
         "no words": Complains(InputError("")),
         "none": AcceptsAnything(),
     },

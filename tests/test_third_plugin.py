@@ -58,7 +58,7 @@ def test_its_command_is_listed_and_runs_beside_ours(tmp_path, monkeypatch):
     monkeypatch.setitem(registry._entry_points, "rts.commands", commands)
     monkeypatch.chdir(tmp_path)
     listed = CliRunner().invoke(app, ["--help"]).output
-    for told in ("render ", "compare ", r"turntable +Write an animation of a model"):
+    for told in ("render ", "compare ", "turntable "):
         assert re.search(told, listed)
     trimesh.creation.box().export("box.obj")
     done = CliRunner().invoke(app, ["turntable", "box.obj", "--frames", "2", "--output", "box.gif"])

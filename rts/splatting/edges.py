@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace, stopped
+from rts.arrays.engines import engine_of, namespace, stopped, value_of
 from rts.arrays.trees import Array
 from rts.contracts.records import Outlines, Splats
 from rts.contracts.splatter import Splatter
@@ -62,7 +62,7 @@ class Edges(Splatter):
         cells = xp.concat([y * width + x for x, y, _ in parts])
         changes = xp.concat([change for *_, change in parts])
         engine = engine_of(changes)
-        sums = engine.segment_sum(changes, engine.to_numpy(cells), height * width)
+        sums = engine.segment_sum(changes, value_of(cells), height * width)
         return image + xp.reshape(sums, image.shape)
 
 
@@ -216,7 +216,7 @@ class _Segments(NamedTuple):
             # Two segments at a line of crossing may run in opposite directions.
             ahead = xp.sum(normal * xp.take(breaks.step, self.ties[:, i], axis=0), axis=-1) >= 0
             turned = xp.where(self.lone[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
-            total = total + engine.segment_sum(turned, engine.to_numpy(self.ties[:, i]), count)
+            total = total + engine.segment_sum(turned, value_of(self.ties[:, i]), count)
         return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
 
     def _places(self) -> list[Array]:
