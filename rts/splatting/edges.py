@@ -23,6 +23,7 @@ from rts.arrays.engines import engine_of, namespace, stopped, value_of
 from rts.arrays.trees import Array
 from rts.contracts.records import Outlines, Splats
 from rts.contracts.splatter import Splatter
+from rts.errors import InputError
 from rts.splatting.layers import check_rows, nothing, unpack
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
@@ -62,7 +63,7 @@ class Edges(Splatter):
         cells = xp.concat([y * width + x for x, y, _ in parts])
         changes = xp.concat([change for *_, change in parts])
         engine = engine_of(changes)
-        sums = engine.segment_sum(changes, value_of(cells), height * width)
+        sums = engine.segment_sum(changes, _known(cells), height * width)
         return image + xp.reshape(sums, image.shape)
 
 
@@ -83,6 +84,14 @@ def _all_joined(covered: Array) -> Array:
     inside = np.ones((2, *covered.shape), bool)
     inside[0, :, -1], inside[1, -1] = False, False  # Nothing follows the last cells.
     return xp.stack([right, below]) & engine_of(covered).constant(inside, covered)
+
+
+def _known(index: Array) -> np.ndarray:
+    """The values of integers of `Outlines`, which no transform traces, on the host."""
+    value = value_of(index)
+    if value is None:
+        raise InputError("outlines are traced; expected arrays that are known while Python runs, such as NumPy's")
+    return value
 
 
 class _Breaks(NamedTuple):
@@ -216,7 +225,7 @@ class _Segments(NamedTuple):
             # Two segments at a line of crossing may run in opposite directions.
             ahead = xp.sum(normal * xp.take(breaks.step, self.ties[:, i], axis=0), axis=-1) >= 0
             turned = xp.where(self.lone[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
-            total = total + engine.segment_sum(turned, value_of(self.ties[:, i]), count)
+            total = total + engine.segment_sum(turned, _known(self.ties[:, i]), count)
         return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
 
     def _places(self) -> list[Array]:
