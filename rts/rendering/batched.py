@@ -111,9 +111,9 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
-    if settings.finds_outlines:  # Of each view by itself.
-        pass
-    elif settings.layers != "auto" and settings.side is not None and len(settings.bands(size)) == 1:
+    # Outlines are found in each view by itself.
+    together = settings.layers != "auto" and not settings.finds_outlines
+    if together and settings.side is not None and len(settings.bands(size)) == 1:
         height, width = (settings.side * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))

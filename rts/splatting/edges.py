@@ -194,7 +194,7 @@ class _Segments(NamedTuple):
         return cls(square, lone, xp.stack([start, corner, end]), side, ties, xp.stack(jump), xp.stack(moves))
 
     def parts(self) -> list[tuple[Array, Array, Array]]:
-        """What segments change: cells (x and y) and changes (S, C), for each corner of the square.
+        """Changes that segments make: cells (x and y) and changes (S, C), for each corner of the square.
 
         The area of a quarter of the square on the right of the way is minus the integral of y over x around it: along
         the way, in straight pieces, and back along the square's sides, of which only the bottom counts.
@@ -284,7 +284,7 @@ class _Segments(NamedTuple):
 def _beside_breaks(
     breaks: _Breaks, segments: _Segments, outlines: Outlines, color: Array, motion: Array
 ) -> list[tuple[Array, Array, Array]]:
-    """What changes in the two cells of each gap: on each surface the colour goes on as far as the break.
+    """Changes in the two cells of each gap: on each surface the colour goes on as far as the break.
 
     From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
