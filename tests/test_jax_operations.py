@@ -15,8 +15,10 @@ from rts.operations.projection import PROJECTION, projective_map
 pytestmark = pytest.mark.engines
 
 jax = pytest.importorskip("jax")
+export = pytest.importorskip("jax.export")
 test_fused_jax = pytest.importorskip("test_fused_jax")
 jax_operations = pytest.importorskip("rts_backends.jax_engine.operations")
+host = pytest.importorskip("rts_backends.jax_engine.host")
 jnp = jax.numpy
 MODES, close, x64 = test_fused_jax.MODES, test_fused_jax.close, test_fused_jax.x64
 
@@ -148,7 +150,7 @@ def test_other_devices_are_left_to_array_code():
     ours, _, given = FUNCTIONS["projection"]
     f = jax.jit(jax.grad(lambda a, b: ours(a, b).sum(), (0, 1)))
     assert "callback" in f.lower(*given).as_text()
-    assert "callback" not in jax.export.export(f, platforms=["cuda"])(*given).mlir_module()
+    assert "callback" not in export.export(f, platforms=["cuda"])(*given).mlir_module()
 
 
 # ---------------------------------------------------------------------------------------------- rows that are not used
@@ -313,6 +315,8 @@ def test_gradients_in_the_place_of_operands_leave_what_is_read_later():
         found, expected = program(positions, rgba), both(positions, rgba, later)
         for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(x, y, atol=1e-6)
+    if host.buffer_callback is None:
+        return  # This jax has no calls that take over the memory of operands.
     assert "output_operand_alias" in jax.jit(lambda *given: both(*given, False)).lower(positions, rgba).as_text()
 
 
@@ -321,6 +325,7 @@ def test_a_process_ends_though_nobody_waits_for_its_last_program(devices):
     code = """
 import jax, jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 from rts.operations.projection import projective_map
 
 @jax.jit
@@ -330,7 +335,7 @@ def program(x, points):
     return projective_map(x[:4, :4], points)
 
 mesh = jax.sharding.Mesh(np.array(jax.devices()), ("a",))
-given = jax.device_put((jnp.ones((600, 600)), jnp.ones((5, 3))), jax.NamedSharding(mesh, jax.P()))
+given = jax.device_put((jnp.ones((600, 600)), jnp.ones((5, 3))), NamedSharding(mesh, PartitionSpec()))
 program.lower(*given).compile()
 program(*given)
 """

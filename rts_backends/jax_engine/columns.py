@@ -35,14 +35,13 @@ def summed_by_columns(f: Callable[..., Any]) -> Callable[..., Any]:
 def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
     """The results of a program: jax evaluates all equations but the short sums, which are computed by columns."""
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-    debug = jaxpr.debug_info.with_unknown_names()
     rest = list(jaxpr.eqns)
     while rest:
         count = next((i for i, equation in enumerate(rest) if _is_call(equation) or _is_short(equation)), len(rest))
         run, rest = rest[:count], rest[count:]
         outputs = {x for equation in run for x in equation.outvars}
         needed, inputs = [x for x in variables(rest, jaxpr.outvars) if x in outputs], [*known]
-        kept = jaxpr.replace(constvars=[], invars=inputs, outvars=needed, eqns=run, debug_info=debug)
+        kept = part(jaxpr, constvars=[], invars=inputs, outvars=needed, eqns=run)
         known.update(zip(needed, eval_jaxpr(kept, [], *known.values()), strict=True))
         if rest:
             equation, *rest = rest
@@ -54,6 +53,13 @@ def _evaluated(jaxpr: Jaxpr, consts: Sequence[Any], arguments: Sequence[Any]) ->
                 results = [sum(values[0][..., i] for i in range(values[0].shape[-1]))]
             known.update(zip(equation.outvars, results, strict=True))
     return [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
+
+
+def part(jaxpr: Jaxpr, **fields: Any) -> Jaxpr:
+    """A program with other variables and equations; jax 0.6 and later check arguments against names, unless unknown."""
+    names: Any = jaxpr.debug_info
+    unnamed = getattr(names, "with_unknown_names", lambda: names)
+    return jaxpr.replace(debug_info=unnamed(), **fields)
 
 
 def variables(equations: Sequence[JaxprEqn], more: Sequence[Any] = ()) -> dict[Any, None]:

@@ -20,7 +20,7 @@ from jax.core import ShapedArray, Tracer, eval_jaxpr
 from jax.extend.core import Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 
-from rts_backends.jax_engine.columns import summed_by_columns, variables
+from rts_backends.jax_engine.columns import part, summed_by_columns, variables
 
 PIECE = 1 << 11
 """Rows of a piece: enough to be worth XLA's calls, and few enough that intermediate arrays stay in caches, and that XLA
@@ -74,9 +74,8 @@ def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any
     read = variables(rest, jaxpr.outvars)
     known = [*jaxpr.constvars, *(x for equation in before for x in equation.outvars)]
     known = [x for x in known if x in read]
-    names = jaxpr.debug_info.with_unknown_names()
-    values = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
-    return jaxpr.replace(constvars=[], invars=[*known, *jaxpr.invars], eqns=rest, debug_info=names), values
+    values = eval_jaxpr(part(jaxpr, invars=[], outvars=known, eqns=before), consts)
+    return part(jaxpr, constvars=[], invars=[*known, *jaxpr.invars], eqns=rest), values
 
 
 _SPREADING = {"broadcast_in_dim", "iota"}
