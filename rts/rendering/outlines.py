@@ -10,15 +10,16 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, stopped, value_of
 from rts.arrays.trees import Array, Tree, map_leaves
-from rts.contracts.records import Outlines, Request, Sampled, Samples
+from rts.contracts.records import Fragments, Outlines, Request, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
 from rts.rendering.scene import Grid, Scene
-from rts.sampling.gaps import Fronts, Oracle, find_breaks, more_breaks
-from rts.sampling.segments import joined, tips
+from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
+from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
+from rts.sampling.spans import breaks_of_triangles
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -30,18 +31,15 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid) -> Sampled:
         InputError: arrays are traced; or a sampler cannot sample single points.
     """
     points = _Points.of(scene, grid)
-    fronts, oracle = points.at_centres(sampled), points.oracle()
-    breaks = find_breaks(fronts, oracle)
+    breaks = points.breaks(points.at_centres(sampled))
     segments = joined(breaks)
-    further = more_breaks(breaks, *tips(breaks, segments), fronts, oracle)
-    if further is not breaks:
-        breaks, segments = further, joined(further)
     # For each break the two last samples, and the two that tell colours.
     parts, every = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
+    triangles = breaks.triangles
     samples, rows, first = [], np.full(parts.shape, -1, np.int32), 0
     for part, own in enumerate(sampled.samples):
         asked = parts == part
-        more = points.sample(part, every[asked], evaluated=True)
+        more = points.sample(part, every[asked], triangles[asked])
         count = own.ids.shape[-2]
         found = _known(more.row)[0, 0]
         rows[asked] = np.where(found >= 0, first + count + found, -1)
@@ -77,8 +75,9 @@ class _Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
-        """Take for each part its sampler, camera, entry and sheets."""
+        """Take for each part its sampler, camera, entry and, where triangles tell all, sheets."""
         self._scene, self._grid, self._parts = scene, grid, parts
+        self._width = np.asarray(_known(grid.camera.spread(grid.size)), np.float64)
 
     @classmethod
     def of(cls, scene: Scene, grid: Grid) -> _Points:
@@ -89,15 +88,24 @@ class _Points:
             if isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface):
                 host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
                 entry = _entry(part, sampler, entry, host, grid.size)
-                sheets = Sheets.of(entry.proxy, host, grid.size)
+                if not (surface.refines and surface.refine_moves):
+                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
 
-    def sample(self, part: int, points: np.ndarray, evaluated: bool = False) -> Samples:
-        """One layer of samples of a part at points (M, 2); with `evaluated`, for rendering."""
-        sampler, camera, entry, _ = self._parts[part]
-        own = entry if not evaluated else self._scene.entries[part]
-        request = Request(points=points, triangles=True, entry=own)
+    def breaks(self, fronts: Fronts) -> Breaks:
+        """The breaks between the fronts (H, W) at centres."""
+        sheets = [own for *_, own in self._parts if own is not None]
+        if len(sheets) == len(self._parts):
+            return breaks_of_triangles(fronts, sheets, self._width)
+        return find_breaks(fronts, Oracle(self._fronts, self._width))
+
+    def sample(self, part: int, points: np.ndarray, triangles: np.ndarray | None = None) -> Samples:
+        """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
+        sampler, camera, entry, sheets = self._parts[part]
+        if sheets is not None and triangles is not None and (triangles >= 0).all():
+            sampler = _Found(sheets.at(triangles, points)[0])
+        request = Request(points=points, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" not in samples.followed:
             raise InputError(
@@ -106,39 +114,41 @@ class _Points:
             )
         return samples
 
-    def oracle(self) -> Oracle:
-        """The scene for `find_breaks`."""
-        width = np.asarray(_known(self._grid.camera.spread(self._grid.size)), np.float64)
-        return Oracle(self.fronts, [sheets for *_, sheets in self._parts], width)
-
-    def fronts(self, points: np.ndarray) -> Fronts:
-        """The nearest samples of all parts at points (M, 2)."""
-        if not len(points):
-            return Fronts(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0))
-        samples = [self.sample(part, points) for part in range(len(self._parts))]
-        return _merged([(_known(s.row)[0, 0], _known(s.depth)[0, 0], s.triangle) for s in samples])
+    def _fronts(self, points: np.ndarray) -> Fronts:
+        """The nearest samples of all parts at points (M, 2); of equal ones the first part's."""
+        part, depth = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
+        for index in range(len(self._parts)):
+            samples = self.sample(index, points)
+            seen, z = _known(samples.row)[0, 0] >= 0, _known(samples.depth)[0, 0]
+            nearer = seen & (z < depth)
+            part[nearer], depth[nearer] = index, z[nearer]
+        return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
 
     def at_centres(self, sampled: Sampled) -> Fronts:
         """The fronts (H, W) of a sampled scene."""
-        row, first, own = _known(sampled.row)[0], 0, []
-        depth = _known(sampled.depth)[0]
-        for samples in sampled.samples:
-            count = samples.ids.shape[-2]
-            inside = (row >= first) & (row < first + count)
-            own.append((np.where(inside, row - first, -1), depth, samples.triangle))
-            first += count
-        return _merged(own)
+        row, counts = _known(sampled.row)[0], [own.ids.shape[-2] for own in sampled.samples]
+        of_part = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        none = [np.full(count, -1, np.int32) for count in counts]
+        own = [s.triangle if s.triangle is not None else n for s, n in zip(sampled.samples, none, strict=True)]
+        triangles = np.concatenate([_known(x) for x in own])
+        part, triangle = (np.where(row >= 0, table[row], np.int32(-1)) for table in (of_part, triangles))
+        return Fronts(part, triangle, _known(sampled.depth)[0].astype(np.float64))
 
 
-def _merged(own: Sequence[tuple[np.ndarray, np.ndarray, Array | None]]) -> Fronts:
-    """The nearest of each part's rows, depths and triangles; of equal ones the first part's."""
-    shape = own[0][0].shape
-    part, triangle, depth = np.full(shape, -1, np.int32), np.full(shape, -1, np.int32), np.full(shape, np.inf)
-    for index, (row, z, triangles) in enumerate(own):
-        nearer = (row >= 0) & (z < depth)
-        part[nearer], depth[nearer] = index, z[nearer]
-        triangle[nearer] = -1 if triangles is None else _known(triangles)[row[nearer]]
-    return Fronts(part, triangle, np.where(part >= 0, depth, 0.0))
+class _Found(TriangleSampler):
+    """A sampler of points whose triangles are known."""
+
+    def __init__(self, fragments: Fragments):
+        """Take the fragments (1, 1, M) at all points to come."""
+        self._fragments = fragments
+
+    def rasterize(self, *_: Any) -> Fragments:
+        """Nothing but points is asked for."""
+        raise NotImplementedError
+
+    def rasterize_points(self, *_: Any) -> Fragments:
+        """The fragments."""
+        return self._fragments
 
 
 def _entry(part: Any, sampler: TriangleSampler, entry: Any, camera: Camera, size: tuple[int, int]) -> Any:

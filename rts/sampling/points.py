@@ -30,13 +30,12 @@ def at_points(
     line = np.where((line >= 0) & (line < size[0]), line, size[0]).astype(np.int64)
     order = np.lexsort((points[:, 0], line))
     begins = np.searchsorted(line[order], np.arange(size[0] + 1))
-    shape, p = (layers, len(points)), camera.projection
+    shape = layers, len(points)
     ids, weights, depth = np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.full(shape, np.inf)
-    planes = np.stack([p[3] + p[2], p[3] - p[2]]) @ camera.view
-    arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size), planes
+    arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size)
     faces = np.ascontiguousarray(proxy.faces, np.int32)
     vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-    sheets_loops.hits(*arguments, _facing(camera, cull), vertices, faces, ids, weights, depth)
+    sheets_loops.hits(*arguments, near_and_far(camera), kept_sign(camera, cull), vertices, faces, ids, weights, depth)
     depth = np.where(ids >= 0, depth, 0).astype(np.float32)
     return Fragments(ids[:, None], weights[:, None], depth[:, None])
 
@@ -46,7 +45,13 @@ def pixel_rows(camera: Camera, size: tuple[int, int]) -> np.ndarray:
     return np.ascontiguousarray(camera.pixel_rows(size), np.float64)
 
 
-def _facing(camera: Camera, cull: str) -> float:
+def near_and_far(camera: Camera) -> np.ndarray:
+    """(2, 4) near and far plane of host matrices, positive on what is seen."""
+    p = camera.projection
+    return np.stack([p[3] + p[2], p[3] - p[2]]) @ camera.view
+
+
+def kept_sign(camera: Camera, cull: str) -> float:
     """Sign of the determinant on screen of triangles to keep; 0 for both. A mirrored view or image reverses it."""
     p = camera.projection
     winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))

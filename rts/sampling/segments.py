@@ -174,31 +174,3 @@ def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles (S,) between vectors (S, 2), 0 to π."""
     return np.abs(np.arctan2(_cross(a, b), (a * b).sum(1)))
 
-
-def tips(breaks: Breaks, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Gaps (M, 3) that corners outside of their squares may reach over, and where (M,): tips that no centre sees."""
-    beyond = _beyond(segments.ties, len(breaks.place))
-    start, end, corner, alone, meets = _turns(segments.ties, beyond, breaks.place)
-    origin = segments.square[:, ::-1] + 0.5
-    local, size = corner - origin, np.array(breaks.joined.shape[1:])
-    far = meets & (alone > 0.5) & ~((local >= 0) & (local <= 1)).all(axis=1) & (np.abs(local - 0.5) < 1.5).all(axis=1)
-    gaps, places = [], []
-    for side, (axis, at) in enumerate(((1, 0), (0, 1), (1, 1), (0, 0))):
-        across = 1 if axis == 1 else 0  # The coordinate that is constant along the side.
-        out = far & (local[:, across] < 0 if at == 0 else local[:, across] > 1)
-        out &= (segments.side != side).all(axis=1)
-        # Where both lines cross the side; the tip lies between.
-        crossed = []
-        for tie in (start, end):
-            begin = tie - origin
-            way = local - begin
-            there = np.abs(way[:, across]) > 1e-9
-            t = np.where(there, at - begin[:, across], 0.0) / np.where(there, way[:, across], 1.0)
-            crossed.append((begin + t[:, None] * way)[:, 1 - across])
-        place = (crossed[0] + crossed[1]) / 2
-        out &= (place > 0) & (place < 1)
-        cell = segments.square[out] + np.array([at, 0] if axis == 1 else [0, at])
-        inside = ((cell >= 0) & (cell < size - (np.array([0, 1]) if axis == 1 else np.array([1, 0])))).all(axis=1)
-        gaps.append(np.column_stack([cell, np.full(len(cell), axis)])[inside].astype(np.int32))
-        places.append(place[out][inside])
-    return np.concatenate(gaps), np.concatenate(places)

@@ -1,4 +1,4 @@
-"""Sheets of a part's triangles in the image: do two samples lie on one sheet, and where does it end?"""
+"""The triangles of a part as a camera sees them: sheets that join samples, and what lies where on them."""
 
 from __future__ import annotations
 
@@ -8,23 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.contracts.records import Proxy
-from rts.sampling.points import pixel_rows
+from rts.contracts.records import Fragments, Proxy
+from rts.sampling.points import kept_sign, near_and_far, pixel_rows
 from rts.scene.camera import Camera
-
-
-class Walk(NamedTuple):
-    """Walks on sheets along M lines of the image.
-
-    Attributes:
-        reached: (M,) the share of each line that lies on the sheet; 1 if the walk came to the end.
-        depth: (M,) depth of the sheet where the walk stops.
-        triangle: (M,) int32, the last triangle; −1 for a walk that has no first one.
-    """
-
-    reached: np.ndarray
-    depth: np.ndarray
-    triangle: np.ndarray
 
 
 class Sheets(NamedTuple):
@@ -35,44 +21,54 @@ class Sheets(NamedTuple):
         faces: (T, 3) int32.
         beyond: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it.
         rows: (4, 4), see `Camera.pixel_rows`.
+        clip: (2, 4) near and far plane, positive on what is seen.
+        keep: sign of the determinants on screen of triangles to keep; 0 for both.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     beyond: np.ndarray
     rows: np.ndarray
+    clip: np.ndarray
+    keep: float
 
     @classmethod
-    def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int]) -> Sheets:
+    def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int], cull: str) -> Sheets:
         """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
-        vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-        return cls(
-            vertices, np.ascontiguousarray(proxy.faces, np.int32), _beyond(proxy.faces), pixel_rows(camera, size)
-        )
+        tables = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
+        seen = pixel_rows(camera, size), near_and_far(camera), kept_sign(camera, cull)
+        return cls(*tables, _beyond(proxy.faces), *seen)
 
-    def walk(self, triangle: np.ndarray, start: np.ndarray, end: np.ndarray) -> Walk:
-        """Walks along lines from `start` (M, 2) to `end` (M, 2), each from the triangle (M,) that its start lies on."""
+    def join(self, own: int, part: np.ndarray, triangle: np.ndarray, depth: np.ndarray, joined: np.ndarray) -> None:
+        """Mark, in `joined` (2, H, W), the centres whose fronts, of the part `own`, a sheet joins to the next ones'.
+
+        `part`, `triangle` and `depth` (H, W) tell what is seen at each centre.
+        """
+        from rts.sampling import sheets_loops
+
+        mesh, height = (self.rows, self.vertices, self.faces, self.beyond), len(part)
+        parallel(sheets_loops.seams, height, part, triangle, depth, own, *mesh, joined, work=20 * part.size)
+
+    def spans(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The triangles' spans on gaps, whose numbers stand in `number` (2, H, W): see `spans_loops.spans_of`."""
+        from rts.sampling import spans_loops
+
+        seen, near = np.empty((len(self.vertices), 2), np.float32), np.empty(len(self.faces), np.bool_)
+        parallel(spans_loops.projected, len(seen), self.vertices, self.rows, seen, work=10 * len(seen))
+        parallel(spans_loops.near_gaps, len(near), self.faces, seen, number, near, work=20 * len(near))
+        mesh = self.rows, self.vertices, self.faces, self.clip, self.keep
+        return spans_loops.spans_of(np.flatnonzero(near), *mesh, number)
+
+    def at(self, triangle: np.ndarray, points: np.ndarray) -> tuple[Fragments, np.ndarray]:
+        """Fragments (1, 1, M) of triangles (M,) at points (M, 2); slopes (M, 2) of depth along x and y, a cell."""
         from rts.sampling import sheets_loops
 
         count = len(triangle)
-        found = Walk(np.empty(count), np.empty(count), np.empty(count, np.int32))
-        lines = np.ascontiguousarray(triangle, np.int32), np.ascontiguousarray(start), np.ascontiguousarray(end)
-        mesh = self.rows, self.vertices, self.faces, self.beyond
-        parallel(sheets_loops.walk, count, *lines, *mesh, *found, work=500 * count)
-        return found
-
-    def touch(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """(M,) True for pairs of triangles that have a corner in common."""
-        return (self.faces[one][:, :, None] == self.faces[other][:, None, :]).any(axis=(1, 2))
-
-    def planes(self, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """(M, 3) depths of triangles' planes at points (M, 2), and their slopes along x and y, a cell."""
-        from rts.sampling import sheets_loops
-
-        found = np.empty((len(points), 3))
-        arguments = np.ascontiguousarray(triangle, np.int32), np.ascontiguousarray(points), self.rows, self.vertices
-        parallel(sheets_loops.planes, len(points), *arguments, self.faces, found, work=100 * len(points))
-        return found
+        weights, depth, slopes = np.empty((count, 2)), np.empty(count), np.empty((count, 2))
+        arguments = triangle, points, self.rows, self.vertices, self.faces, weights, depth, slopes
+        parallel(sheets_loops.on_planes, count, *arguments, work=100 * count)
+        weights, depth = weights.astype(np.float32), depth.astype(np.float32)
+        return Fragments(triangle[None, None], weights[None, None], depth[None, None]), slopes
 
 
 _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}

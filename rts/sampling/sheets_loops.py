@@ -15,7 +15,7 @@ STEPS = 4096
 """The most triangles of one walk."""
 
 
-@loop
+@compiled
 def corners_of(t, rows, vertices, faces, corners):
     """Fill `corners` (3, 4) of a triangle; `rows` is `Camera.pixel_rows`. Returns the sign of its determinant."""
     for c in range(3):
@@ -29,7 +29,7 @@ def corners_of(t, rows, vertices, faces, corners):
 
 
 @compiled
-def _edge(corners, k, sign):
+def edge(corners, k, sign):
     """Coefficients (x, y, 1) of the edge function opposite corner `k`, positive inside."""
     i, j = (k + 1) % 3, (k + 2) % 3
     ax, ay, aw = corners[i, 0], corners[i, 1], corners[i, 2]
@@ -42,7 +42,7 @@ def _depth(corners, sign, x, y):
     """Depth of a triangle's plane at a position, and its slopes along x and y, a pixel."""
     total, total_x, total_y, deep, deep_x, deep_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
-        ex, ey, e = _edge(corners, k, sign)
+        ex, ey, e = edge(corners, k, sign)
         value, z = ex * x + ey * y + e, corners[k, 3]
         total, total_x, total_y = total + value, total_x + ex, total_y + ey
         deep, deep_x, deep_y = deep + value * z, deep_x + ex * z, deep_y + ey * z
@@ -78,13 +78,13 @@ def neighbours(faces, order):
 @compiled
 def _leaves(corners, sign, came, x, y, dx, dy):
     """Where a line leaves a triangle, as a share of it, and through the edge opposite which corner, not `came`."""
-    best, edge = np.inf, -1
+    best, out = np.inf, -1
     for k in range(3):
-        ex, ey, e = _edge(corners, k, sign)
+        ex, ey, e = edge(corners, k, sign)
         slope = ex * dx + ey * dy
         if k != came and slope < 0 and -(ex * x + ey * y + e) / slope < best:
-            best, edge = -(ex * x + ey * y + e) / slope, k
-    return best, edge
+            best, out = -(ex * x + ey * y + e) / slope, k
+    return best, out
 
 
 @compiled
@@ -96,59 +96,82 @@ def _opposite(faces, t, i, j):
     return 0
 
 
+@compiled
+def _walked(t, x, y, dx, dy, rows, vertices, faces, beyond, corners, other):
+    """Walk from triangle to triangle along a line, until the sheet ends, turns away, or the line ends.
+
+    Returns the share of the line that lies on the sheet, the depth there, and the last triangle.
+    """
+    sign, at, came = corners_of(t, rows, vertices, faces, corners), 0.0, -1
+    for _ in range(STEPS):
+        leave, out = _leaves(corners, sign, came, x, y, dx, dy)
+        at = min(max(at, leave), 1.0)
+        s = np.int32(-1) if at == 1 else beyond[t, out]
+        if s < 0:
+            break
+        turned = corners_of(s, rows, vertices, faces, other)
+        back = _opposite(faces, s, faces[t, (out + 1) % 3], faces[t, (out + 2) % 3])
+        ex, ey, _ = edge(other, back, turned)
+        if not ex * dx + ey * dy > 0:
+            break  # The sheet turns away: its next triangle lies on the same side of the edge.
+        t, sign, came = s, turned, back
+        corners, other = other, corners
+    return at, _depth(corners, sign, x + at * dx, y + at * dy)[0], t
+
+
+@compiled
+def _touch(faces, t, s):
+    """True if two triangles have a corner in common."""
+    for i in range(3):
+        for j in range(3):
+            if faces[t, i] == faces[s, j]:
+                return True
+    return False
+
+
 @loop
-def walk(first, last, triangles, start, end, rows, vertices, faces, beyond, reached, depths, final):
-    """Walk from triangle to triangle along lines in the image, until the sheet ends, turns away, or the line ends.
+def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond, joined):
+    """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
 
     Args:
         first: the first line.
         last: the line after the last.
-        triangles: (M,) int32, the triangle that each line starts on; −1 for none.
-        start: (M, 2) float64, x and y of the starts.
-        end: (M, 2) float64, of the ends.
+        part: (H, W) int32, the parts seen at centres.
+        triangle: (H, W) int32, and their triangles.
+        depth: (H, W) float64.
+        own: the part that the further arguments belong to.
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
         beyond: (T, 3), the result of `neighbours`.
-        reached: (M,) to fill: the share of the line that lies on the sheet; 1 if the walk reached its end.
-        depths: (M,) to fill: the depth of the last triangle's plane where the walk stops.
-        final: (M,) to fill: the last triangle.
+        joined: (2, H, W) bool to fill: along x, and along y.
     """
-    corners, other = np.empty((3, 4)), np.empty((3, 4))
-    for m in range(first, last):
-        t, reached[m], depths[m], final[m] = triangles[m], 0.0, 0.0, -1
-        if t < 0:
-            continue
-        x, y = start[m, 0], start[m, 1]
-        dx, dy = end[m, 0] - x, end[m, 1] - y
-        sign, at, came = corners_of(t, rows, vertices, faces, corners), 0.0, -1
-        for _ in range(STEPS):
-            leave, edge = _leaves(corners, sign, came, x, y, dx, dy)
-            at = min(max(at, leave), 1.0)
-            s = np.int32(-1) if at == 1 else beyond[t, edge]
-            if s < 0:
-                break
-            turned = corners_of(s, rows, vertices, faces, other)
-            back = _opposite(faces, s, faces[t, (edge + 1) % 3], faces[t, (edge + 2) % 3])
-            ex, ey, e = _edge(other, back, turned)
-            if not ex * dx + ey * dy > 0:
-                break  # The sheet turns away: its next triangle lies on the same side of the edge.
-            t, sign, came = s, turned, back
-            corners, other = other, corners
-        reached[m], final[m] = at, t
-        depths[m] = _depth(corners, sign, x + at * dx, y + at * dy)[0]
+    (height, width), corners, other = part.shape, np.empty((3, 4)), np.empty((3, 4))
+    for y in range(first, last):
+        for x in range(width):
+            if part[y, x] != own:
+                continue
+            for axis in range(2):
+                dx, dy = 1 - axis, axis
+                if x + dx == width or y + dy == height or part[y + dy, x + dx] != own:
+                    continue
+                t, s, whole = triangle[y, x], triangle[y + dy, x + dx], True
+                if t != s:
+                    at, z, end = _walked(t, x + 0.5, y + 0.5, dx, dy, rows, vertices, faces, beyond, corners, other)
+                    # Rounding may tell neighbours apart; sheets that pass through one another share no corner.
+                    there = depth[y + dy, x + dx]
+                    whole = at == 1 and (end == s or (abs(z - there) <= 1e-5 * there and _touch(faces, end, s)))
+                joined[axis, y, x] = whole
 
 
 @loop
-def planes(first, last, triangles, points, rows, vertices, faces, found):
-    """Fill `found` (M, 3): depth of triangles' planes at points, and its slopes along x and y; NaN without triangle."""
+def on_planes(first, last, triangles, points, rows, vertices, faces, weights, depths, slopes):
+    """Triangles' planes at points (M, 2): the first two barycentrics, depths, and their slopes along x and y."""
     corners = np.empty((3, 4))
     for m in range(first, last):
-        if triangles[m] < 0:
-            found[m] = np.nan
-            continue
         sign = corners_of(triangles[m], rows, vertices, faces, corners)
-        found[m, 0], found[m, 1], found[m, 2] = _depth(corners, sign, points[m, 0], points[m, 1])
+        _, weights[m, 0], weights[m, 1] = _weights(corners, sign, points[m, 0], points[m, 1])
+        depths[m], slopes[m, 0], slopes[m, 1] = _depth(corners, sign, points[m, 0], points[m, 1])
 
 
 @loop
@@ -208,7 +231,7 @@ def _weights(corners, sign, x, y):
     """
     inside, total, first, second = True, 0.0, 0.0, 0.0
     for k in range(3):
-        ex, ey, e = _edge(corners, k, sign)
+        ex, ey, e = edge(corners, k, sign)
         value = ex * x + ey * y + e
         inside &= value > 0 or (value == 0 and (ex > 0 or (ex == 0 and ey > 0)))
         total += value
