@@ -322,11 +322,11 @@ class Outlines:
     sides are joined into segments.
 
     Attributes:
-        place: (B, 2) float64, x and y of each break, in cells from the grid's corner.
+        place: (B,) float64, the place of each break along its gap: 0 at the first centre, 1 at the second.
         gap: (B, 3) int32: the cell (y, x) of the gap's first centre, and 1 for a gap along a row, 0 along a column.
         rows: (B, 2) int32, indices of the last samples before and behind each break, along its gap, or −1. Breaks move
             as they do.
-        points: (B, 2, 2) float64, x and y of these samples.
+        points: (B, 2) float64, the places of these samples along the gap.
         inner: (B, 2) int32, indices of samples of the same surfaces a little farther from the break, or −1. They tell
             colours: in the last hair before an outline normals may turn away, and colours with them.
         near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
@@ -338,7 +338,7 @@ class Outlines:
             the other. −1 in second place if a break is alone.
         side: (S, 2) int32, the sides of the square that these breaks lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
         beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
-        corner: (S, 2) float64, x and y of a point between the two where the outline turns.
+        corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
         pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
             is the motion of the corner.
         joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y?

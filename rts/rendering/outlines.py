@@ -46,7 +46,11 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid) -> Sampled:
         samples.append(in_one_table([own, more]))
         first += samples[-1].ids.shape[-2]
     shifted = _renumbered(sampled, samples)
-    fields = {name: getattr(breaks, name) for name in ("place", "gap", "points", "near", "slope", "ends", "joined")}
+    fields = {name: getattr(breaks, name) for name in ("gap", "near", "slope", "ends", "joined")}
+    along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
+    first = breaks.gap[:, 1::-1] + 0.5
+    fields["place"] = ((breaks.place - first) * along).sum(-1)
+    fields["points"] = ((breaks.points - first[:, None]) * along[:, None]).sum(-1)
     outlines = Outlines(rows=rows[:, :2], inner=rows[:, 2:], **fields, **segments._asdict())
     return replace(sampled, samples=tuple(samples), cells=shifted, outlines=outlines)
 

@@ -68,6 +68,7 @@ def joined(breaks: Breaks) -> Segments:
     sides = np.column_stack([side[i], np.where(lone, -1, side[j])])
     beyond = _beyond(ties, len(y))
     corner, pull = _corners(squares[i] + 0.5, ties, beyond, breaks.place)
+    corner = corner - (squares[i][:, ::-1] + 0.5)
     square, ties, sides, beyond = (np.asarray(x, np.int32) for x in (squares[i], ties, sides, beyond[:, 1:3]))
     return Segments(square, ties, sides, beyond, corner, pull)
 

@@ -15,15 +15,17 @@ flux, J are constants.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace, stopped, value_of
+from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Outlines, Splats
 from rts.contracts.splatter import Splatter
-from rts.errors import InputError
+from rts.operations.operation import Arrays, Operation, Some
 from rts.splatting.layers import check_rows, nothing, unpack
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
@@ -45,26 +47,39 @@ class Edges(Splatter):
         if rgba.shape[0] == 0:
             return nothing(rgba, row)
         check_rows(row, rgba.shape[0])
-        xp, (height, width) = namespace(rgba), row.shape[1:]
-        covered = row[0] >= 0
-        at = np.mgrid[:height, :width][::-1] + 0.5
-        centres = engine_of(positions).constant(np.stack([*at, 0 * at[0]], axis=-1), positions)
-        color = xp.where(covered[..., None], unpack(rgba, row[0]), 0.0)
-        motion = xp.where(covered[..., None], unpack(positions, row[0]) - centres, 0.0)
         outlines = splats.outlines
         if outlines is None:
-            return color - _inside(color, motion - stopped(motion), _all_joined(covered))
-        image = color - _inside(color, motion, outlines.joined)
-        if outlines.place.shape[0] == 0:
-            return image
-        breaks = _Breaks.of(outlines, positions, rgba)
-        segments = _Segments.of(outlines, breaks)
-        parts = [*_beside_breaks(breaks, segments, outlines, color, motion), *segments.parts()]
-        cells = xp.concat([y * width + x for x, y, _ in parts])
-        changes = xp.concat([change for *_, change in parts])
-        engine = engine_of(changes)
-        sums = engine.segment_sum(changes, _known(cells), height * width)
-        return image + xp.reshape(sums, image.shape)
+            color, motion = _on_cells(positions, rgba, row[0, ...])
+            return color - _inside(color, motion - stopped(motion), _all_joined(row[0, ...] >= 0))
+        check_rows(outlines.rows, rgba.shape[0], "outlines.rows")
+        check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
+        return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, field.name) for field in fields(Outlines)))
+
+
+def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:
+    """The image (H, W, C) of samples with `row` (H, W), and of outlines, whose fields `arrays` are."""
+    xp, (height, width), outlines = namespace(rgba), row.shape, Outlines(*arrays)
+    color, motion = _on_cells(positions, rgba, row)
+    image = color - _inside(color, motion, outlines.joined)
+    if outlines.place.shape[0] == 0:
+        return image
+    breaks = _Breaks.of(outlines, positions, rgba)
+    segments = _Segments.of(outlines, breaks)
+    parts = [*_beside_breaks(breaks, segments, outlines, color, motion), *segments.parts()]
+    cells = xp.concat([y * width + x for x, y, _ in parts])
+    changes = xp.concat([change for *_, change in parts])
+    sums = engine_of(changes).segment_sum(changes, cells, height * width)
+    return image + xp.reshape(sums, image.shape)
+
+
+def _on_cells(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array]:
+    """Colours (H, W, C) of cells, and motions (H, W, 3) of their samples; 0 in empty ones."""
+    xp, (height, width) = namespace(rgba), row.shape
+    at = np.mgrid[:height, :width][::-1] + 0.5
+    centres = engine_of(positions).constant(np.stack([*at, 0 * at[0]], axis=-1), positions)
+    covered = (row >= 0)[..., None]
+    color = xp.where(covered, unpack(rgba, row), 0.0)
+    return color, xp.where(covered, unpack(positions, row) - centres, 0.0)
 
 
 def _inside(color: Array, motion: Array, joined: Array) -> Array:
@@ -84,14 +99,6 @@ def _all_joined(covered: Array) -> Array:
     inside = np.ones((2, *covered.shape), bool)
     inside[0, :, -1], inside[1, -1] = False, False  # Nothing follows the last cells.
     return xp.stack([right, below]) & engine_of(covered).constant(inside, covered)
-
-
-def _known(index: Array) -> np.ndarray:
-    """The values of integers of `Outlines`, which no transform traces, on the host."""
-    value = value_of(index)
-    if value is None:
-        raise InputError("outlines are traced; expected arrays that are known while Python runs, such as NumPy's")
-    return value
 
 
 class _Breaks(NamedTuple):
@@ -117,17 +124,19 @@ class _Breaks(NamedTuple):
     def of(cls, outlines: Outlines, positions: Array, rgba: Array) -> _Breaks:
         """The samples of outlines."""
         xp, rows = namespace(positions), outlines.rows
-        check_rows(rows, rgba.shape[0], "outlines.rows")
         seen = xp.stack([rows[:, 0] >= 0, rows[:, 1] >= 0])
         at = [xp.where(rows[:, i] >= 0, rows[:, i], 0) for i in (0, 1)]
         shown = xp.where(outlines.inner >= 0, outlines.inner, rows)
         shown = xp.where(shown >= 0, shown, 0)
         color = xp.stack([xp.where(seen[i][:, None], xp.take(rgba, shown[:, i], axis=0), 0.0) for i in (0, 1)])
         found = [xp.take(positions, at[i], axis=0) for i in (0, 1)]
-        points = xp.astype(outlines.points, positions.dtype)
-        motion = [xp.where(seen[i][:, None], found[i][:, :2] - points[:, i], 0.0) for i in (0, 1)]
+        row = xp.astype(outlines.gap[:, 2], positions.dtype)
+        first = xp.astype(xp.stack([outlines.gap[:, 1], outlines.gap[:, 0]], axis=-1), positions.dtype) + 0.5
+        step = xp.stack([row, 1 - row], axis=-1)
+        points = [first + outlines.points[:, i, None] * step for i in (0, 1)]
+        motion = [xp.where(seen[i][:, None], found[i][:, :2] - points[i], 0.0) for i in (0, 1)]
         # Where surfaces pass through one another, the line moves to where their depths are equal.
-        slope = xp.astype(outlines.slope, positions.dtype)
+        slope = outlines.slope
         still = [found[i][:, 2] - stopped(found[i][:, 2]) - xp.sum(slope[:, i] * motion[i], axis=-1) for i in (0, 1)]
         apart = slope[:, 0] - slope[:, 1]
         square = xp.sum(apart * apart, axis=-1)
@@ -135,9 +144,7 @@ class _Breaks(NamedTuple):
         along = -(still[0] - still[1]) / xp.where(crossing & (square > 0), square, 1.0)
         moves = xp.where((outlines.near == 0)[:, None], motion[0], motion[1])
         moves = xp.where(crossing[:, None], along[:, None] * apart, moves)
-        row = xp.astype(outlines.gap[:, 2], positions.dtype)
-        place, step = xp.astype(outlines.place, positions.dtype), xp.stack([row, 1 - row], axis=-1)
-        return cls(place, step, color, seen, xp.stack(motion), moves)
+        return cls(first + outlines.place[:, None] * step, step, color, seen, xp.stack(motion), moves)
 
 
 class _Segments(NamedTuple):
@@ -174,8 +181,7 @@ class _Segments(NamedTuple):
         along = xp.take(breaks.step, ties[:, 0], axis=0)
         end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
         start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
-        corner = xp.astype(outlines.corner, origin.dtype) - origin
-        corner = xp.where(lone[:, None], (start + end) / 2, corner)
+        corner = xp.where(lone[:, None], (start + end) / 2, outlines.corner)
         jump, moves = [], []
         for i in (0, 1):
             before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
@@ -188,9 +194,8 @@ class _Segments(NamedTuple):
             xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0)
             for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
         ]
-        pull = xp.astype(outlines.pull, origin.dtype)
         pulled = (beyond[0], *moves, beyond[1])
-        moves.insert(1, sum(pull[:, i, None] * x for i, x in enumerate(pulled)))
+        moves.insert(1, sum(outlines.pull[:, i, None] * x for i, x in enumerate(pulled)))
         return cls(square, lone, xp.stack([start, corner, end]), side, ties, xp.stack(jump), xp.stack(moves))
 
     def parts(self) -> list[tuple[Array, Array, Array]]:
@@ -225,7 +230,7 @@ class _Segments(NamedTuple):
             # Two segments at a line of crossing may run in opposite directions.
             ahead = xp.sum(normal * xp.take(breaks.step, self.ties[:, i], axis=0), axis=-1) >= 0
             turned = xp.where(self.lone[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
-            total = total + engine.segment_sum(turned, _known(self.ties[:, i]), count)
+            total = total + engine.segment_sum(turned, self.ties[:, i], count)
         return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
 
     def _places(self) -> list[Array]:
@@ -325,3 +330,150 @@ def _beside_breaks(
         parts.append((cx, cy, xp.where(counts, share * moved + nearer, 0.0)))
         parts.append((*beyond, xp.where(counts, (1 - share) * moved + farther, 0.0)))
     return parts
+
+
+# ------------------------------------------------------------------------------------------------------ compiled
+
+
+class _Weights(NamedTuple):
+    """The weights of colours and motions in the image, from outlines alone; see `rts.splatting.edges_loops`.
+
+    Attributes:
+        shown: (B, 2) int32, the samples that tell colours before and behind breaks, or −1.
+        points: (B, 2, 2), x and y of the last samples.
+        moves: (B, 2, 3, 2).
+        share: (S, 4, 2).
+        flux: (S, 4, 2, 4, 2).
+        cells: (B, 2, 3) int32.
+        sides: (B, 2, 5).
+    """
+
+    shown: np.ndarray
+    points: np.ndarray
+    moves: np.ndarray
+    share: np.ndarray
+    flux: np.ndarray
+    cells: np.ndarray
+    sides: np.ndarray
+
+    @classmethod
+    def of(cls, outlines: Outlines) -> _Weights:
+        """The weights of outlines on the host."""
+        from rts.splatting import edges_loops as loops
+
+        count, segments, gap = len(outlines.place), len(outlines.square), outlines.gap
+        shown = np.where(outlines.inner >= 0, outlines.inner, outlines.rows)
+        step = np.stack([gap[:, 2], 1 - gap[:, 2]], axis=1)
+        points = gap[:, None, 1::-1] + 0.5 + np.asarray(outlines.points, np.float64)[..., None] * step[:, None]
+        moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
+        path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
+        loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
+        ties = outlines.ties
+        known = outlines.place, gap, outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER
+        parallel(loops.weigh_segments, segments, *known, path, share, flux, work=400 * segments)
+        seen, normal = outlines.rows >= 0, np.empty((count, 2))
+        arrays = outlines.place, gap, outlines.ends, seen, ties, path, outlines.joined, normal, cells, sides
+        loops.weigh_sides(*arrays)
+        return cls(shown, points, moves, share, flux, cells, sides)
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> _Weights:
+    """The value, and the weights, which the derivatives use again."""
+    from rts.splatting import edges_loops as loops
+
+    positions, rgba, row, *arrays = operands
+    outlines = Outlines(*arrays)
+    parallel(loops.inside, len(row), positions, rgba, row, outlines.joined, out, work=10 * out.size)
+    weights = _Weights.of(outlines)
+    steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
+    loops.motions(positions, outlines.rows, weights.points, weights.moves, motion)
+    _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out)
+    return weights
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | None) -> None:
+    from rts.splatting import edges_loops as loops
+
+    positions, rgba, row, *arrays = operands
+    outlines = Outlines(*arrays)
+    weights = kept or _Weights.of(outlines)
+    t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
+    parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
+    steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown) if len(t_positions) else 0, 2))
+    if len(t_positions):
+        loops.motions(t_positions, outlines.rows, NOWHERE, weights.moves, motion)
+    jump = _jumps(t_rgba, weights) if len(t_rgba) else np.empty((0, out.shape[2]))
+    _add(outlines, weights, row, (t_rgba, t_positions, NOWHERE), (rgba, jump, steady, motion), out)
+
+
+def _add(
+    outlines: Outlines, weights: _Weights, row: np.ndarray, samples: Arrays, jumps: Arrays, out: np.ndarray
+) -> None:
+    """Add the changes at outlines to an image.
+
+    Args:
+        outlines: on the host.
+        weights: of these outlines.
+        row: (H, W).
+        samples: colours and positions, or their tangents, and points, or none; see `edges_loops.add_sides`.
+        jumps: constant colours; jumps, constant jumps and motions, see `edges_loops.add_segments`.
+        out: (H, W, C).
+    """
+    from rts.splatting import edges_loops as loops
+
+    (rgba, positions, points), (steady, *at_breaks) = samples, jumps
+    segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux
+    loops.add_segments(*segments, *at_breaks, out)
+    sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
+    loops.add_sides(*sides, steady, rgba, positions, points, out)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) -> None:
+    from rts.splatting import edges_loops as loops
+
+    positions, rgba, row, *arrays = operands
+    outlines, g = Outlines(*arrays), read_only(g)
+    weights = kept or _Weights.of(outlines)
+    g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
+    loops.pull_inside(0, len(row), rgba, row, outlines.joined, g, g_positions, g_rgba)
+    count, steady = len(weights.shown), _jumps(rgba, weights)
+    g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
+    segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux
+    loops.pull_segments(*segments, steady, g, g_jump, g_motion)
+    if len(g_positions):
+        loops.pull_motions(outlines.rows, weights.moves, g_motion, g_positions)
+    if len(g_rgba):
+        loops.pull_jumps(weights.shown, g_jump, g_rgba)
+    sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
+    loops.pull_sides(*sides, rgba, g, g_rgba, g_positions)
+
+
+def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:
+    """(B, C) colours before breaks, less those behind."""
+    from rts.splatting import edges_loops as loops
+
+    found = np.empty((len(weights.shown), rgba.shape[1]))
+    loops.jumps(rgba, weights.shown, found)
+    return found
+
+
+def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
+    return *row, rgba[1]
+
+
+NOWHERE = np.empty((0, 2, 2))
+"""In place of points, for tangents."""
+
+EDGES = Operation(
+    "rts.edges",
+    _specification,
+    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
+    shape=_shape,
+    forward=_forward,
+    push=_push,
+    pull=_pull,
+    differentiable=2,
+    packed=(0, 1),
+    keeps=True,
+)
+"""The image (H, W, C) of positions (N, 3), colours (N, C), `row` (H, W), and the fields of `Outlines`."""

@@ -201,7 +201,7 @@ class JaxEngine(Engine):
         result = row_blocks.apply(few, used, list(rows.values()))
         return whole if result is None else result
 
-    def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
+    def segment_sum(self, values: jax.Array, segments: jax.Array | np.ndarray, count: int) -> jax.Array:
         """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
         return jax.ops.segment_sum(values, _on_device(segments), num_segments=count)
 

@@ -185,9 +185,9 @@ class TorchEngine(Engine):
         index = torch.arange(x.shape[0], device=x.device).reshape(-1, *[1] * (x.ndim - 1))
         return torch.where(index < used, x, torch.where(used > 0, x[:1], torch.ones_like(x[:1])))
 
-    def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
+    def segment_sum(self, values: torch.Tensor, segments: torch.Tensor | np.ndarray, count: int) -> torch.Tensor:
         """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
-        index = _tensor(segments, values.device)
+        index = segments if isinstance(segments, torch.Tensor) else _tensor(segments, values.device)
         return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(
             0, index, values
         )

@@ -1,0 +1,468 @@
+"""The image of `rts.splatting.edges` and its derivatives, by walks along outlines. Compiled.
+
+An image is linear in colours; and, with their values as constants, linear in motions. `weigh` computes the weights once,
+from outlines alone. Then value, pushforward and pullback are sums over cells, breaks and segments.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+
+# ------------------------------------------------------------------------------------------------------- weights
+
+
+@loop
+def weigh_breaks(first, last, near, slope, moves):
+    """Fill `moves` (B, 2, 3, 2): motion of breaks along x and y, for motions (x, y, depth) of their two samples."""
+    for b in range(first, last):
+        moves[b] = 0.0
+        if near[b] < 2:
+            moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
+            continue
+        square = (slope[b, 0, 0] - slope[b, 1, 0]) ** 2 + (slope[b, 0, 1] - slope[b, 1, 1]) ** 2
+        for a in range(2):
+            share = -(slope[b, 0, a] - slope[b, 1, a]) / (square if square > 0 else 1.0)
+            for i in range(2):
+                sign = share if i == 0 else -share
+                moves[b, i, 0, a] = -sign * slope[b, i, 0]
+                moves[b, i, 1, a] = -sign * slope[b, i, 1]
+                moves[b, i, 2, a] = sign
+
+
+@compiled
+def _place(x, y, side):
+    """A place on a square's sides, clockwise from the upper left corner, 0 to 4."""
+    if side == 0:
+        return x
+    if side == 1:
+        return 1 + y
+    return 3 - x if side == 2 else 4 - y
+
+
+@compiled
+def _right_of_bottom(start, end, low, high):
+    """The length, between two places on the sides, of what lies on the right of the way from `start` to `end`."""
+    a, b = (start, end) if start < end else (end, start)
+    between = max(min(max(b, low), high) - min(max(a, low), high), 0.0)
+    return high - low - between if start < end else between
+
+
+@compiled
+def _point(place, gap, b, square, s, out):
+    """Fill `out` with a break's position from the first corner's centre of a segment's square, within it."""
+    along = gap[b, 2]
+    x = gap[b, 1] - square[s, 1] + (place[b] if along == 1 else 0.0)
+    y = gap[b, 0] - square[s, 0] + (0.0 if along == 1 else place[b])
+    out[0], out[1] = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
+
+
+@loop
+def weigh_segments(first, last, place, gap, square, ties, side, corner, pull, border, path, share, flux):
+    """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
+
+    Args:
+        first: the first segment.
+        last: the segment after the last.
+        place: (B,) of outlines.
+        gap: (B, 3).
+        square: (S, 2).
+        ties: (S, 2).
+        side: (S, 2).
+        corner: (S, 2).
+        pull: (S, 4).
+        border: width of the strip along a border of two pixels in which an edge belongs to both.
+        path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
+        share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps before and behind both breaks.
+        flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
+            that pull.
+    """
+    cuts, area = np.empty(4), np.empty(4)
+    for s in range(first, last):
+        lone = ties[s, 1] < 0
+        side0 = side[s, 0]
+        side1 = (side0 + 2) % 4 if lone else side[s, 1]
+        _point(place, gap, ties[s, 0], square, s, path[s, 0])
+        if lone:
+            along = gap[ties[s, 0], 2]
+            path[s, 2, 0] = path[s, 0, 0] if along == 1 else 1 - path[s, 0, 0]
+            path[s, 2, 1] = 1 - path[s, 0, 1] if along == 1 else path[s, 0, 1]
+            path[s, 1] = (path[s, 0] + path[s, 2]) / 2
+        else:
+            _point(place, gap, ties[s, 1], square, s, path[s, 2])
+            path[s, 1] = corner[s]
+        # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
+        sign0 = 1.0 if side0 < 2 else -1.0
+        sign1 = sign0 if lone else (1.0 if side1 >= 2 else -1.0)
+        chord_x, chord_y = path[s, 2, 0] - path[s, 0, 0], path[s, 2, 1] - path[s, 0, 1]
+        length = chord_x * chord_x + chord_y * chord_y
+        turn = (path[s, 1, 0] - path[s, 0, 0]) * chord_x + (path[s, 1, 1] - path[s, 0, 1]) * chord_y
+        turn = turn / length if length > 0 else 0.0
+        flux[s] = 0.0
+        start, end = _place(path[s, 0, 0], path[s, 0, 1], side0), _place(path[s, 2, 0], path[s, 2, 1], side1)
+        area[0] = area[3] = 0.5 * _right_of_bottom(start, end, 2.5, 3.0)
+        area[1] = area[2] = 0.5 * _right_of_bottom(start, end, 2.0, 2.5)
+        for i in range(2):
+            x, y = path[s, i, 0], path[s, i, 1]
+            wx, wy = path[s, i + 1, 0] - x, path[s, i + 1, 1] - y
+            cuts[0], cuts[3] = 0.0, 1.0
+            a = min(max((0.5 - x) / wx, 0.0), 1.0) if abs(wx) > 1e-9 else 0.0
+            b = min(max((0.5 - y) / wy, 0.0), 1.0) if abs(wy) > 1e-9 else 0.0
+            cuts[1], cuts[2] = min(a, b), max(a, b)
+            for n in range(3):
+                t, part = (cuts[n] + cuts[n + 1]) / 2, cuts[n + 1] - cuts[n]
+                if part == 0:
+                    continue
+                px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
+                u = t * turn if i == 0 else (1 - t) * turn + t
+                counts = not lone or abs(px - path[s, 0, 0]) + abs(py - path[s, 0, 1]) <= 0.5
+                right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
+                below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+                for k in range(4):
+                    east, south = k == 1 or k == 2, k >= 2
+                    if (px >= 0.5) == east:
+                        area[k] -= min(max(py - (0.5 if south else 0.0), 0.0), 0.5) * dx
+                    of_cell = (right if east else 1 - right) * (below if south else 1 - below)
+                    if of_cell == 0 or not counts:
+                        continue
+                    for m in range(4):
+                        # Of start and corner, or corner and end.
+                        own = (1 - t) * (m == 1) + t * pull[s, m] if i == 0 else (1 - t) * pull[s, m] + t * (m == 2)
+                        if lone:
+                            own = 1.0 if m == 1 else 0.0
+                        own *= of_cell
+                        flux[s, k, 0, m, 0] += own * (1 - u) * sign0 * dy
+                        flux[s, k, 0, m, 1] -= own * (1 - u) * sign0 * dx
+                        flux[s, k, 1, m, 0] += own * u * sign1 * dy
+                        flux[s, k, 1, m, 1] -= own * u * sign1 * dx
+        for k in range(4):
+            # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
+            after, until = side0 >= k, side1 >= k
+            on_right = (after or not until) if start < end else (after and not until)
+            counts = not lone or side0 == k or side0 == (k + 3) % 4
+            beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
+            share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
+
+
+@loop
+def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, sides):
+    """Fill in the weights of the surfaces on both sides of breaks.
+
+    Args:
+        place: (B,) of outlines.
+        gap: (B, 3).
+        near_ends: (B, 2), `Outlines.ends`.
+        seen: (B, 2) bool, is there a sample before and behind?
+        ties: (S, 2).
+        path: (S, 3, 2), see `weigh_segments`.
+        joined: (2, H, W).
+        normal: (B, 2), zeros.
+        cells: (B, 2, 3) int32 to fill, for each side: the gap's cell on it (flat), the other one, and the one from
+            which the colour changes towards the break; −1 in first place for a side that does not count.
+        sides: (B, 2, 5) to fill: the share of the change that belongs to the first cell; weights of the colours'
+            difference in the first and in the other cell; and those of motions along x and y.
+    """
+    (height, width), count = joined.shape[1:], len(place)
+    for b in range(count):
+        normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
+    for s in range(len(ties)):
+        if ties[s, 1] < 0:
+            continue
+        nx, ny = path[s, 2, 1] - path[s, 0, 1], path[s, 0, 0] - path[s, 2, 0]
+        for e in range(2):
+            b = ties[s, e]
+            # Two segments at a line of crossing may run in opposite directions.
+            sign = 1.0 if nx * gap[b, 2] + ny * (1 - gap[b, 2]) >= 0 else -1.0
+            normal[b, 0] += sign * nx
+            normal[b, 1] += sign * ny
+    for b in range(count):
+        length = np.hypot(normal[b, 0], normal[b, 1])
+        nx, ny = normal[b, 0] / length, normal[b, 1] / length
+        y, x, row = gap[b, 0], gap[b, 1], gap[b, 2]
+        ahead, step = nx * row + ny * (1 - row), row + (1 - row) * width
+        for i in range(2):
+            cells[b, i, 0] = -1
+            if not (near_ends[b, i] and seen[b, i]):
+                continue
+            way = 1 - 2 * i
+            here = y * width + x + i * step
+            length = min(max(place[b] if i == 0 else 1 - place[b], 0.0), 1.0)
+            inside, outside = min(length, 0.5), max(length - 0.5, 0.0)
+            cells[b, i, 0], cells[b, i, 1], cells[b, i, 2] = here, here + way * step, here
+            # The cell before tells the slope, where it shows the same surface, since the way may be short.
+            by = y + (2 if i == 1 else -1) * (1 - row)
+            bx = x + (2 if i == 1 else -1) * row
+            rate = 1 / max(length, 0.5)
+            if 0 <= by < height and 0 <= bx < width:
+                fy, fx = (by, bx) if i == 0 else (y + (1 - row), x + row)
+                if joined[1 - row, fy, fx]:
+                    cells[b, i, 2], rate = by * width + bx, 1 / (1 + length)
+            sides[b, i, 0] = inside / (length if length > 1e-6 else 1.0)
+            sides[b, i, 1] = -ahead * ahead * rate * (0.5 - inside) ** 2 / 2
+            sides[b, i, 2] = -ahead * ahead * rate * outside**2 / 2
+            sides[b, i, 3], sides[b, i, 4] = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
+
+
+# ---------------------------------------------------------------------------------------------- value and derivatives
+
+
+@compiled
+def _slope(rgba, row, joined, y, x, axis, c):
+    """The slope of a channel at a cell: the mean of the differences from and to the next cells of the same surface."""
+    own, total = rgba[row[y, x], c], 0.0
+    if joined[axis, y, x]:
+        total += rgba[row[y + axis, x + 1 - axis], c] - own
+    by, bx = y - axis, x - (1 - axis)
+    if by >= 0 and bx >= 0 and joined[axis, by, bx]:
+        total += own - rgba[row[by, bx], c]
+    return total / 2
+
+
+@loop
+def inside(first, last, positions, rgba, row, joined, out):
+    """Fill lines `first` to `last` of `out` (H, W, C): colours of cells, moved along their slopes."""
+    for y in range(first, last):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n < 0:
+                out[y, x] = 0.0
+                continue
+            mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
+            for c in range(rgba.shape[1]):
+                value = rgba[n, c]
+                for axis in range(2):
+                    move = mx if axis == 0 else my
+                    if move != 0:
+                        value -= _slope(rgba, row, joined, y, x, axis, c) * move
+                out[y, x, c] = value
+
+
+@loop
+def push_inside(first, last, rgba, row, joined, t_positions, t_rgba, out):
+    """Fill lines of `out` (H, W, C) with the derivative of `inside` along tangents; empty ones are zeros."""
+    for y in range(first, last):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            for c in range(rgba.shape[1]):
+                out[y, x, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
+                if n < 0 or not len(t_positions):
+                    continue
+                for axis in range(2):
+                    if t_positions[n, axis] != 0:
+                        out[y, x, c] -= _slope(rgba, row, joined, y, x, axis, c) * t_positions[n, axis]
+
+
+@loop
+def pull_inside(first, last, rgba, row, joined, g, g_positions, g_rgba):
+    """Add to gradients of samples those of `inside`, in lines of cells; empty ones are not wanted."""
+    for y in range(first, last):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n < 0:
+                continue
+            for c in range(rgba.shape[1]):
+                if g[y, x, c] == 0:
+                    continue
+                if len(g_rgba):
+                    g_rgba[n, c] += g[y, x, c]
+                if len(g_positions):
+                    for axis in range(2):
+                        g_positions[n, axis] -= _slope(rgba, row, joined, y, x, axis, c) * g[y, x, c]
+
+
+@compiled
+def _jump(rgba, shown, b, c):
+    """A channel before a break, less that behind."""
+    before = rgba[shown[b, 0], c] if shown[b, 0] >= 0 else 0.0
+    return before - (rgba[shown[b, 1], c] if shown[b, 1] >= 0 else 0.0)
+
+
+@compiled
+def _last(s, ties, m, beyond):
+    """The m-th of the breaks that pull at a segment: the one before, its own two, the one after; or −1."""
+    if m == 0:
+        return beyond[s, 0]
+    if m == 3:
+        return beyond[s, 1]
+    return ties[s, m - 1]
+
+
+@loop
+def jumps(rgba, shown, out):
+    """Fill `out` (B, C): colours before breaks, less those behind."""
+    for b in range(len(shown)):
+        for c in range(rgba.shape[1]):
+            out[b, c] = _jump(rgba, shown, b, c)
+
+
+@loop
+def motions(positions, rows, points, moves, out):
+    """Fill `out` (B, 2): motions of breaks, for samples that were at `points` (B, 2, 2); of tangents if it is empty."""
+    for b in range(len(rows)):
+        out[b] = 0.0
+        for i in range(2):
+            n = rows[b, i]
+            if n < 0:
+                continue
+            for a in range(2):
+                x, y = positions[n, 0], positions[n, 1]
+                if len(points):
+                    out[b, a] += moves[b, i, 0, a] * (x - points[b, i, 0]) + moves[b, i, 1, a] * (y - points[b, i, 1])
+                else:
+                    out[b, a] += moves[b, i, 0, a] * x + moves[b, i, 1, a] * y + moves[b, i, 2, a] * positions[n, 2]
+
+
+@loop
+def add_segments(square, ties, beyond, share, flux, jump, steady, motion, out):
+    """Add to an image (H, W, C) the changes that segments make.
+
+    Args:
+        square: (S, 2) of outlines.
+        ties: (S, 2).
+        beyond: (S, 2).
+        share: (S, 4, 2), see `weigh_segments`.
+        flux: (S, 4, 2, 4, 2).
+        jump: (B, C) jumps of colours, or their tangents; empty for zeros.
+        steady: (B, C) jumps that are constants in fluxes.
+        motion: (B, 2) motions of breaks, or their tangents; empty for zeros.
+        out: (H, W, C).
+    """
+    channels, rate = out.shape[2], np.empty(2)
+    for s in range(len(square)):
+        start = ties[s, 0]
+        end = ties[s, 1] if ties[s, 1] >= 0 else start
+        for k in range(4):
+            y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
+            rate[:] = 0.0
+            if len(motion):
+                for m in range(4):
+                    b = _last(s, ties, m, beyond)
+                    if b >= 0:
+                        for e in range(2):
+                            rate[e] += flux[s, k, e, m, 0] * motion[b, 0] + flux[s, k, e, m, 1] * motion[b, 1]
+            for c in range(channels):
+                value = rate[0] * steady[start, c] + rate[1] * steady[end, c]
+                if len(jump):
+                    value += share[s, k, 0] * jump[start, c] + share[s, k, 1] * jump[end, c]
+                out[y, x, c] += value
+
+
+@loop
+def pull_segments(square, ties, beyond, share, flux, steady, g, g_jump, g_motion):
+    """Add to gradients of jumps (B, C) and of motions (B, 2) those of `add_segments`; empty ones are not wanted."""
+    channels, rate = g.shape[2], np.empty(2)
+    for s in range(len(square)):
+        start = ties[s, 0]
+        end = ties[s, 1] if ties[s, 1] >= 0 else start
+        for k in range(4):
+            y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
+            rate[:] = 0.0
+            for c in range(channels):
+                own = g[y, x, c]
+                rate[0] += own * steady[start, c]
+                rate[1] += own * steady[end, c]
+                if len(g_jump):
+                    g_jump[start, c] += share[s, k, 0] * own
+                    g_jump[end, c] += share[s, k, 1] * own
+            if len(g_motion) and (rate[0] != 0 or rate[1] != 0):
+                for m in range(4):
+                    b = _last(s, ties, m, beyond)
+                    if b >= 0:
+                        for a in range(2):
+                            g_motion[b, a] += rate[0] * flux[s, k, 0, m, a] + rate[1] * flux[s, k, 1, m, a]
+
+
+@loop
+def pull_motions(rows, moves, g_motion, g_positions):
+    """Add to gradients of positions those of `motions`."""
+    for b in range(len(rows)):
+        for i in range(2):
+            n = rows[b, i]
+            if n >= 0:
+                for r in range(3):
+                    g_positions[n, r] += moves[b, i, r, 0] * g_motion[b, 0] + moves[b, i, r, 1] * g_motion[b, 1]
+
+
+@loop
+def pull_jumps(shown, g_jump, g_rgba):
+    """Add to gradients of colours those of `jumps`."""
+    for b in range(len(shown)):
+        for i in range(2):
+            n = shown[b, i]
+            if n >= 0:
+                for c in range(g_rgba.shape[1]):
+                    g_rgba[n, c] += g_jump[b, c] if i == 0 else -g_jump[b, c]
+
+
+@compiled
+def _moved(positions, row, rows, points, sides, b, i, y, x):
+    """The motion of the surface on a side of a break, by its last sample and that of the cell; see `weigh_sides`."""
+    n, m = rows[b, i], row[y, x]
+    mx, my = positions[n, 0] + positions[m, 0], positions[n, 1] + positions[m, 1]
+    if len(points):
+        mx, my = mx - points[b, i, 0] - (x + 0.5), my - points[b, i, 1] - (y + 0.5)
+    return sides[b, i, 3] * mx + sides[b, i, 4] * my
+
+
+@loop
+def add_sides(row, rows, shown, cells, sides, steady, rgba, positions, points, out):
+    """Add to an image (H, W, C) the changes beside breaks.
+
+    Args:
+        row: (H, W) int32.
+        rows: (B, 2), the last samples.
+        shown: (B, 2), those that tell colours.
+        cells: (B, 2, 3), see `weigh_sides`.
+        sides: (B, 2, 5).
+        steady: (N, C) colours that are constants where surfaces move.
+        rgba: (N, C) colours, or their tangents; empty for zeros.
+        positions: (N, 3), or their tangents; empty for zeros.
+        points: (B, 2, 2), see `motions`; empty for tangents.
+        out: (H, W, C).
+    """
+    width = row.shape[1]
+    for b in range(len(cells)):
+        for i in range(2):
+            if cells[b, i, 0] < 0:
+                continue
+            y, x = divmod(cells[b, i, 0], width)
+            there_y, there_x = divmod(cells[b, i, 1], width)
+            from_y, from_x = divmod(cells[b, i, 2], width)
+            last, here, former = shown[b, i], row[y, x], row[from_y, from_x]
+            move = _moved(positions, row, rows, points, sides, b, i, y, x) if len(positions) else 0.0
+            for c in range(out.shape[2]):
+                near, far = 0.0, 0.0
+                if move != 0:
+                    change = (steady[last, c] - steady[here, c]) * move
+                    near, far = sides[b, i, 0] * change, (1 - sides[b, i, 0]) * change
+                if len(rgba):
+                    change = rgba[last, c] - rgba[former, c]
+                    near, far = near + sides[b, i, 1] * change, far + sides[b, i, 2] * change
+                out[y, x, c] += near
+                out[there_y, there_x, c] += far
+
+
+@loop
+def pull_sides(row, rows, shown, cells, sides, steady, g, g_rgba, g_positions):
+    """Add to gradients of colours and positions those of `add_sides`; empty ones are not wanted."""
+    width = row.shape[1]
+    for b in range(len(cells)):
+        for i in range(2):
+            if cells[b, i, 0] < 0:
+                continue
+            y, x = divmod(cells[b, i, 0], width)
+            there_y, there_x = divmod(cells[b, i, 1], width)
+            from_y, from_x = divmod(cells[b, i, 2], width)
+            last, here, former, move = shown[b, i], row[y, x], row[from_y, from_x], 0.0
+            for c in range(g.shape[2]):
+                near, far = g[y, x, c], g[there_y, there_x, c]
+                move += (sides[b, i, 0] * near + (1 - sides[b, i, 0]) * far) * (steady[last, c] - steady[here, c])
+                if len(g_rgba):
+                    own = sides[b, i, 1] * near + sides[b, i, 2] * far
+                    g_rgba[last, c] += own
+                    g_rgba[former, c] -= own
+            if len(g_positions) and move != 0:
+                for a in range(2):
+                    g_positions[rows[b, i], a] += sides[b, i, 3 + a] * move
+                    g_positions[here, a] += sides[b, i, 3 + a] * move
