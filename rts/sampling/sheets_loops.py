@@ -76,18 +76,6 @@ def neighbours(faces, order):
 
 
 @compiled
-def _leaves(corners, sign, came, x, y, dx, dy):
-    """Where a line leaves a triangle, as a share of it, and through the edge opposite which corner, not `came`."""
-    best, out = np.inf, -1
-    for k in range(3):
-        ex, ey, e = edge(corners, k, sign)
-        slope = ex * dx + ey * dy
-        if k != came and slope < 0 and -(ex * x + ey * y + e) / slope < best:
-            best, out = -(ex * x + ey * y + e) / slope, k
-    return best, out
-
-
-@compiled
 def _opposite(faces, t, i, j):
     """The corner of triangle t that is neither i nor j."""
     for k in range(3):
@@ -97,26 +85,69 @@ def _opposite(faces, t, i, j):
 
 
 @compiled
-def _walked(t, x, y, dx, dy, rows, vertices, faces, beyond, corners, other):
-    """Walk from triangle to triangle along a line, until the sheet ends, turns away, or the line ends.
+def _beside(v, axis, at, rows, vertices, corner):
+    """Fill `corner` with a vertex's position along a line of centres, times w; its distance from the line; and w."""
+    x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
+    along, across = axis, 1 - axis
+    w = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3]
+    corner[0] = rows[along, 0] * x + rows[along, 1] * y + rows[along, 2] * z + rows[along, 3]
+    corner[1] = rows[across, 0] * x + rows[across, 1] * y + rows[across, 2] * z + rows[across, 3] - at * w
+    corner[2] = w
 
-    Returns the share of the line that lies on the sheet, the depth there, and the last triangle.
+
+@compiled
+def _meets(a, b):
+    """Where an edge between two corners, on both sides of a line, meets the line."""
+    return (a[0] * b[1] - b[0] * a[1]) / (a[2] * b[1] - b[2] * a[1])
+
+
+@compiled
+def _walked(t, start, axis, at, rows, vertices, faces, beyond, corners):
+    """The triangle that a walk from triangle to triangle, a cell along a line of centres, ends on.
+
+    It ends before that, with −1, where the sheet ends or turns away.
+
+    Args:
+        t: the first triangle, which the line meets at `start`.
+        start: where the walk starts, along the line.
+        axis: 0 for lines along x, 1 along y.
+        at: the line's place along the other axis.
+        rows: (4, 4), see `corners_of`.
+        vertices: (V, 3).
+        faces: (T, 3).
+        beyond: (T, 3).
+        corners: (3, 3), room for corners.
     """
-    sign, at, came = corners_of(t, rows, vertices, faces, corners), 0.0, -1
+    for c in range(3):
+        _beside(faces[t, c], axis, at, rows, vertices, corners[c])
+    out, place = -1, -np.inf
+    for c in range(3):
+        a, b = corners[(c + 1) % 3], corners[(c + 2) % 3]
+        if (a[1] >= 0) != (b[1] >= 0) and _meets(a, b) > place:
+            out, place = c, _meets(a, b)
+    if out < 0:
+        return np.int32(-1)
+    # The edge that the line goes out through: its vertices, and the places of their corners.
+    a, b, third = (out + 1) % 3, (out + 2) % 3, out
+    first, second = faces[t, a], faces[t, b]
     for _ in range(STEPS):
-        leave, out = _leaves(corners, sign, came, x, y, dx, dy)
-        at = min(max(at, leave), 1.0)
-        s = np.int32(-1) if at == 1 else beyond[t, out]
+        if place >= start + 1:
+            return t
+        s = beyond[t, out]
         if s < 0:
-            break
-        turned = corners_of(s, rows, vertices, faces, other)
-        back = _opposite(faces, s, faces[t, (out + 1) % 3], faces[t, (out + 2) % 3])
-        ex, ey, _ = edge(other, back, turned)
-        if not ex * dx + ey * dy > 0:
-            break  # The sheet turns away: its next triangle lies on the same side of the edge.
-        t, sign, came = s, turned, back
-        corners, other = other, corners
-    return at, _depth(corners, sign, x + at * dx, y + at * dy)[0], t
+            return np.int32(-1)
+        k = _opposite(faces, s, first, second)
+        _beside(faces[s, k], axis, at, rows, vertices, corners[third])
+        # The corner on the other side of the line than the third one stays.
+        if (corners[a, 1] >= 0) != (corners[third, 1] >= 0):
+            b, third, second = third, b, faces[s, k]
+        else:
+            a, third, first = third, a, faces[s, k]
+        before, place = place, _meets(corners[a], corners[b])
+        if place < before:
+            return np.int32(-1)  # The triangle lies on the same side of the edge: the sheet turns away.
+        t, out = s, _opposite(faces, s, first, second)
+    return np.int32(-1)
 
 
 @compiled
@@ -146,7 +177,7 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
         beyond: (T, 3), the result of `neighbours`.
         joined: (2, H, W) bool to fill: along x, and along y.
     """
-    (height, width), corners, other = part.shape, np.empty((3, 4)), np.empty((3, 4))
+    (height, width), corners, edges = part.shape, np.empty((3, 4)), np.empty((3, 3))
     for y in range(first, last):
         for x in range(width):
             if part[y, x] != own:
@@ -155,13 +186,17 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
                 dx, dy = 1 - axis, axis
                 if x + dx == width or y + dy == height or part[y + dy, x + dx] != own:
                     continue
-                t, s, whole = triangle[y, x], triangle[y + dy, x + dx], True
+                t, s = triangle[y, x], triangle[y + dy, x + dx]
+                end = t
                 if t != s:
-                    at, z, end = _walked(t, x + 0.5, y + 0.5, dx, dy, rows, vertices, faces, beyond, corners, other)
+                    start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
+                    end = _walked(t, start, axis, at, rows, vertices, faces, beyond, edges)
+                joined[axis, y, x] = end == s
+                if end >= 0 and end != s and _touch(faces, end, s):
                     # Rounding may tell neighbours apart; sheets that pass through one another share no corner.
-                    there = depth[y + dy, x + dx]
-                    whole = at == 1 and (end == s or (abs(z - there) <= 1e-5 * there and _touch(faces, end, s)))
-                joined[axis, y, x] = whole
+                    sign, there = corners_of(end, rows, vertices, faces, corners), depth[y + dy, x + dx]
+                    z = _depth(corners, sign, x + dx + 0.5, y + dy + 0.5)[0]
+                    joined[axis, y, x] = abs(z - there) <= 1e-5 * there
 
 
 @loop

@@ -340,8 +340,11 @@ def _kind(spans, parts, own, a, b, depth, place):
     zb = _z(spans, b, place) if b >= 0 else depth[1]
     if abs(za - zb) > ALIKE * max(za, zb):
         return 0 if za < zb else 1
-    ends = a < 0 or (spans[a, 1] <= place + TOUCH and not _goes_on(spans, parts, own, a, place, 1))
-    starts = b < 0 or (spans[b, 0] >= place - TOUCH and not _goes_on(spans, parts, own, b, place, 0))
+    # What is seen at a centre goes on beyond it.
+    ends = a >= 0 and spans[a, 1] < 1 and spans[a, 1] <= place + TOUCH
+    ends = ends and not _goes_on(spans, parts, own, a, place, 1)
+    starts = b >= 0 and spans[b, 0] > 0 and spans[b, 0] >= place - TOUCH
+    starts = starts and not _goes_on(spans, parts, own, b, place, 0)
     if ends != starts:
         return 0 if ends else 1
     return 3 if ends else 2

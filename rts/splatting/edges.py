@@ -31,7 +31,7 @@ from rts.splatting.layers import check_rows, nothing, unpack
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
-BORDER = 2e-4
+BORDER = 1e-3
 """Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
 
 
@@ -435,7 +435,7 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None)
     outlines, g = Outlines(*arrays), read_only(g)
     weights = kept or _Weights.of(outlines)
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
-    loops.pull_inside(0, len(row), rgba, row, outlines.joined, g, g_positions, g_rgba)
+    loops.pull_inside(rgba, row, outlines.joined, g, g_positions, g_rgba)
     count, steady = len(weights.shown), _jumps(rgba, weights)
     g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
     segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux

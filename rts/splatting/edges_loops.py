@@ -208,20 +208,28 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
 
 
 @compiled
-def _slope(rgba, row, joined, y, x, axis, c):
+def _around(row, joined, y, x, around):
+    """Fill `around` with the samples of the next cells to the left and right, above and below; see `_slope`.
+
+    Where the next cell shows another surface, the cell's own sample stands in.
+    """
+    n = row[y, x]
+    around[0] = row[y, x - 1] if x > 0 and joined[0, y, x - 1] else n
+    around[1] = row[y, x + 1] if joined[0, y, x] else n
+    around[2] = row[y - 1, x] if y > 0 and joined[1, y - 1, x] else n
+    around[3] = row[y + 1, x] if joined[1, y, x] else n
+
+
+@compiled
+def _slope(rgba, around, axis, c):
     """The slope of a channel at a cell: the mean of the differences from and to the next cells of the same surface."""
-    own, total = rgba[row[y, x], c], 0.0
-    if joined[axis, y, x]:
-        total += rgba[row[y + axis, x + 1 - axis], c] - own
-    by, bx = y - axis, x - (1 - axis)
-    if by >= 0 and bx >= 0 and joined[axis, by, bx]:
-        total += own - rgba[row[by, bx], c]
-    return total / 2
+    return (rgba[around[2 * axis + 1], c] - rgba[around[2 * axis], c]) / 2
 
 
 @loop
 def inside(first, last, positions, rgba, row, joined, out):
     """Fill lines `first` to `last` of `out` (H, W, C): colours of cells, moved along their slopes."""
+    around = np.empty(4, np.int32)
     for y in range(first, last):
         for x in range(row.shape[1]):
             n = row[y, x]
@@ -229,46 +237,47 @@ def inside(first, last, positions, rgba, row, joined, out):
                 out[y, x] = 0.0
                 continue
             mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
+            _around(row, joined, y, x, around)
             for c in range(rgba.shape[1]):
-                value = rgba[n, c]
-                for axis in range(2):
-                    move = mx if axis == 0 else my
-                    if move != 0:
-                        value -= _slope(rgba, row, joined, y, x, axis, c) * move
-                out[y, x, c] = value
+                out[y, x, c] = rgba[n, c] - _slope(rgba, around, 0, c) * mx - _slope(rgba, around, 1, c) * my
 
 
 @loop
 def push_inside(first, last, rgba, row, joined, t_positions, t_rgba, out):
     """Fill lines of `out` (H, W, C) with the derivative of `inside` along tangents; empty ones are zeros."""
+    around = np.empty(4, np.int32)
     for y in range(first, last):
         for x in range(row.shape[1]):
             n = row[y, x]
             for c in range(rgba.shape[1]):
                 out[y, x, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
-                if n < 0 or not len(t_positions):
-                    continue
-                for axis in range(2):
-                    if t_positions[n, axis] != 0:
-                        out[y, x, c] -= _slope(rgba, row, joined, y, x, axis, c) * t_positions[n, axis]
+            if n < 0 or not len(t_positions):
+                continue
+            mx, my = t_positions[n, 0], t_positions[n, 1]
+            _around(row, joined, y, x, around)
+            for c in range(rgba.shape[1]):
+                out[y, x, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
 
 
 @loop
-def pull_inside(first, last, rgba, row, joined, g, g_positions, g_rgba):
-    """Add to gradients of samples those of `inside`, in lines of cells; empty ones are not wanted."""
-    for y in range(first, last):
+def pull_inside(rgba, row, joined, g, g_positions, g_rgba):
+    """Add to gradients of samples those of `inside`; empty ones are not wanted."""
+    around = np.empty(4, np.int32)
+    for y in range(row.shape[0]):
         for x in range(row.shape[1]):
             n = row[y, x]
             if n < 0:
                 continue
-            for c in range(rgba.shape[1]):
-                if g[y, x, c] == 0:
-                    continue
-                if len(g_rgba):
+            if len(g_rgba):
+                for c in range(rgba.shape[1]):
                     g_rgba[n, c] += g[y, x, c]
-                if len(g_positions):
-                    for axis in range(2):
-                        g_positions[n, axis] -= _slope(rgba, row, joined, y, x, axis, c) * g[y, x, c]
+            if len(g_positions):
+                _around(row, joined, y, x, around)
+                for axis in range(2):
+                    total = 0.0
+                    for c in range(rgba.shape[1]):
+                        total += _slope(rgba, around, axis, c) * g[y, x, c]
+                    g_positions[n, axis] -= total
 
 
 @compiled
