@@ -146,11 +146,13 @@ class _Found(TriangleSampler):
         """Take the fragments (1, 1, M) at all points to come."""
         self._fragments = fragments
 
-    def rasterize(self, *_: Any) -> Fragments:
+    def rasterize(self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """Nothing but points is asked for."""
         raise NotImplementedError
 
-    def rasterize_points(self, *_: Any) -> Fragments:
+    def rasterize_points(
+        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
+    ) -> Fragments:
         """The fragments."""
         return self._fragments
 

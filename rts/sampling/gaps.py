@@ -166,9 +166,7 @@ def _ends(gap: np.ndarray, fronts: Fronts) -> tuple[Fronts, Fronts, np.ndarray, 
     """The fronts at both centres of gaps (M, 3), the first centres (M, 2), and steps (M, 2) to the others."""
     y, x, axis = gap.T
     step = np.column_stack([axis == 1, axis == 0])
-    first, second = (
-        Fronts(*(table[y + k * step[:, 1], x + k * step[:, 0]] for table in fronts)) for k in (0, 1)
-    )
+    first, second = (Fronts(*(table[y + k * step[:, 1], x + k * step[:, 0]] for table in fronts)) for k in (0, 1))
     return first, second, np.column_stack([x, y]) + 0.5, step.astype(float)
 
 

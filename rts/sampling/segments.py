@@ -174,4 +174,3 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles (S,) between vectors (S, 2), 0 to π."""
     return np.abs(np.arctan2(_cross(a, b), (a * b).sum(1)))
-

@@ -101,9 +101,7 @@ def _slopes(whole: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]) -> 
     return slopes
 
 
-def _crossings(
-    whole: np.ndarray, slope: np.ndarray, fronts: Fronts, gap: np.ndarray, width: np.ndarray
-) -> np.ndarray:
+def _crossings(whole: np.ndarray, slope: np.ndarray, fronts: Fronts, gap: np.ndarray, width: np.ndarray) -> np.ndarray:
     """`Breaks.near`, where surfaces that hardly differ in slope are not said to cross."""
     cell = width[0] + width[1] * fronts.depth[gap[:, 0], gap[:, 1]]
     flat = ~(np.abs(slope[:, 1] - slope[:, 0]).sum(-1) > 1e-4 * cell)

@@ -22,17 +22,15 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
-from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Outlines, Splats
 from rts.contracts.splatter import Splatter
-from rts.operations.operation import Arrays, Operation, Some
+from rts.operations.operation import Operation
+from rts.splatting import edges_weights
+from rts.splatting.edges_weights import BORDER
 from rts.splatting.layers import check_rows, nothing, unpack
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
-
-BORDER = 1e-3
-"""Width, in cells, of the strip along a border of two pixels in which an edge belongs to both."""
 
 
 class Edges(Splatter):
@@ -332,146 +330,18 @@ def _beside_breaks(
     return parts
 
 
-# ------------------------------------------------------------------------------------------------------ compiled
-
-
-class _Weights(NamedTuple):
-    """The weights of colours and motions in the image, from outlines alone; see `rts.splatting.edges_loops`.
-
-    Attributes:
-        shown: (B, 2) int32, the samples that tell colours before and behind breaks, or −1.
-        points: (B, 2, 2), x and y of the last samples.
-        moves: (B, 2, 3, 2).
-        share: (S, 4, 2).
-        flux: (S, 4, 2, 4, 2).
-        cells: (B, 2, 3) int32.
-        sides: (B, 2, 5).
-    """
-
-    shown: np.ndarray
-    points: np.ndarray
-    moves: np.ndarray
-    share: np.ndarray
-    flux: np.ndarray
-    cells: np.ndarray
-    sides: np.ndarray
-
-    @classmethod
-    def of(cls, outlines: Outlines) -> _Weights:
-        """The weights of outlines on the host."""
-        from rts.splatting import edges_loops as loops
-
-        count, segments, gap = len(outlines.place), len(outlines.square), outlines.gap
-        shown = np.where(outlines.inner >= 0, outlines.inner, outlines.rows)
-        step = np.stack([gap[:, 2], 1 - gap[:, 2]], axis=1)
-        points = gap[:, None, 1::-1] + 0.5 + np.asarray(outlines.points, np.float64)[..., None] * step[:, None]
-        moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
-        path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
-        loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
-        ties = outlines.ties
-        known = outlines.place, gap, outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER
-        parallel(loops.weigh_segments, segments, *known, path, share, flux, work=400 * segments)
-        seen, normal = outlines.rows >= 0, np.empty((count, 2))
-        arrays = outlines.place, gap, outlines.ends, seen, ties, path, outlines.joined, normal, cells, sides
-        loops.weigh_sides(*arrays)
-        return cls(shown, points, moves, share, flux, cells, sides)
-
-
-def _forward(operands: Arrays, out: np.ndarray) -> _Weights:
-    """The value, and the weights, which the derivatives use again."""
-    from rts.splatting import edges_loops as loops
-
-    positions, rgba, row, *arrays = operands
-    outlines = Outlines(*arrays)
-    parallel(loops.inside, len(row), positions, rgba, row, outlines.joined, out, work=10 * out.size)
-    weights = _Weights.of(outlines)
-    steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
-    loops.motions(positions, outlines.rows, weights.points, weights.moves, motion)
-    _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out)
-    return weights
-
-
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | None) -> None:
-    from rts.splatting import edges_loops as loops
-
-    positions, rgba, row, *arrays = operands
-    outlines = Outlines(*arrays)
-    weights = kept or _Weights.of(outlines)
-    t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
-    parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
-    steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown) if len(t_positions) else 0, 2))
-    if len(t_positions):
-        loops.motions(t_positions, outlines.rows, NOWHERE, weights.moves, motion)
-    jump = _jumps(t_rgba, weights) if len(t_rgba) else np.empty((0, out.shape[2]))
-    _add(outlines, weights, row, (t_rgba, t_positions, NOWHERE), (rgba, jump, steady, motion), out)
-
-
-def _add(
-    outlines: Outlines, weights: _Weights, row: np.ndarray, samples: Arrays, jumps: Arrays, out: np.ndarray
-) -> None:
-    """Add the changes at outlines to an image.
-
-    Args:
-        outlines: on the host.
-        weights: of these outlines.
-        row: (H, W).
-        samples: colours and positions, or their tangents, and points, or none; see `edges_loops.add_sides`.
-        jumps: constant colours; jumps, constant jumps and motions, see `edges_loops.add_segments`.
-        out: (H, W, C).
-    """
-    from rts.splatting import edges_loops as loops
-
-    (rgba, positions, points), (steady, *at_breaks) = samples, jumps
-    segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux
-    loops.add_segments(*segments, *at_breaks, out)
-    sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
-    loops.add_sides(*sides, steady, rgba, positions, points, out)
-
-
-def _pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) -> None:
-    from rts.splatting import edges_loops as loops
-
-    positions, rgba, row, *arrays = operands
-    outlines, g = Outlines(*arrays), read_only(g)
-    weights = kept or _Weights.of(outlines)
-    g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
-    loops.pull_inside(rgba, row, outlines.joined, g, g_positions, g_rgba)
-    count, steady = len(weights.shown), _jumps(rgba, weights)
-    g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
-    segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux
-    loops.pull_segments(*segments, steady, g, g_jump, g_motion)
-    if len(g_positions):
-        loops.pull_motions(outlines.rows, weights.moves, g_motion, g_positions)
-    if len(g_rgba):
-        loops.pull_jumps(weights.shown, g_jump, g_rgba)
-    sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
-    loops.pull_sides(*sides, rgba, g, g_rgba, g_positions)
-
-
-def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:
-    """(B, C) colours before breaks, less those behind."""
-    from rts.splatting import edges_loops as loops
-
-    found = np.empty((len(weights.shown), rgba.shape[1]))
-    loops.jumps(rgba, weights.shown, found)
-    return found
-
-
 def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
     return *row, rgba[1]
 
-
-NOWHERE = np.empty((0, 2, 2))
-"""In place of points, for tangents."""
 
 EDGES = Operation(
     "rts.edges",
     _specification,
     ranks=(2, 2, 2, 1, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
     shape=_shape,
-    forward=_forward,
-    push=_push,
-    pull=_pull,
+    forward=edges_weights.forward,
+    push=edges_weights.push,
+    pull=edges_weights.pull,
     differentiable=2,
     packed=(0, 1),
     keeps=True,

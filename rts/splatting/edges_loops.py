@@ -1,7 +1,7 @@
 """The image of `rts.splatting.edges` and its derivatives, by walks along outlines. Compiled.
 
-An image is linear in colours; and, with their values as constants, linear in motions. `weigh` computes the weights once,
-from outlines alone. Then value, pushforward and pullback are sums over cells, breaks and segments.
+An image is linear in colours; and, with their values as constants, linear in motions. The weights follow from outlines
+alone. With them value, pushforward and pullback are sums over cells, breaks and segments.
 """
 
 from __future__ import annotations
