@@ -175,6 +175,37 @@ def test_numpy_draws_what_torch_draws():
     np.testing.assert_allclose(edges(card(corners)), drawn.numpy(), atol=1e-5)
 
 
+def two_colors():
+    """A card whose halves differ in colour, before another one."""
+    x, y = np.array([-7.0, 0, 0, 7]), np.array([-6.0, 6])
+    corners = turned(np.array([(a, b) for a in x for b in y]), 0.3, (12.2, 11.7))
+    faces = np.array([[0, 2, 3], [0, 3, 1], [4, 6, 7], [4, 7, 5]])
+    colors = np.repeat(np.array([[0.9, 0.1, 0.2], [0.1, 0.8, 0.3]], np.float32), 4, axis=0)
+    front = rts.Part(rts.Mesh(faces), {"vertices": flat(corners), "colors": colors}, "unlit")
+    return [front, card(flat(SQUARE * 1.5 + 12, 5.0), (0.2, 0.3, 0.9))]
+
+
+def test_torch_func_draws_and_pushes_what_forward_mode_does():
+    def image(t):
+        along = torch.zeros(4, 4)
+        along[0, 3] = 1.0
+        front, back = two_colors()
+        return edges([front.replace(transform=torch.eye(4) + t * along), back])
+
+    value, derivative = pushed(image)
+    by_func = torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))
+    np.testing.assert_allclose(by_func[0].numpy(), value, atol=1e-6)
+    np.testing.assert_allclose(by_func[1].numpy(), derivative, atol=1e-5)
+
+
+@pytest.mark.thorough
+def test_jax_draws_what_numpy_draws():
+    jax = pytest.importorskip("jax")
+    drawn = edges([part.replace(theta={**part.theta, "vertices": jax.numpy.asarray(part.theta["vertices"])})
+                   for part in two_colors()])  # fmt: skip
+    np.testing.assert_allclose(np.asarray(drawn), edges(two_colors()), atol=1e-5)
+
+
 def test_the_area_of_a_square_that_shifts_has_no_curvature():
     """d² of a pixel's area is 0 but where a corner turns: at most 0.02 px⁻² for each pixel of perimeter."""
     corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
@@ -222,7 +253,7 @@ def test_two_layers_ask_for_no_second_sample():
 
 
 def test_adaptive_samples_are_refused():
-    with pytest.raises(InputError, match="finds outlines without further samples"):
+    with pytest.raises(InputError, match="splatter 'edges' finds outlines without further samples"):
         edges(card(flat(SQUARE + 12)), supersample=rts.Adaptive(4))
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
 from rts.errors import InputError
+from rts.registry import name_of
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned
 
@@ -57,8 +58,8 @@ class RenderSettings:
         splatter = check_splatter(splatter)
         if isinstance(supersample, Adaptive) and "outlines" in splatter.reads:
             raise InputError(
-                f"supersample is {supersample!r}, and {splatter!r} finds outlines without further samples; give 1, or "
-                f"a number of samples along each side of a pixel"
+                f"supersample is {supersample!r}, and splatter {name_of('rts.splatters', splatter)!r} finds outlines "
+                f"without further samples; give 1, or a number of samples along each side of a pixel"
             )
         if splatter.layers is not None:  # More would not be read.
             layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))

@@ -42,7 +42,8 @@ def to_splats(
     height, width, apron = *sampled.row.shape[1:], sampled.apron
     grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
     sampled = _owned(sampled, sampled.row, context)
-    positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, grid, context))
+    beside = sampled.outlines is not None
+    positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, grid, context, beside))
     return _splats(sampled, parts, positions, rgba, context, border=apron)
 
 
@@ -153,6 +154,7 @@ def _shown(
     camera: Camera,
     grid: Grid,
     context: Context,
+    beside: bool = False,
 ) -> tuple[list[Array], list[Array]]:
     """Positions (N, 3) and colours (N, C + 1) of the samples of each part, all of one engine.
 
@@ -163,6 +165,7 @@ def _shown(
         camera: the camera of the whole image, which shaders see.
         grid: the cells of the samples, and their camera.
         context: the engine to compute with, and an exemplar of the results.
+        beside: True if rows behind those of cells are samples, too: those beside outlines.
     """
     inputs, engine = _of_inputs(context), context.engine
     seen = grid.camera.replace(view=inputs.constants(grid.camera.view))
@@ -173,7 +176,8 @@ def _shown(
         local = evaluate(part, samples, inputs)
         own = seen.within(transform)
         add_footprint(part, samples, local, own, grid.size, inputs)
-        world, rgba = shade(part, theta, transform, samples, local, camera, engine)
+        used = _all_in_use(samples, inputs) if beside else samples
+        world, rgba = shade(part, theta, transform, used, local, camera, engine)
         positions.append(context.constants(own.project(_on_rays(samples, local["position"]), grid.size)))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(context.constants(rgba))
@@ -182,6 +186,12 @@ def _shown(
         # A shader may close over arrays of an engine that the scene has none of.
         positions, colors = context_of(positions, colors).constants((positions, colors))
     return positions, colors
+
+
+def _all_in_use(samples: Samples, context: Context) -> Samples:
+    """The samples with cells of their own, one a row, so that no row passes for unused."""
+    every = np.arange(samples.ids.shape[0], dtype=np.int32)[None, None]
+    return replace(samples, cells=replace(samples.cells, row=context.constants(every)))
 
 
 def _shown_in_views(

@@ -77,8 +77,8 @@ class HessianCheck(NamedTuple):
         )
         if not self.ok:
             lines.append(
-                "The weights of splats have a curvature that the area which they cover has not: take Gauss–Newton "
-                '(rts.fit with method="lm"), or differences of gradients.'
+                "Second derivatives by autodiff are those of weights in pixels, not of the areas that these stand for: "
+                'take Gauss–Newton (rts.fit with method="lm"), or differences of gradients.'
             )
         return "\n".join(lines)
 
