@@ -1,7 +1,7 @@
 """Spans: the parts of gaps that triangles cover; and the fronts along gaps, the nearest spans. Compiled.
 
-A place along a gap is a number from 0 to 1, from its first centre to its second. A span is linear in homogeneous
-coordinates there: its depth is (a + b · place) / (c + d · place).
+A place along a gap is a number from 0 to 1, from its first centre to its second. A span may reach beyond both. It is
+linear in homogeneous coordinates there: its depth is (a + b · place) / (c + d · place).
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ def spans_of(triangles, rows, vertices, faces, clip, keep, number):
                     gap = number[axis, n, m] if axis == 0 else number[axis, m, n]
                     if gap < 0:
                         continue
-                    start, end = max(low - 0.5 - m, 0.0), min(high - 0.5 - m, 1.0)
-                    if end - start <= TINY:
+                    start, end = low - 0.5 - m, high - 0.5 - m
+                    if min(end, 1.0) - max(start, 0.0) <= TINY:
                         continue
                     names, spans = _room(names, count + 1), _room(spans, count + 1)
                     names[count, 0], names[count, 1] = gap, t
@@ -282,6 +282,8 @@ def fronts(first, last, begins, order, spans, names, parts, ends, end_depth, pie
         own = order[begins[g] : begins[g + 1]]
         base, room, n = 2 * begins[g] + 4 * g, 2 * len(own) + 3, 0
         place, x = 0.0, NOTHING
+        for k in range(2):
+            _agree(spans, own, ends[g, k, 0] >= 0, end_depth[g, k], k)
         if ends[g, 0, 0] >= 0:
             x = FIRST
             for i in own:
@@ -299,7 +301,7 @@ def fronts(first, last, begins, order, spans, names, parts, ends, end_depth, pie
                 x = _nearest(spans, own, 0.0, TINY)
             else:
                 place, by = _overtaken(spans, own, x, place)
-                if by < 0 and place >= 1 - TOUCH:
+                if place >= (1 - TOUCH if by < 0 else 1.0):
                     break
                 x = by if by >= 0 else _nearest(spans, own, place, TOUCH)
         # The sample at the second centre has the last word.
@@ -308,7 +310,19 @@ def fronts(first, last, begins, order, spans, names, parts, ends, end_depth, pie
         if not known and not (x == NOTHING and last_part < 0):
             pieces[base + n], starts[base + n] = (SECOND if last_part >= 0 else NOTHING), 1.0
             n += 1
+            # The line runs along an edge that both samples are on: nothing ends there.
+            if pieces[base] == FIRST and last_part == ends[g, 0, 0]:
+                n = 1
         counts[g] = n
+
+
+@compiled
+def _agree(spans, own, seen, depth, centre):
+    """Empty the spans that reach over a centre before what is seen there: they touch the line with an edge alone."""
+    for i in own:
+        if spans[i, 0] < centre - TOUCH and spans[i, 1] > centre + TOUCH:
+            if not seen or _z(spans, i, centre) < (1 - ALIKE) * depth:
+                spans[i, 0], spans[i, 1] = 9.0, 9.0
 
 
 @compiled
@@ -341,9 +355,9 @@ def _kind(spans, parts, own, a, b, depth, place):
     if abs(za - zb) > ALIKE * max(za, zb):
         return 0 if za < zb else 1
     # What is seen at a centre goes on beyond it.
-    ends = a >= 0 and spans[a, 1] < 1 and spans[a, 1] <= place + TOUCH
+    ends = a >= 0 and spans[a, 1] <= place + TOUCH
     ends = ends and not _goes_on(spans, parts, own, a, place, 1)
-    starts = b >= 0 and spans[b, 0] > 0 and spans[b, 0] >= place - TOUCH
+    starts = b >= 0 and spans[b, 0] >= place - TOUCH
     starts = starts and not _goes_on(spans, parts, own, b, place, 0)
     if ends != starts:
         return 0 if ends else 1
@@ -406,8 +420,8 @@ def breaks(begins, order, spans, names, parts, ends, end_depth, pieces, starts, 
                 whole[count, 5] = names[y, 1] if y >= 0 else ends[g, 1, 1]
                 whole[count, 8], whole[count, 9] = count == begun, 0
                 numbers[count, 0] = place
-                numbers[count, 1] = min(max(place - fine, spans[x, 0]), place) if x >= 0 else place
-                numbers[count, 2] = max(min(place + fine, spans[y, 1]), place) if y >= 0 else place
+                numbers[count, 1] = min(max(place - fine, spans[x, 0], 0.0), place) if x >= 0 else place
+                numbers[count, 2] = max(min(place + fine, spans[y, 1], 1.0), place) if y >= 0 else place
                 count += 1
             a = n
         if count > begun:

@@ -343,7 +343,6 @@ EDGES = Operation(
     push=edges_weights.push,
     pull=edges_weights.pull,
     differentiable=2,
-    packed=(0, 1),
     keeps=True,
 )
 """The image (H, W, C) of positions (N, 3), colours (N, C), `row` (H, W), and the fields of `Outlines`."""
