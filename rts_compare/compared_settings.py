@@ -66,6 +66,16 @@ def as_text(supersample: Adaptive) -> str:
     return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
 
 
+def combine(splatter: str, supersample: int | str) -> bool:
+    """False for an `rts.Adaptive` beside a splatter that finds outlines without further samples.
+
+    Args:
+        splatter: its name.
+        supersample: as `Setting.supersample`.
+    """
+    return isinstance(supersample, int) or "outlines" not in plugin("rts.splatters", splatter)().reads
+
+
 def finest(supersample: Any) -> Any:
     """Samples along a side of a pixel: of an `rts.Adaptive` those where they are finest; all else is returned as is."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample

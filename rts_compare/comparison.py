@@ -17,7 +17,7 @@ from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
-from rts_compare.compared_settings import Setting, as_text, finest, usable, worth_timing
+from rts_compare.compared_settings import Setting, as_text, combine, finest, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
 from rts_compare.interleaved_timing import ROUNDS, Calls, InterleavedTiming
@@ -198,6 +198,11 @@ def compare(
     if not is_count(truth_samples):
         raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     names, without = usable("rts.splatters", splatters)
+    if not any(combine(name, samples) for name in names for samples in samples_a_pixel):
+        raise InputError(
+            f"supersample is {quoted(supersample)}, and {', '.join(names)} finds outlines without further samples; "
+            f"give whole numbers, too, or another splatter"
+        )
     possible, missing = usable("rts.samplers", samplers)
     used, failing = engines_for(found, engines)
     earlier = _earlier(folder, found, fresh)

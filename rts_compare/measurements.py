@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from rts import Camera, Engine, Part, explain, namespace, plugin, render, sample
+from rts import Camera, Engine, Part, explain, namespace, render, sample
 from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError, RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
-from rts_compare.compared_settings import Setting
+from rts_compare.compared_settings import Setting, combine
 from rts_compare.derivative_scores import loss_weights, relative_l2, scores
 from rts_compare.interleaved_timing import LONGEST, Calls, InterleavedTiming
 from rts_compare.kept_measurements import KeptMeasurements
@@ -311,7 +311,7 @@ class Measurements:
             for rate in (self.at_rates(group) if rates else [""])
             for supersample in samples
             for splatter in splatters
-            if isinstance(supersample, int) or "outlines" not in plugin("splatters", splatter)().reads
+            if combine(splatter, supersample)
             for count in layers
         )
         return [setting for setting in all_of if self.counting(group, setting) is not None]

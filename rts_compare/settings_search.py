@@ -279,7 +279,10 @@ class Search:
     def _timed(self, settings: Sequence[Setting], turns: int = 1) -> dict[Setting, float]:
         """Setting → median seconds; without settings that fail, or whose turn comes after the deadline."""
         calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
-        timed = self.measured.timing(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
+        timing = self.measured.timing(TOGETHER, calls)
+        timed = timing.run(turns, late=self._over, hopeless=SLOWER)
+        lines = [f"{', '.join(str(v) for v in s if v != '')}: {why}" for s, why in timing.failed.items()]
+        self.measured.left_out += [line for line in lines if line not in self.measured.left_out]
         return {Setting(*s): ms["median"] / 1e3 for s, ms in timed.items()}
 
     def _fastest(self, settings: Sequence[Setting]) -> Setting:

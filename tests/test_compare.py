@@ -482,6 +482,19 @@ def modelled(monkeypatch):
     return cost
 
 
+class TestFoundEdges:
+    def test_no_adaptive_samples_beside_them_alone(self):
+        with pytest.raises(InputError, match=r"edges finds outlines without further samples; give whole numbers"):
+            compare(scene("translation"), splatters=["edges"], supersample=[rts.Adaptive(4)], progress=False)
+
+    @pytest.mark.thorough
+    def test_why_a_search_could_time_nothing(self, kept):
+        pytest.importorskip("jax")
+        options = dict(splatters=["edges"], samplers=["raster"], engine="jax", size=(16, 16), truths=kept, **TRUTH)
+        with pytest.raises(InputError, match=r"nothing could be timed: edges, 1, 1.*these samples are traced"):
+            tune(scene("translation"), budget_s=5, **options)
+
+
 class TestTune:
     @pytest.mark.parametrize("tolerance", [0.6, 0.1])
     @pytest.mark.thorough

@@ -108,12 +108,7 @@ def reversed_twice(loss, at):
     return torch.stack([torch.autograd.grad(g, at, retain_graph=True)[0] for g in first])
 
 
-VARYING = pytest.mark.xfail(
-    strict=True, reason="under torch.func, colours beside breaks are those of unused rows (rts/rendering/shade.py)"
-)
-
-
-@pytest.mark.parametrize("shader", ["unlit", pytest.param("normals", marks=VARYING)])
+@pytest.mark.parametrize("shader", ["unlit", "normals"])
 def test_torch_func_sees_the_loss_that_is_drawn(shader):
     loss, zero = hexagonal(shader)
     value, _ = torch.func.jvp(loss, (zero,), (torch.ones_like(zero),))
@@ -135,7 +130,7 @@ def test_torch_func_sees_the_loss_that_is_drawn(shader):
 )
 @pytest.mark.thorough
 def test_second_derivatives_by_torch_func_are_those_of_reverse_mode_twice(transform):
-    loss, zero = hexagonal("unlit")
+    loss, zero = hexagonal("normals")
     found, expected = transform(loss)(zero), reversed_twice(loss, zero)
     assert float(expected.abs().max()) > 1
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)

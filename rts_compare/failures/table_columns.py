@@ -27,6 +27,7 @@ METHODS = (
     Method("visible", {"splatter": "visible", "layers": 2}),
     Method("visible, auto", {"splatter": "visible", "layers": "auto"}),
     Method("visible, 2 × 2", {"splatter": "visible", "layers": 2, "supersample": 2}),
+    Method("edges", {"splatter": "edges"}),
     Method("DEODR", {}, "DEODR"),
     Method("Mitsuba", {"spp": 16}, "Mitsuba"),
 )

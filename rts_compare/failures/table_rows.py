@@ -23,6 +23,7 @@ GRID = (
 NO_EDGES = "`none` has no derivative at outlines, by construction."
 ONE_LAYER = "`single` knows nothing of what lies behind."
 OPAQUE_ALONE = "`single` and `multi` take layers to be opaque."
+FRONT_ALONE = "`edges` shows the front alone."
 THIN = "What is thinner than a pixel is met by some rays only, and nothing tells of it between them: more samples help."
 COARSE = "An error of one sample a pixel, which tells only between which two centres an edge is: more samples help."
 
@@ -85,7 +86,7 @@ ROWS: tuple[Row, ...] = (
         "pane of glass",
         f"It lets half of the light through, and slides over a card. {ERROR}",
         Derivative(failure_scenes.pane, pixel=1.0),
-        f"{NO_EDGES} {OPAQUE_ALONE}",
+        f"{NO_EDGES} {OPAQUE_ALONE} {FRONT_ALONE}",
     ),
     Row(
         "card behind glass",
