@@ -43,35 +43,42 @@ def check_numbers(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
     Returns:
         The value as NumPy; None if it is traced, or batched by `vmap`.
     """
-    expected = " or ".join("a number" if s == () else str(s) for s in shapes)
-    wrong = InputError(f"{name} is {quoted(value)}; expected {'' if () in shapes else 'numbers of shape '}{expected}")
-    if not all(isinstance(x, CONSTANT_TYPES) or hasattr(x, "dtype") for x in leaves(value)):
-        raise wrong
-    try:
-        shape, dtype = _shape_and_dtype(value)
-    except ValueError:  # Rows of different lengths.
-        raise wrong from None
-    if dtype == np.dtype(object):
-        raise wrong
+    found = _shape_and_dtype(value)
+    if found is None:
+        what = _either(shapes) if () in shapes else f"numbers of shape {_either(shapes)}"
+        raise InputError(f"{name} is {quoted(value)}; expected {what}")
+    shape, dtype = found
     if not namespace(value).isdtype(dtype, ("real floating", "integral")):
         raise InputError(f"{name} has dtype {dtype}; expected real numbers")
     if shape not in shapes:
         fault = f"is {quoted(value)}" if shape == () else f"has shape {shape}"
-        raise InputError(f"{name} {fault}; expected {expected}")
+        raise InputError(f"{name} {fault}; expected {_either(shapes)}")
     array = value_of(value)
     if array is not None and not np.isfinite(array).all():
         raise InputError(f"{name} is {quoted(array)}; expected finite numbers")
     return None if array is None or array.shape != shape else array
 
 
-def _shape_and_dtype(value: Any) -> tuple[Shape, Any]:
-    if is_constant(value):
-        array = np.asarray(value)
-        return array.shape, array.dtype
-    if isinstance(value, (list, tuple)):  # For example a camera's eye of traced scalars.
-        first = next(x for x in leaves(value) if not isinstance(x, CONSTANT_TYPES))
-        return (len(value), *{shape_of(x) for x in value}.pop()), first.dtype
-    return shape_of(value), value.dtype
+def _either(shapes: tuple[Shape, ...]) -> str:
+    return " or ".join("a number" if s == () else str(s) for s in shapes)
+
+
+def _shape_and_dtype(value: Any) -> tuple[Shape, Any] | None:
+    """The shape and dtype of an array, number or list of numbers; None for anything else."""
+    if not all(isinstance(x, CONSTANT_TYPES) or hasattr(x, "dtype") for x in leaves(value)):
+        return None
+    try:
+        if is_constant(value):
+            array = np.asarray(value)
+            shape, dtype = array.shape, array.dtype
+        elif isinstance(value, (list, tuple)):  # For example a camera's eye of traced scalars.
+            first = next(x for x in leaves(value) if not isinstance(x, CONSTANT_TYPES))
+            shape, dtype = (len(value), *{shape_of(x) for x in value}.pop()), first.dtype
+        else:
+            shape, dtype = shape_of(value), value.dtype
+    except ValueError:  # Rows of different lengths.
+        return None
+    return None if dtype == np.dtype(object) else (shape, dtype)
 
 
 def check_flag(name: str, value: Any) -> None:

@@ -18,7 +18,7 @@ from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import operations, torch_internals
-from rts_backends.torch_engine.functions import applied, foreign, quiet_forward_mode, tangent_alike, transformed
+from rts_backends.torch_engine.functions import foreign, quiet_forward_mode, tangent_alike, transformed
 
 for _cls, _split, _join in Engine.records():
     _pytree.register_pytree_node(_cls, _split, _join, serialized_type_name=f"rts.{_cls.__name__}")
@@ -77,7 +77,7 @@ class _HostCall(torch.autograd.Function):
         def select(b):
             return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
 
-        items = [applied(_HostCall, fn, specs, *select(b)) for b in range(info.batch_size)]
+        items = [_HostCall.apply(fn, specs, *select(b)) for b in range(info.batch_size)]
         outputs = []
         for spec, values in zip(specs, zip(*items, strict=True), strict=True):
             if spec.packed:
@@ -114,8 +114,8 @@ class TorchEngine(Engine):
         """
         if torch.compiler.is_compiling():
             # torch annotates nothing of what `disable` returns.
-            return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)  # pyright: ignore[reportCallIssue]
-        return applied(_HostCall, fn, specs, *args)
+            return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
+        return _HostCall.apply(fn, specs, *args)
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
@@ -168,16 +168,13 @@ class TorchEngine(Engine):
         """The value of `x` as NumPy, for all items of a batch; None under `torch.compile`, or for `foreign` tensors."""
         if torch.compiler.is_compiling() or foreign(x):
             return None
-        if not torch_internals.transforms_active():
+        if torch_internals.current_level() is None:
             return _to_host(x)
-        while torch_internals.is_wrapped(x):
-            x = torch_internals.get_unwrapped(x)
-        with torch_internals.untransformed():  # Else what is made of it would be wrapped.
-            return _to_host(x)
+        return torch_internals.value_within(x, _to_host)
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under a `torch.func` transform: under `torch.vmap` all items have as many rows as the longest."""
-        return torch_internals.maybe_current_level() is not None
+        return torch_internals.current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
         """See `Engine.fill_unused`: by selection; all rows become ones if no row is in use."""
@@ -216,13 +213,10 @@ class TorchEngine(Engine):
     def _repeated(body: Callable, going: Callable, state: Tree, most: int) -> Tree:
         for _ in range(most):
             on = going(state)
-            whole = on
-            while torch_internals.is_wrapped(whole):
-                whole = torch_internals.get_unwrapped(whole)
-            if not bool(whole.any()):
+            any_on, batched = torch_internals.value_within(on, lambda whole: (bool(whole.any()), whole.ndim > 0))
+            if not any_on:
                 break
             new = iter(list(leaves(body(state))))
-            batched = whole.ndim > 0
             state = map_leaves(lambda x, on=on, b=batched: torch.where(on, next(new), x) if b else next(new), state)  # noqa: B023
         return state
 

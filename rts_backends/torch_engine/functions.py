@@ -15,24 +15,11 @@ from torch.utils import _pytree
 from rts_backends.torch_engine import torch_internals
 
 
-def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
-    """The result of `function.apply(*args)`, with all arguments given.
-
-    Outside of transforms this spares torch's search for defaults, which takes longer than a small loop.
-    """
-    if torch_internals.transforms_active():
-        return function.apply(*args)
-    # What torch does with all arguments, in one loop.
-    arguments = [torch_internals.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
-    # Torch's stubs leave out the class above `Function`.
-    return super(torch.autograd.Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def transformed() -> bool:
     """True under a `torch.func` transform, in forward mode, or while `torch.compile` traces."""
     if torch.compiler.is_compiling() or torch_internals.forward_level() >= 0:
         return True
-    return torch_internals.maybe_current_level() is not None
+    return torch_internals.current_level() is not None
 
 
 _loaded: list[bool] = []
@@ -72,12 +59,7 @@ def tangent_alike(x: Tensor) -> Tensor:
 
 def on_host(x: Tensor) -> np.ndarray:
     """The value of a tensor in the memory of the host: a view, or new zeros for torch's zeros without memory."""
-    x = x.detach()
-    # Zeros that torch's forward mode makes up have no memory.
-    return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if torch_internals.is_zero(x) else x.numpy()
-
-
-_NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
+    return x.numpy(force=True)  # Forward mode makes up zeros without memory, which NumPy gets by force alone.
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:

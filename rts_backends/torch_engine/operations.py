@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, applied, foreign, on_host
+from rts_backends.torch_engine.functions import along, foreign, on_host
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -31,7 +31,7 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
     # Repeated rows are written out once, and not for each derivative anew.
-    return applied(_Value, _Call(operation, params), *[x.contiguous() for x in operands])
+    return _Value.apply(_Call(operation, params), *[x.contiguous() for x in operands])
 
 
 class _Specifying(threading.local):
@@ -161,7 +161,7 @@ class _Value(torch.autograd.Function):
             varied, fixed = call.split(operands)
             found = call.pulled(wanted, fixed)(*varied, gradients[0])
         else:
-            found = applied(_Pull, call, wanted, *operands, gradients[0])
+            found = _Pull.apply(call, wanted, *operands, gradients[0])
         found = (x if wish else None for x, wish in zip(found, wanted, strict=True))
         return None, *found, *[None] * (len(operands) - call.count)
 
@@ -176,13 +176,13 @@ class _Value(torch.autograd.Function):
         if foreign(*tangents):
             varied, fixed = call.split(operands)
             return call.pushed(present, fixed)(*varied, *there)[0]
-        return applied(_Push, call, present, *operands, *there)[0]
+        return _Push.apply(call, present, *operands, *there)[0]
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
     def vmap(info, in_dims, call, *operands):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         items = _items(info, in_dims[1:], operands)
-        return torch.stack([applied(_Value, call.another(), *item) for item in items]), 0
+        return torch.stack([_Value.apply(call.another(), *item) for item in items]), 0
 
 
 class _Pull(torch.autograd.Function):
@@ -225,7 +225,7 @@ class _Pull(torch.autograd.Function):
     def vmap(info, in_dims, call, wanted, *given):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         same = all(d is None for d in in_dims[2:-1])
         items = [
-            applied(_Pull, call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], given)
+            _Pull.apply(call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], given)
         ]
         return tuple(torch.stack(x) for x in zip(*items, strict=True)), (0,) * len(wanted)
 
@@ -272,11 +272,11 @@ class _Push(torch.autograd.Function):
         count, dims = sum(present), in_dims[2:]
         if any(d is not None for d in dims[:-count]):
             items = _items(info, dims, given)
-            return torch.stack([applied(_Push, call.another(), present, *item) for item in items]), 0
+            return torch.stack([_Push.apply(call.another(), present, *item) for item in items]), 0
         # The batch is more tangents of the same operands: one sweep for all.
         folded = (
             (t.expand(info.batch_size, *t.shape) if d is None else t.movedim(d, 0)).flatten(0, 1)
             for t, d in zip(given[-count:], dims[-count:], strict=True)
         )
-        out = applied(_Push, call, present, *given[:-count], *folded)
+        out = _Push.apply(call, present, *given[:-count], *folded)
         return out.unflatten(0, (info.batch_size, -1)), 0

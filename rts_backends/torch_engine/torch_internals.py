@@ -1,49 +1,84 @@
-"""Private names of torch, where it has no public ones, and substitutes for a torch without them.
+"""Private names of torch that capabilities need, since it has no public ones, and substitutes for a torch without them.
 
-With the substitutes, the engine works as if a transform were always active: more slowly, through public names alone.
-Values inside of `torch.func` transforms are then unknown.
+- `current_level` tells whether a `torch.func` transform is active. Threads and `checkpoint` are for code outside of
+  transforms, and so are packed rows without padding.
+- `value_within` reads values inside of transforms.
+- `is_legacy_batchedtensor` finds the batches of `torch.autograd.grad(..., is_grads_batched=True)`.
+- `forward_level` tells whether forward mode is on. Tangents then take the dtype of their tensors.
+
+With the substitutes everything works, as if a transform were always active: on one thread, with all arrays kept, and
+each value read takes longer.
 """
 
 from __future__ import annotations
 
-import contextlib
+from collections.abc import Callable
+from typing import Any, TypeVar
 
+import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+_T = TypeVar("_T")
+
 try:
-    from torch._C import _are_functorch_transforms_active as transforms_active
-    from torch._C import _DisableFuncTorch as untransformed
-    from torch._C._functorch import get_unwrapped, is_legacy_batchedtensor, maybe_current_level, unwrap_if_dead
-    from torch._C._functorch import is_functorch_wrapped_tensor as is_wrapped
+    from torch._C import _DisableFuncTorch
+    from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor
+    from torch._C._functorch import maybe_current_level as current_level
+
+    def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:
+        """`read` of the tensor that transforms have wrapped in `x`: of all items of a batch."""
+        while is_functorch_wrapped_tensor(x):
+            x = get_unwrapped(x)
+        with _DisableFuncTorch():  # Else what is made of it would be wrapped.
+            return read(x)
+
 except ImportError:
-    untransformed = contextlib.nullcontext
 
-    def transforms_active() -> bool:
-        """True, so that `applied` calls torch's public `apply`."""
-        return True
+    class _Read(torch.autograd.Function):
+        """A call of a function with the tensor that transforms have wrapped, without result or derivative."""
 
-    def maybe_current_level() -> int | None:
+        @staticmethod
+        def forward(call: Callable[[Tensor], None], x: Tensor) -> Tensor:
+            call(x)
+            return torch.zeros(())
+
+        @staticmethod
+        def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+            ctx.mark_non_differentiable(output)
+
+        @staticmethod
+        def backward(ctx: Any, *_: Any) -> tuple[None, None]:
+            return None, None
+
+        @staticmethod
+        def jvp(ctx: Any, *_: Any) -> None:
+            return None
+
+        @staticmethod
+        def vmap(info: Any, in_dims: tuple, call: Callable, x: Tensor) -> tuple[Tensor, None]:
+            return _Read.apply(call, x), None
+
+    def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:
+        """`read` of the tensor that transforms have wrapped in `x`: of all items of a batch."""
+        found: list[_T] = []
+        _Read.apply(lambda value: found.append(read(value)), x)
+        return found[0]
+
+    def current_level() -> int | None:
         """0, as if some transform were active."""
         return 0
 
-    def is_wrapped(tensor: Tensor) -> bool:
-        """False, as if no transform had wrapped the tensor."""
-        return False
-
     def is_legacy_batchedtensor(tensor: Tensor) -> bool:
-        """False, as if the tensor were no batch of gradients."""
-        return False
+        """True for a tensor without values, where no transform has wrapped it."""
+        return not value_within(tensor, _is_readable)
 
-    def get_unwrapped(tensor: Tensor) -> Tensor:
-        """`tensor` itself."""
-        return tensor
-
-    unwrap_if_dead = get_unwrapped
-
-
-is_zero = getattr(Tensor, "_is_zerotensor", lambda x: False)
-"""True for a tensor of zeros without memory, as torch's forward mode makes."""
+    def _is_readable(tensor: Tensor) -> bool:
+        try:
+            tensor.data_ptr()
+        except RuntimeError:
+            return False
+        return True
 
 
 def forward_level() -> int:
