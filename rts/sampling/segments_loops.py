@@ -13,7 +13,44 @@ outline and a line where surfaces cross."""
 
 
 @loop
-def join(begins, along, sign, front, back, place, partner):
+def ends_of(gap, place, near, parts, height, width):
+    """The ends of segments: each break in the two squares beside its gap, as far as these have four centres.
+
+    Returns:
+        Flat index of the square's first corner (E,) int64; place on its sides (E,), clockwise from the upper left
+        corner, 0 to 4; and (E, 5) int32: the break, the side (0 top, 1 right, 2 bottom, 3 left), 1 where the way along
+        the sides leaves the front, −1 where it enters it, 0 where surfaces cross; the parts in front and behind.
+    """
+    square, along, ends = (
+        np.empty(2 * len(gap), np.int64),
+        np.empty(2 * len(gap)),
+        np.empty((2 * len(gap), 5), np.int32),
+    )
+    count = 0
+    for b in range(len(gap)):
+        y, x, row = gap[b, 0], gap[b, 1], gap[b, 2]
+        at = place[b, 0] - x - 0.5 if row == 1 else place[b, 1] - y - 0.5
+        at = min(max(at, 0.0), 1 - 1e-9)
+        front, back = parts[b, 0], parts[b, 1]
+        if near[b] == 1 or (near[b] == 2 and front > back):
+            front, back = back, front
+        for first in range(2):
+            # Above and below a row's gap, left and right of a column's.
+            top, left = y - (row if first == 0 else 0), x - (1 - row if first == 0 else 0)
+            if top < 0 or left < 0 or top >= height - 1 or left >= width - 1:
+                continue
+            side = (2 if row == 1 else 1) if first == 0 else (0 if row == 1 else 3)
+            square[count] = top * width + left
+            along[count] = at if side == 0 else (1 + at if side == 1 else (3 - at if side == 2 else 4 - at))
+            sign = 0 if near[b] == 2 else (1 if near[b] == 0 else -1)
+            ends[count, 0], ends[count, 1], ends[count, 2] = b, side, sign if side < 2 else -sign
+            ends[count, 3], ends[count, 4] = front, back
+            count += 1
+    return square[:count], along[:count], ends[:count]
+
+
+@loop
+def join(begins, along, ends, place, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
     Only ends with the same part in front are joined, one that leaves it with one that enters it. The least cost of
@@ -21,15 +58,17 @@ def join(begins, along, sign, front, back, place, partner):
 
     Args:
         begins: (Q + 1,) where the ends of each square begin.
-        along: (E,) places on the square's sides, clockwise from the upper left corner, 0 to 4, in order.
-        sign: (E,) 1 where the way along the sides leaves the front, −1 where it enters it, 0 where surfaces cross.
-        front: (E,) the part in front; where surfaces cross, that of the lower number.
-        back: (E,) the part behind; where surfaces cross, that of the higher number.
-        place: (E, 2) x and y.
+        along: (E,) places on the square's sides, in order.
+        ends: (E, 5), see `ends_of`.
+        place: (B, 2) x and y of breaks.
         partner: (E,) int32, filled with −1.
     """
     for q in range(len(begins) - 1):
         first, n = begins[q], begins[q + 1] - begins[q]
+        if n == 2:
+            if _cost(first, first + 1, along, ends, place) < 2 * LONE:
+                partner[first], partner[first + 1] = first + 1, first
+            continue
         if n < 2:
             continue
         # least[i, m]: the cost of the m ends from i on; chosen[i, m]: the step from i to its partner, or −1.
@@ -38,7 +77,7 @@ def join(begins, along, sign, front, back, place, partner):
             for i in range(n - m + 1):
                 best, choice = LONE + least[i + 1, m - 1], -1
                 for k in range(1, m):
-                    cost = _cost(first + i, first + i + k, along, sign, front, back, place)
+                    cost = _cost(first + i, first + i + k, along, ends, place)
                     cost += least[i + 1, k - 1] + least[i + k + 1, m - k - 1]
                     best, choice = (cost, k) if cost < best else (best, choice)
                 least[i, m], chosen[i, m] = best, choice
@@ -46,13 +85,14 @@ def join(begins, along, sign, front, back, place, partner):
 
 
 @compiled
-def _cost(a, b, along, sign, front, back, place):
+def _cost(a, b, along, ends, place):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
-    if front[a] != front[b] or sign[a] * sign[b] > 0:
+    if ends[a, 3] != ends[b, 3] or ends[a, 2] * ends[b, 2] > 0:
         return np.inf
-    cost = np.hypot(place[a, 0] - place[b, 0], place[a, 1] - place[b, 1])
-    cost += ON_ONE_SIDE * (int(along[a]) == int(along[b])) + OTHER_BEHIND * (back[a] != back[b])
-    return cost + OTHER_KIND * ((sign[a] == 0) != (sign[b] == 0))
+    p, q = ends[a, 0], ends[b, 0]
+    cost = np.hypot(place[p, 0] - place[q, 0], place[p, 1] - place[q, 1])
+    cost += ON_ONE_SIDE * (int(along[a]) == int(along[b])) + OTHER_BEHIND * (ends[a, 4] != ends[b, 4])
+    return cost + OTHER_KIND * ((ends[a, 2] == 0) != (ends[b, 2] == 0))
 
 
 @compiled
@@ -72,3 +112,130 @@ def _read(first, n, chosen, partner):
             partner[first + i], partner[first + i + k] = first + i + k, first + i
             stack[top] = i + k + 1, m - k - 1
             top += 1
+
+
+@loop
+def segments_of(square, ends, partner, width):
+    """First corners (S, 2), ties (S, 2) and sides (S, 2) of segments, int32; see `rts.contracts.records.Outlines`."""
+    origin = np.empty((len(ends), 2), np.int32)
+    ties, side = np.full((len(ends), 2), -1, np.int32), np.full((len(ends), 2), -1, np.int32)
+    count = 0
+    for e in range(len(ends)):
+        other, sign = partner[e], ends[e, 2]
+        # Of two ends the one that leaves the front comes first; of two that cross, the earlier.
+        if other >= 0 and not (sign > 0 or (sign == 0 and (ends[other, 2] < 0 or (ends[other, 2] == 0 and e < other)))):
+            continue
+        origin[count, 0], origin[count, 1] = square[e] // width, square[e] % width
+        ties[count, 0], side[count, 0] = ends[e, 0], ends[e, 1]
+        if other >= 0:
+            ties[count, 1], side[count, 1] = ends[other, 0], ends[other, 1]
+        count += 1
+    return origin[:count], ties[:count], side[:count]
+
+
+@loop
+def beyond(ties, count):
+    """(S, 4) int32: the last break but one along the same outline, the last, the next, and the next but one; or −1.
+
+    `ties` (S, 2) are the ends of segments, between `count` breaks; each break ends at most two.
+    """
+    # The segments at each break, as 2 · segment + end.
+    at = np.full((count, 2), -1, np.int32)
+    for s in range(len(ties)):
+        for e in range(2):
+            b = ties[s, e]
+            if b >= 0:
+                at[b, 0 if at[b, 0] < 0 else 1] = 2 * s + e
+    found = np.full((len(ties), 4), -1, np.int32)
+    for s in range(len(ties)):
+        for e in range(2):
+            own = 2 * s + e
+            for far in range(2):
+                b = ties[own // 2, own % 2]
+                if b < 0:
+                    break
+                next_ = at[b, 1] if at[b, 0] == own else at[b, 0]
+                if next_ < 0:
+                    break
+                own = next_ + 1 - 2 * (next_ % 2)  # Its other end.
+                found[s, (1 - far) if e == 0 else 2 + far] = ties[own // 2, own % 2]
+    return found
+
+
+@compiled
+def _meeting(start, ahead, end, back, meeting):
+    """Fill `meeting` with where lines from `start` along `ahead` and to `end` along `back` meet; True if between."""
+    turn = ahead[0] * back[1] - ahead[1] * back[0]
+    if not abs(turn) > 1e-9:
+        meeting[0], meeting[1] = start[0], start[1]
+        return False
+    t = ((end[0] - start[0]) * back[1] - (end[1] - start[1]) * back[0]) / turn
+    meeting[0], meeting[1] = start[0] + t * ahead[0], start[1] + t * ahead[1]
+    return t >= 0 and (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1] >= 0
+
+
+@compiled
+def _angle(a, b):
+    """The angle between two vectors, 0 to π."""
+    return abs(np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
+
+
+@compiled
+def _within(point, origin, s):
+    """True if a point lies in the square of a segment."""
+    x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
+    return 0 <= x <= 1 and 0 <= y <= 1
+
+
+@loop
+def corners(first, last, origin, ties, around, place, corner, pull):
+    """Fill `corner` (S, 2), from the square's first centre, and `pull` (S, 4) of segments; see `Outlines`.
+
+    Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
+    at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
+    curve is two thirds as far from the chord as their meeting.
+
+    Args:
+        first: the first segment.
+        last: the segment after the last.
+        origin: (S, 2), y and x of the first corner of each square.
+        ties: (S, 2).
+        around: (S, 4), the result of `beyond`.
+        place: (B, 2), x and y of breaks.
+        corner: to fill.
+        pull: to fill.
+    """
+    sharp, curve = np.empty(2), np.empty(2)
+    for s in range(first, last):
+        start, end = place[ties[s, 0]], place[ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0]]
+        for a in range(2):
+            corner[s, a] = (start[a] + end[a]) / 2
+        alone, on, back = 0.0, 0.0, 0.0
+        if around[s, 1] >= 0 and around[s, 2] >= 0:
+            before, after = place[around[s, 1]], place[around[s, 2]]
+            if _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
+                for a in range(2):
+                    corner[s, a] += 2 / 3 * (curve[a] - corner[s, a])
+            ahead, behind = start - before, after - end
+            if _meeting(start, ahead, end, behind, sharp) and _within(sharp, origin, s):
+                beside = 0.0
+                if around[s, 0] >= 0:
+                    beside += _angle(before - place[around[s, 0]], ahead)
+                if around[s, 3] >= 0:
+                    beside += _angle(behind, place[around[s, 3]] - after)
+                alone = min(max(1 - beside / max(_angle(ahead, behind), 1e-6), 0.0), 1.0)
+            for a in range(2):
+                corner[s, a] += alone * (sharp[a] - corner[s, a]) if alone > 0 else 0.0
+            if alone > 0:
+                on = np.hypot(corner[s, 0] - start[0], corner[s, 1] - start[1]) / np.hypot(ahead[0], ahead[1])
+                back = np.hypot(corner[s, 0] - end[0], corner[s, 1] - end[1]) / np.hypot(behind[0], behind[1])
+        chord_x, chord_y = end[0] - start[0], end[1] - start[1]
+        share = (corner[s, 0] - start[0]) * chord_x + (corner[s, 1] - start[1]) * chord_y
+        share = min(max(share / max(chord_x * chord_x + chord_y * chord_y, 1e-12), 0.0), 1.0)
+        # The corner of two straight lines moves as both of them say; a point of a curve as the ends of its chord do.
+        lines = alone if on < 2 and back < 2 else 0.0
+        pull[s, 0], pull[s, 3] = -lines * on / 2, -lines * back / 2
+        pull[s, 1] = (1 - lines) * (1 - share) + lines * (1 + on) / 2
+        pull[s, 2] = (1 - lines) * share + lines * (1 + back) / 2
+        corner[s, 0] -= origin[s, 1] + 0.5
+        corner[s, 1] -= origin[s, 0] + 0.5
