@@ -47,7 +47,8 @@ class Sheets(NamedTuple):
         from rts.sampling import sheets_loops
 
         mesh, height = (self.rows, self.vertices, self.faces, self.beyond), len(part)
-        parallel(sheets_loops.seams, height, part, triangle, depth, own, *mesh, joined, work=20 * part.size)
+        arguments = part, triangle, depth, own, *mesh, self.keep != 0, joined
+        parallel(sheets_loops.seams, height, *arguments, work=20 * part.size)
 
     def spans(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The triangles' spans on gaps, whose numbers stand in `number` (2, H, W): see `spans_loops.spans_of`."""
@@ -55,7 +56,7 @@ class Sheets(NamedTuple):
 
         seen, near = np.empty((len(self.vertices), 2), np.float32), np.empty(len(self.faces), np.bool_)
         parallel(spans_loops.projected, len(seen), self.vertices, self.rows, seen, work=10 * len(seen))
-        parallel(spans_loops.near_gaps, len(near), self.faces, seen, number, near, work=20 * len(near))
+        parallel(spans_loops.near_gaps, len(near), self.faces, seen, self.keep, number, near, work=20 * len(near))
         mesh = self.rows, self.vertices, self.faces, self.clip, self.keep
         return spans_loops.spans_of(np.flatnonzero(near), *mesh, number)
 

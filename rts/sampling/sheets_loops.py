@@ -161,7 +161,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond, joined):
+def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond, one_sided, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
 
     Args:
@@ -175,6 +175,7 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
         beyond: (T, 3), the result of `neighbours`.
+        one_sided: True if only one side of triangles is seen, so that two which share an edge do not fold there.
         joined: (2, H, W) bool to fill: along x, and along y.
     """
     (height, width), corners, edges = part.shape, np.empty((3, 4)), np.empty((3, 3))
@@ -187,8 +188,8 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
                 if x + dx == width or y + dy == height or part[y + dy, x + dx] != own:
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
-                end = t
-                if t != s:
+                end = s
+                if t != s and not (one_sided and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
                     end = _walked(t, start, axis, at, rows, vertices, faces, beyond, edges)
                 joined[axis, y, x] = end == s

@@ -59,15 +59,19 @@ def _crosses(low_x, high_x, low_y, high_y, number):
 
 
 @loop
-def near_gaps(first, last, faces, seen, number, near):
-    """Fill `near` (T,) bool: may a triangle meet a gap? `number` (2, H, W) is −1 at gaps that are not looked at."""
+def near_gaps(first, last, faces, seen, keep, number, near):
+    """Fill `near` (T,) bool: may a triangle that is kept meet a gap? For `keep` and `number` see `spans_of`."""
     slack = np.float32(0.01)
     for t in range(first, last):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         low_x, high_x = min(seen[a, 0], seen[b, 0], seen[c, 0]), max(seen[a, 0], seen[b, 0], seen[c, 0])
         low_y, high_y = min(seen[a, 1], seen[b, 1], seen[c, 1]), max(seen[a, 1], seen[b, 1], seen[c, 1])
-        if np.isnan(seen[a, 0] + seen[b, 0] + seen[c, 0]):
+        area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
+        area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
+        if np.isnan(area):
             near[t] = True
+        elif area * keep < -slack:
+            near[t] = False
         else:
             near[t] = _crosses(low_x - slack, high_x + slack, low_y - slack, high_y + slack, number)
 
