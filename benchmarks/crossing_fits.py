@@ -2,7 +2,7 @@
 
 *Card*: its edges are outside of the picture, and it cuts a sphere; the camera is orthographic. All that changes with
 its depth is the circle. *Hand*: spheres in one rigid body, pressed into a box; its six numbers are sought, from starts
-off by degrees and parts of its size. With lines of crossing that move as depths say, and without:
+off by degrees and parts of its size. With lines of crossing that move as depths say, without, and by found edges:
 
     python -m benchmarks.crossing_fits -o out/crossing_fits
 """
@@ -39,9 +39,12 @@ TURN, SHIFT, RUNS = 6.0, 0.08, 10
 COLORS = np.array([[0.85, 0.6, 0.45], [0.25, 0.45, 0.7]])
 
 
-def visible(crossings: bool) -> Any:
-    """The splatter."""
-    return rts.plugin("rts.splatters", "visible")(crossings=crossings)
+WAYS: dict[str, Any] = {
+    "as samples": rts.plugin("rts.splatters", "visible")(crossings=False),
+    "as depths": "visible",
+    "edges": "edges",
+}
+"""Splatters."""
 
 
 def ball() -> rts.Part:
@@ -85,38 +88,36 @@ def pressed_hand(pose: Any) -> list[rts.Part]:
     return [hand().replace(transform=rts.rigid(pose)), board]
 
 
-def fitted(scene: Callable, view: rts.Camera, goal: Any, start: Any, method: str, crossings: bool) -> np.ndarray:
+def fitted(scene: Callable, view: rts.Camera, goal: Any, start: Any, method: str, way: str) -> np.ndarray:
     """The parameters that are found, from the picture of `goal`."""
     target = supersampled(scene(goal), view, SIZE, 8)[..., :3].astype(np.float32)
-    residuals = rts.ImageResiduals(scene, view, SIZE, target, layers=3, splatter=visible(crossings))
+    residuals = rts.ImageResiduals(scene, view, SIZE, target, layers=3, splatter=WAYS[way])
     options: dict[str, Any] = {"learning_rate": 0.01} if method == "adam" else {}
     first = torch.tensor(start, dtype=torch.float32)
     found = rts.fit(residuals, first, method=method, steps=STEPS[method], progress=False, **options)
     return np.asarray(found.parameters, np.float64)
 
 
-def card_rows(method: str) -> list[dict]:
+def card_rows(method: str, ways: list[str]) -> list[dict]:
     """The card's error of position, in diameters of the sphere."""
     view, rows = rts.Camera.orthographic((0, 0, 4), (0, 0, 0), height=2.2), []
     for start in track(CARD_STARTS, description=f"card, {method}", transient=True):
-        for crossings in (False, True):
-            found = fitted(cut_sphere, view, np.float64(CARD_AT), start, method, crossings)
-            rows.append({"start": start, "crossings": crossings, "off": abs(float(found) - CARD_AT) / (2 * SPHERE)})
+        for way in ways:
+            found = fitted(cut_sphere, view, np.float64(CARD_AT), start, method, way)
+            rows.append({"start": start, "way": way, "off": abs(float(found) - CARD_AT) / (2 * SPHERE)})
     return rows
 
 
-def hand_rows(method: str) -> list[dict]:
+def hand_rows(method: str, ways: list[str]) -> list[dict]:
     """Errors of the hand's last poses: degrees, and share of its size; and the poses."""
     rows = []
     for seed in track(range(RUNS), description=f"hand, {method}", transient=True):
         rng = np.random.default_rng(seed)
         turn, shift = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
         start = HAND_AT + np.concatenate([np.radians(TURN) * turn, SHIFT * HAND_SIZE * shift])
-        for crossings in (False, True):
-            pose = fitted(pressed_hand, camera(), HAND_AT, start, method, crossings)
-            rows.append(
-                {"seed": seed, "crossings": crossings, "start": start.tolist(), "pose": pose.tolist(), **off(pose)}
-            )
+        for way in ways:
+            pose = fitted(pressed_hand, camera(), HAND_AT, start, method, way)
+            rows.append({"seed": seed, "way": way, "start": start.tolist(), "pose": pose.tolist(), **off(pose)})
     return rows
 
 
@@ -133,8 +134,9 @@ def off(pose: np.ndarray) -> dict[str, float]:
 
 
 def pictures(rows: list[dict]) -> list[np.ndarray]:
-    """The hand's target, the first start, and what was found without and with lines."""
-    poses = [HAND_AT, rows[0]["start"], *(np.array(row["pose"]) for row in rows[:2])]
+    """The hand's target, the first start, and what was found from it in each way."""
+    found = [row["pose"] for row in rows if row["seed"] == rows[0]["seed"]]
+    poses = [HAND_AT, rows[0]["start"], *map(np.array, found)]
     return [supersampled(pressed_hand(np.asarray(pose)), camera(), SIZE, 4) for pose in poses]
 
 
@@ -142,17 +144,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/crossing_fits"))
     parser.add_argument("--methods", nargs="+", default=["lm", "adam"])
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {}
     lines = []
     for method in args.methods:
-        card, found = card_rows(method), hand_rows(method)
+        card, found = card_rows(method, args.ways), hand_rows(method, args.ways)
         results[method] = {"card": card, "hand": found}
-        for crossings in (False, True):
-            name = "as depths" if crossings else "as samples"
-            offs = [row["off"] for row in card if row["crossings"] == crossings]
-            rows = [row for row in found if row["crossings"] == crossings]
+        for name in args.ways:
+            offs = [row["off"] for row in card if row["way"] == name]
+            rows = [row for row in found if row["way"] == name]
             near = sum(row["angle"] < 1 and row["offset"] < 0.01 for row in rows)
             medians = (f"{np.median([row[key] for row in rows]):.4f}" for key in ("angle", "offset", "depth"))
             lines.append([method, name, *(f"{100 * x:.2f} %" for x in offs), f"{near} of {len(rows)}", *medians])

@@ -186,11 +186,11 @@ def low(x: np.ndarray) -> np.ndarray:
     return gaussian_filter(x, (2, 2, 0))
 
 
-def truth(scene: SceneAt) -> tuple[np.ndarray, np.ndarray]:
+def truth(scene: SceneAt, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
     """The area-sampled image, and the difference of two a pixel of motion."""
 
     def area(t: float) -> np.ndarray:
-        options = {"splatter": "none", "layers": 1, "supersample": SAMPLES}
+        options = {"splatter": "none", "layers": 1, "supersample": samples}
         with torch.no_grad():
             return rts.render(scene(torch.tensor(t)), CAMERA, SIZE, **options).numpy()
 

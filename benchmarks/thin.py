@@ -136,6 +136,7 @@ def errors(output: Path, spp: list[int]) -> str:
     context = Context(samples=POINTS, folder=output / "truths")
     ours = {"splatter": "visible", "layers": 2}
     methods = {name: Method(name, {**ours, "supersample": s}) for name, s in SAMPLES.items()}
+    methods["edges"] = Method("edges", {"splatter": "edges"})
     methods |= {f"Mitsuba, {n} spp": Method("Mitsuba", {"spp": n}, "Mitsuba") for n in spp}
     made = {name: make() for name, make in SCENES.items()}
     rows = [[name, *(cell(scene, m, context) for scene in made.values())] for name, m in methods.items()]

@@ -395,6 +395,15 @@ def test_every_public_name_is_tried():
     assert not tried & set(misuses.RECORDS)
 
 
+def test_right_values_are_not_written_out():
+    class Unwritten(np.ndarray):
+        def __repr__(self):
+            raise AssertionError("the text of a message that nobody reads")
+
+    eye = np.array([0.4, 0.5, 4]).view(Unwritten)
+    np.testing.assert_array_equal(Camera.look_at(eye, (0, 0, 0)).view, CAMERA.view)
+
+
 def test_arrays_of_two_engines_are_refused():
     torch, jnp = pytest.importorskip("torch"), pytest.importorskip("jax.numpy")
     part, points = theta(vertices=torch.tensor(PART.theta["vertices"])), torch.zeros(4, 3)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import icosphere
 
 torch = pytest.importorskip("torch")
 
@@ -147,30 +146,43 @@ def test_points_without_an_image_are_finite_with_finite_gradients():
     assert out.isfinite().all() and rows.grad.isfinite().all() and points.grad.isfinite().all()
 
 
-def test_without_private_names_values_and_gradients_are_the_same(monkeypatch):
+CALLS = {
+    "backward": lambda f, pose: torch.autograd.grad(f(pose).square().mean(), pose),
+    "grad": lambda f, pose: torch.func.grad(lambda x: f(x).square().mean())(pose.detach()),
+    "jvp": lambda f, pose: torch.func.jvp(f, (pose.detach(),), (pose.detach(),)),
+    "vmap": lambda f, pose: torch.vmap(f)(torch.stack([pose, 2 * pose]).detach()),
+    "vmap of grad": lambda f, pose: torch.vmap(torch.func.grad(lambda x: f(x).sum()))(pose.detach()[None]),
+    "is_grads_batched": lambda f, pose: torch.autograd.grad(
+        f(pose)[4:6, 4, 3], pose, torch.eye(2), is_grads_batched=True
+    ),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("surface", ["mesh", "sdf"])
+def test_without_private_names_values_and_gradients_are_the_same(surface, monkeypatch):
     private = pytest.importorskip("rts_backends.torch_engine.torch_internals")
-    vertices, faces = icosphere(1)
+    part = rts.plugin("surfaces", surface).example()
+
+    def image(pose):
+        return rts.render(
+            part.replace(transform=rts.rigid(pose)), rts.Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50), (12, 12)
+        )
 
     def found():
         pose = torch.full((6,), 0.1, requires_grad=True)
-        part = rts.Part(
-            rts.plugin("surfaces", "mesh")(faces),
-            {"vertices": vertices.astype(np.float32)},
-            transform=rts.rigid(pose),
-        )
-        image = rts.render(part, rts.Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50), (12, 12))
-        (image**2).sum().backward()
-        return image.detach().numpy(), pose.grad.numpy()
+        return {name: call(image, pose) for name, call in CALLS.items()}
 
     expected = found()
     with monkeypatch.context() as patch:
-        patch.delattr(torch._C._functorch, "unwrap_if_dead")
+        patch.delattr(torch._C._functorch, "is_legacy_batchedtensor")
         importlib.reload(private)
-        assert private.unwrap_if_dead is private.get_unwrapped and private.transforms_active()
+        patch.setattr(private, "forward_level", lambda: 0)
+        assert private.current_level() == 0
         less = found()
     importlib.reload(private)
-    for x, y in zip(less, expected, strict=True):
-        np.testing.assert_array_equal(x, y)
+    assert private.current_level() is None
+    torch.testing.assert_close(less, expected)
 
 
 def test_samples_of_another_mesh_are_one_clear_error():

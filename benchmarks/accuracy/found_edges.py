@@ -33,6 +33,8 @@ from rts_compare.failures.table_rows import ROWS
 from rts_compare.moving_scenes import Scene
 from rts_compare.true_derivatives import truth
 
+SIZE = 128
+"""Pixels along each side of the scenes of `accuracy.run` and `accuracy.crossings`."""
 STEP = 0.3
 """Length of the truth's central difference, pixels."""
 LOW, GAIN, WORSE = 0.08, 0.03, 0.02
@@ -99,7 +101,7 @@ def of_scene(scene: Scene, mode: str, pixel: float, layers: int, samples: int, f
 def of_accuracy(name: str, folder: Path, turned_over: bool = False) -> Case:
     """A scene of `accuracy.run` or `accuracy.crossings`; with back faces the other way if `turned_over`."""
     crossing = crossing_scenes.CROSSING
-    scene = crossing[name](scenes.SIZE) if name in crossing else scenes.scene(name)
+    scene = crossing[name](SIZE) if name in crossing else scenes.scene(name, SIZE)
     closed, true = closed_forms.closed_form(scene), scene
     if turned_over:
         other = methods.turned_over(scene)
@@ -162,7 +164,7 @@ def cases(folder: Path) -> dict[str, Mapping[str, Callable[[], Case]]]:
     """Suite → scene → the function that makes its case."""
     accuracy = {name: partial(of_accuracy, name, folder) for name in scenes.SCENES}
     for name in methods.CLOSED:
-        other = methods.turned_over(scenes.scene(name))
+        other = methods.turned_over(scenes.scene(name, SIZE))
         assert other is not None
         accuracy[other.name] = partial(of_accuracy, name, folder, turned_over=True)
     moving = {name: motion for name, motion in other_motions.motions().items() if not motion.still}

@@ -86,7 +86,7 @@ def splatters(scene: scenes.Scene) -> list[Method]:
     most = scene.layers[-1]
     found = [ours(scene, "single", 1, s) for s in (1, 2)]
     found += [ours(scene, name, k, s) for name in ("multi", "visible") for k in scene.layers for s in (1, 2)]
-    found.append(ours(scene, "multi, calibrated", most))
+    found += [ours(scene, "multi, calibrated", most), ours(scene, "edges", 1)]
     found += [ours(scene, "visible, by samples", most, s) for s in (1, 2)]
     if scene.name in CASES:
         found += [ours(scene, "none", 1), *(ours(scene, "visible", most, s) for s in (4, *ADAPTIVE))]

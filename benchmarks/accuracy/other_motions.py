@@ -10,7 +10,7 @@ beside differences of area-sampled images over a pixel:
 from __future__ import annotations
 
 import argparse
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,8 +27,13 @@ from rts_compare.derivative_scores import all_scores
 
 SIZE, POINTS = 256, 8
 """Pixels, and points of a pixel along x and y in each of the truth's two grids."""
-METHODS = {"samples": (1, False), "root": (1, True), "chord": (2, True)}
-"""K, and whether outlines have a motion of their own."""
+METHODS: dict[str, dict[str, Any]] = {
+    "samples": {"splatter": rts.plugin("rts.splatters", "visible")(rims=False), "layers": 1},
+    "root": {"splatter": "visible", "layers": 1},
+    "chord": {"splatter": "visible", "layers": 2},
+    "found": {"splatter": "edges", "layers": 1},
+}
+"""Options of `rts.render`."""
 UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -77,20 +82,20 @@ class Body:
 
     def truth(self, velocity: np.ndarray) -> np.ndarray:
         """Difference of images (H, W, 3) half a unit of t before and after, the mean over two grids."""
-        ends = [self.at((self.motion.vertices + t * velocity).astype(np.float32)) for t in (-0.5, 0.5)]
-        images = [
-            [supersampled(end, camera(), (SIZE, SIZE), points)[..., :3] for end in ends] for points in grids(POINTS)
-        ]
-        return np.mean([after - before for before, after in images], axis=0)
+        return np.mean(self.differences(velocity, 1.0, POINTS), axis=0)
 
-    def derivative(self, layers: int, rims: bool) -> np.ndarray:
+    def differences(self, velocity: np.ndarray, step: float, points: int) -> list[np.ndarray]:
+        """Differences of images (H, W, 3) over a step of t, per unit, by each of two grids."""
+        ends = [self.at((self.motion.vertices + t * velocity).astype(np.float32)) for t in (-step / 2, step / 2)]
+        images = [[supersampled(end, camera(), (SIZE, SIZE), grid)[..., :3] for end in ends] for grid in grids(points)]
+        return [(after - before) / step for before, after in images]
+
+    def forward(self, **options: Any) -> np.ndarray:
         """(H, W, 3) by forward mode."""
         start, velocity = (torch.tensor(x, dtype=torch.float32) for x in (self.motion.vertices, self.motion.velocity))
-        splatter = rts.plugin("rts.splatters", "visible")(rims=rims)
 
         def image(t: torch.Tensor) -> torch.Tensor:
-            part = self.at(start + t * velocity)
-            return rts.render(part, camera(), (SIZE, SIZE), splatter=splatter, layers=layers)[..., :3]
+            return rts.render(self.at(start + t * velocity), camera(), (SIZE, SIZE), **options)[..., :3]
 
         return torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))[1].numpy()
 
@@ -101,7 +106,7 @@ def cells(motion: Motion) -> list[str]:
     Where the outline stands still: the low-passed norm in that of the body moving by a pixel.
     """
     body = Body(motion)
-    found = [body.derivative(*how) for how in METHODS.values()]
+    found = [body.forward(**how) for how in METHODS.values()]
     if motion.still:
         whole = body.truth(np.broadcast_to((pixel(DISTANCE, SIZE), 0.0, 0.0), motion.vertices.shape))
         unit = np.linalg.norm(low_pass(whole))

@@ -59,6 +59,7 @@ CASE_METHODS = (
     "visible, K = 2, 2 × 2",
     "visible, K = 2, 4 × 4",
     *(name_of("visible", 2, adaptive) for adaptive in ADAPTIVE),
+    "edges, K = 1",
 )
 
 

@@ -213,8 +213,8 @@ class TorchEngine(Engine):
     def _repeated(body: Callable, going: Callable, state: Tree, most: int) -> Tree:
         for _ in range(most):
             on = going(state)
-            any_on, batched = torch_internals.value_within(on, lambda whole: (bool(whole.any()), whole.ndim > 0))
-            if not any_on:
+            any_on, batched = torch_internals.value_within(on, lambda whole: (whole.any(), whole.ndim > 0))
+            if not bool(any_on):
                 break
             new = iter(list(leaves(body(state))))
             state = map_leaves(lambda x, on=on, b=batched: torch.where(on, next(new), x) if b else next(new), state)  # noqa: B023

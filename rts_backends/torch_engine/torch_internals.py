@@ -26,7 +26,7 @@ try:
     from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor
     from torch._C._functorch import maybe_current_level as current_level
 
-    def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:
+    def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:  # pyright: ignore[reportRedeclaration]
         """`read` of the tensor that transforms have wrapped in `x`: of all items of a batch."""
         while is_functorch_wrapped_tensor(x):
             x = get_unwrapped(x)
@@ -55,8 +55,11 @@ except ImportError:
         def jvp(ctx: Any, *_: Any) -> None:
             return None
 
+        # torch's own signature has no named arguments, though its manual has.
         @staticmethod
-        def vmap(info: Any, in_dims: tuple, call: Callable, x: Tensor) -> tuple[Tensor, None]:
+        def vmap(  # pyright: ignore[reportIncompatibleMethodOverride]
+            info: Any, in_dims: tuple, call: Callable, x: Tensor
+        ) -> tuple[Tensor, None]:
             return _Read.apply(call, x), None
 
     def value_within(x: Tensor, read: Callable[[Tensor], _T]) -> _T:
