@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from polygons import covered
 
 import rts
@@ -262,3 +263,14 @@ def test_traced_samples_are_refused():
     vertices = jax.numpy.asarray(flat(SQUARE + 12))
     with pytest.raises(InputError, match="these samples are traced"):
         jax.jit(lambda v: edges(card(v)))(vertices)
+
+
+def test_no_colour_leaves_the_range_of_those_that_are_seen():
+    """Light that turns away at the limb: the sample at a centre is dark, that beside the outline bright, or the other
+    way around."""
+    ball = trimesh.creation.icosphere(2, radius=0.7)
+    theta = {"vertices": np.float32(ball.vertices), "light": {"direction": np.float32([0.3, 0.8, 0.5])}}
+    camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=40)
+    image = rts.render(rts.Part(rts.Mesh(ball.faces), theta, "lambert"), camera, (128, 128), splatter="edges")
+    assert image.min() > -1e-6
+    assert (image[..., :3] - image[..., 3:]).max() < 1e-6

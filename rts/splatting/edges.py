@@ -63,7 +63,7 @@ def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) ->
         return image
     breaks = _Breaks.of(outlines, positions, rgba)
     segments = _Segments.of(outlines, breaks)
-    parts = [*_beside_breaks(breaks, segments, outlines, color, motion), *segments.parts()]
+    parts = [*_beside_breaks(breaks, segments, outlines, color, motion), *segments.parts(color)]
     cells = xp.concat([y * width + x for x, y, _ in parts])
     changes = xp.concat([change for *_, change in parts])
     sums = engine_of(changes).segment_sum(changes, cells, height * width)
@@ -155,6 +155,8 @@ class _Segments(NamedTuple):
         side: (S, 2) int, the sides of the square that start and end lie on.
         ties: (S, 2) int, the breaks at start and end.
         jump: (2, S, C), at start and end, the colour on the right of the way less that on the left.
+        right: (2, S, C), the colour on the right.
+        next: (4, S) bool, is a corner of the square an end of one of these breaks' gaps, with no break between?
         moves: (3, S, 2), the motion of start, corner and end.
     """
 
@@ -164,6 +166,8 @@ class _Segments(NamedTuple):
     side: Array
     ties: Array
     jump: Array
+    right: Array
+    next: Array
     moves: Array
 
     @classmethod
@@ -180,29 +184,36 @@ class _Segments(NamedTuple):
         end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
         start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
         corner = xp.where(lone[:, None], (start + end) / 2, outlines.corner)
-        jump, moves = [], []
+        jump, right, moves = [], [], []
         for i in (0, 1):
             before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
             # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
             forward = (side[:, i] < 2) if i == 0 else (side[:, i] >= 2)
             jump.append(xp.where(forward[:, None], before - behind, behind - before))
+            right.append(xp.where(forward[:, None], before, behind))
             moves.append(xp.take(breaks.moves, ties[:, i], axis=0))
-        jump[1] = xp.where(lone[:, None], jump[0], jump[1])
+        jump[1], right[1] = (xp.where(lone[:, None], x[0], x[1]) for x in (jump, right))
+        beside = [_next(k, ties, side, lone, outlines.ends) for k in range(4)]
         beyond = [
             xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0)
             for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
         ]
         pulled = (beyond[0], *moves, beyond[1])
         moves.insert(1, sum(outlines.pull[:, i, None] * x for i, x in enumerate(pulled)))
-        return cls(square, lone, xp.stack([start, corner, end]), side, ties, xp.stack(jump), xp.stack(moves))
+        path, sides = xp.stack([start, corner, end]), (xp.stack(jump), xp.stack(right))
+        return cls(square, lone, path, side, ties, *sides, xp.stack(beside), xp.stack(moves))
 
-    def parts(self) -> list[tuple[Array, Array, Array]]:
+    def parts(self, color: Array) -> list[tuple[Array, Array, Array]]:
         """Changes that segments make: cells (x and y) and changes (S, C), for each corner of the square.
+
+        Beside a segment the cell gets the other side's colour, and loses its own: that of the segment's side, or that
+        of the cell's centre, `color` (H, W, C), where this shows the same surface.
 
         The area of a quarter of the square on the right of the way is minus the integral of y over x around it: along
         the way, in straight pieces, and back along the square's sides, of which only the bottom counts.
         """
         xp, mean, parts = namespace(self.path), (self.jump[0] + self.jump[1]) / 2, []
+        flat = xp.reshape(color, (-1, color.shape[2]))
         pieces, bottoms = self._pieces(), [self._right_of_bottom(2.5, 3.0), self._right_of_bottom(2.0, 2.5)]
         for k, (dx, dy) in enumerate(CORNERS):
             area, change = 0.5 * bottoms[dx], xp.zeros_like(mean)
@@ -213,10 +224,14 @@ class _Segments(NamedTuple):
                 right, below = (xp.clip((at[:, a] - 0.5) / BORDER + 0.5, 0.0, 1.0) for a in (0, 1))
                 share = (right if dx else 1 - right) * (below if dy else 1 - below)
                 change = change + share[:, None] * flux
-            share = area - xp.where(self._on_the_right(k), 0.25, 0.0)
+            on_right, x, y = self._on_the_right(k), self.square[:, 0] + dx, self.square[:, 1] + dy
+            share = area - xp.where(on_right, 0.25, 0.0)
             beside = (self.side[:, 0] == k) | (self.side[:, 0] == (k + 3) % 4)
-            change = change + xp.where(self.lone & ~beside, 0.0, share)[:, None] * mean
-            parts.append((self.square[:, 0] + dx, self.square[:, 1] + dy, change))
+            share = xp.where(self.lone & ~beside, 0.0, share)[:, None]
+            own = xp.where(on_right[:, None], self.right, self.right - self.jump)
+            centre = xp.take(flat, y * color.shape[1] + x, axis=0)
+            differs = xp.where(self.next[k][:, None], centre - (own[0] + own[1]) / 2, 0.0)
+            parts.append((x, y, change + share * mean - xp.abs(share) * differs))
         return parts
 
     def normals(self, breaks: _Breaks) -> Array:
@@ -284,6 +299,21 @@ class _Segments(NamedTuple):
         return pieces
 
 
+def _next(k: int, ties: Array, side: Array, lone: Array, ends: Array) -> Array:
+    """`_Segments.next` of the corner k."""
+    xp, found = namespace(ties), None
+    for e in (0, 1):
+        first, last = (xp.take(ends[:, i], ties[:, e]) for i in (0, 1))
+        begins, stops = ((side[:, e] == a) | (side[:, e] == b) for a, b in FIRST_AND_LAST[k])
+        here = (begins & first) | (stops & last)
+        found = here if found is None else found | (here & ~lone)
+    return found
+
+
+FIRST_AND_LAST = (((0, 3), (9, 9)), ((1, 9), (0, 9)), ((9, 9), (1, 2)), ((2, 9), (3, 9)))
+"""For each corner of a square the sides on which it is the first centre of the gap, and the last; 9 for none."""
+
+
 def _beside_breaks(
     breaks: _Breaks, segments: _Segments, outlines: Outlines, color: Array, motion: Array
 ) -> list[tuple[Array, Array, Array]]:
@@ -291,8 +321,9 @@ def _beside_breaks(
 
     From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
-    the outline's normal n, with the mean motion of both samples. The mean colour of what is seen differs from C, or X
-    beyond the border, by half the slope times the length; in a cell seen on both sides of its centre, these cancel.
+    the outline's normal n, with the mean motion of both samples. What is left of a cell that the outline cuts has a
+    mean colour other than C: the slope from the centre before tells it, so that no colour leaves the range of those
+    that are seen. The strip in the next cell differs from X by half the slope times its width.
     """
     xp, (height, width) = namespace(color), color.shape[:2]
     y, x, row = (outlines.gap[:, i] for i in range(3))
@@ -312,18 +343,17 @@ def _beside_breaks(
         share = (inside / xp.where(length > 1e-6, length, 1.0))[:, None]
         moves = (breaks.motion[i] + xp.take(flat_motion, index, axis=0)[:, :2]) / 2
         moved = -stopped(last - here) * (way * ahead * xp.sum(moves * normal, axis=-1))[:, None]
-        # The slope from the centre before, where it shows the same surface, since d may be short.
+        # The centre before tells the slope, where it shows the same surface, since d may be short.
         before = xp.clip(cx - way * row, 0, width - 1), xp.clip(cy - way * (1 - row), 0, height - 1)
         former = before[1] * width + before[0]
         first = former if way == 1 else index
         on = xp.where(row == 1, xp.take(joined[0], first), xp.take(joined[1], first))[:, None]
+        beyond_here = xp.take(flat_color, former, axis=0)
         slope = xp.where(
-            on,
-            (last - xp.take(flat_color, former, axis=0)) / (1 + length)[:, None],
-            (last - here) / xp.clip(length, 0.5, None)[:, None],
+            on, (last - beyond_here) / (1 + length)[:, None], (last - here) / xp.clip(length, 0.5, None)[:, None]
         )
         weight = (ahead**2)[:, None]
-        nearer = -weight * slope * ((0.5 - inside) ** 2 / 2)[:, None]
+        nearer = weight * xp.where(on, beyond_here - here, 0.0) * (0.125 - inside**2 / 2)[:, None]
         farther = -weight * slope * (outside**2 / 2)[:, None]
         parts.append((cx, cy, xp.where(counts, share * moved + nearer, 0.0)))
         parts.append((*beyond, xp.where(counts, (1 - share) * moved + farther, 0.0)))

@@ -50,6 +50,14 @@ def _right_of_bottom(start, end, low, high):
 
 
 @compiled
+def _is_next(b, side, k, near_ends):
+    """True if a square's corner is an end of the gap of a break, on a side of the square, and no break lies between."""
+    first = (0, 1, 3, 0)[side]
+    second = (1, 2, 2, 3)[side]
+    return (k == first and near_ends[b, 0]) or (k == second and near_ends[b, 1])
+
+
+@compiled
 def _point(place, gap, b, square, s, out):
     """Fill `out` with a break's position from the first corner's centre of a segment's square, within it."""
     along = gap[b, 2]
@@ -59,7 +67,9 @@ def _point(place, gap, b, square, s, out):
 
 
 @loop
-def weigh_segments(first, last, place, gap, square, ties, side, corner, pull, border, path, share, flux):
+def weigh_segments(
+    first, last, place, gap, near_ends, square, ties, side, corner, pull, border, path, share, own, flux
+):
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
     Args:
@@ -67,6 +77,7 @@ def weigh_segments(first, last, place, gap, square, ties, side, corner, pull, bo
         last: the segment after the last.
         place: (B,) of outlines.
         gap: (B, 3).
+        near_ends: (B, 2), `Outlines.ends`.
         square: (S, 2).
         ties: (S, 2).
         side: (S, 2).
@@ -75,6 +86,8 @@ def weigh_segments(first, last, place, gap, square, ties, side, corner, pull, bo
         border: width of the strip along a border of two pixels in which an edge belongs to both.
         path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
         share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps before and behind both breaks.
+        own: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that the cell's
+            centre shows; −1 if another may lie between.
         flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
             that pull.
     """
@@ -128,14 +141,14 @@ def weigh_segments(first, last, place, gap, square, ties, side, corner, pull, bo
                         continue
                     for m in range(4):
                         # Of start and corner, or corner and end.
-                        own = (1 - t) * (m == 1) + t * pull[s, m] if i == 0 else (1 - t) * pull[s, m] + t * (m == 2)
+                        rate = (1 - t) * (m == 1) + t * pull[s, m] if i == 0 else (1 - t) * pull[s, m] + t * (m == 2)
                         if lone:
-                            own = 1.0 if m == 1 else 0.0
-                        own *= of_cell
-                        flux[s, k, 0, m, 0] += own * (1 - u) * sign0 * dy
-                        flux[s, k, 0, m, 1] -= own * (1 - u) * sign0 * dx
-                        flux[s, k, 1, m, 0] += own * u * sign1 * dy
-                        flux[s, k, 1, m, 1] -= own * u * sign1 * dx
+                            rate = 1.0 if m == 1 else 0.0
+                        rate *= of_cell
+                        flux[s, k, 0, m, 0] += rate * (1 - u) * sign0 * dy
+                        flux[s, k, 0, m, 1] -= rate * (1 - u) * sign0 * dx
+                        flux[s, k, 1, m, 0] += rate * u * sign1 * dy
+                        flux[s, k, 1, m, 1] -= rate * u * sign1 * dx
         for k in range(4):
             # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
             after, until = side0 >= k, side1 >= k
@@ -143,6 +156,9 @@ def weigh_segments(first, last, place, gap, square, ties, side, corner, pull, bo
             counts = not lone or side0 == k or side0 == (k + 3) % 4
             beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
             share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
+            own[s, k, 0] = own[s, k, 1] = -1
+            if _is_next(ties[s, 0], side0, k, near_ends) or (not lone and _is_next(ties[s, 1], side1, k, near_ends)):
+                own[s, k, 0], own[s, k, 1] = (sign0 > 0) != on_right, (sign1 > 0) != on_right
 
 
 @loop
@@ -158,10 +174,11 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
         path: (S, 3, 2), see `weigh_segments`.
         joined: (2, H, W).
         normal: (B, 2), zeros.
-        cells: (B, 2, 3) int32 to fill, for each side: the gap's cell on it (flat), the other one, and the one from
-            which the colour changes towards the break; −1 in first place for a side that does not count.
-        sides: (B, 2, 5) to fill: the share of the change that belongs to the first cell; weights of the colours'
-            difference in the first and in the other cell; and those of motions along x and y.
+        cells: (B, 2, 3) int32 to fill, for each side: the gap's cell on it (flat), the other one, and the one before,
+            if it shows the same surface, else the first again; −1 in first place for a side that does not count.
+        sides: (B, 2, 5) to fill: the share of the change that belongs to the first cell; in that cell the weight of the
+            colour before, less the cell's own; in the other one that of the last colour, less the one before; and
+            those of motions along x and y.
     """
     (height, width), count = joined.shape[1:], len(place)
     for b in range(count):
@@ -199,7 +216,7 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
                 if joined[1 - row, fy, fx]:
                     cells[b, i, 2], rate = by * width + bx, 1 / (1 + length)
             sides[b, i, 0] = inside / (length if length > 1e-6 else 1.0)
-            sides[b, i, 1] = -ahead * ahead * rate * (0.5 - inside) ** 2 / 2
+            sides[b, i, 1] = ahead * ahead * (0.125 - inside**2 / 2)
             sides[b, i, 2] = -ahead * ahead * rate * outside**2 / 2
             sides[b, i, 3], sides[b, i, 4] = -0.5 * way * ahead * nx, -0.5 * way * ahead * ny
 
@@ -281,10 +298,22 @@ def pull_inside(rgba, row, joined, g, g_positions, g_rgba):
 
 
 @compiled
+def _of(rgba, n, c):
+    """A channel of a sample; 0 where nothing is seen."""
+    return rgba[n, c] if n >= 0 else 0.0
+
+
+@compiled
+def _add_to(g_rgba, n, c, value):
+    """Add to the gradient of a sample's channel."""
+    if n >= 0:
+        g_rgba[n, c] += value
+
+
+@compiled
 def _jump(rgba, shown, b, c):
     """A channel before a break, less that behind."""
-    before = rgba[shown[b, 0], c] if shown[b, 0] >= 0 else 0.0
-    return before - (rgba[shown[b, 1], c] if shown[b, 1] >= 0 else 0.0)
+    return _of(rgba, shown[b, 0], c) - _of(rgba, shown[b, 1], c)
 
 
 @compiled
@@ -323,7 +352,7 @@ def motions(positions, rows, points, moves, out):
 
 
 @loop
-def add_segments(square, ties, beyond, share, flux, jump, steady, motion, out):
+def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump, steady, motion, out):
     """Add to an image (H, W, C) the changes that segments make.
 
     Args:
@@ -331,7 +360,11 @@ def add_segments(square, ties, beyond, share, flux, jump, steady, motion, out):
         ties: (S, 2).
         beyond: (S, 2).
         share: (S, 4, 2), see `weigh_segments`.
+        own: (S, 4, 2).
         flux: (S, 4, 2, 4, 2).
+        row: (H, W) int32.
+        shown: (B, 2), the samples that tell colours.
+        rgba: (N, C) colours, or their tangents; empty for zeros.
         jump: (B, C) jumps of colours, or their tangents; empty for zeros.
         steady: (B, C) jumps that are constants in fluxes.
         motion: (B, 2) motions of breaks, or their tangents; empty for zeros.
@@ -343,7 +376,7 @@ def add_segments(square, ties, beyond, share, flux, jump, steady, motion, out):
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
-            rate[:] = 0.0
+            known, rate[:] = own[s, k, 0] >= 0, 0.0
             if len(motion):
                 for m in range(4):
                     b = _last(s, ties, m, beyond)
@@ -354,26 +387,35 @@ def add_segments(square, ties, beyond, share, flux, jump, steady, motion, out):
                 value = rate[0] * steady[start, c] + rate[1] * steady[end, c]
                 if len(jump):
                     value += share[s, k, 0] * jump[start, c] + share[s, k, 1] * jump[end, c]
+                    if known:
+                        # What is taken away of the cell's own surface has the colour at its centre.
+                        here = _of(rgba, row[y, x], c)
+                        value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, own[s, k, 0]], c))
+                        value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, own[s, k, 1]], c))
                 out[y, x, c] += value
 
 
 @loop
-def pull_segments(square, ties, beyond, share, flux, steady, g, g_jump, g_motion):
-    """Add to gradients of jumps (B, C) and of motions (B, 2) those of `add_segments`; empty ones are not wanted."""
+def pull_segments(square, ties, beyond, share, own, flux, row, shown, steady, g, g_rgba, g_jump, g_motion):
+    """Add to gradients of colours, jumps (B, C) and motions (B, 2) those of `add_segments`; empty ones: not wanted."""
     channels, rate = g.shape[2], np.empty(2)
     for s in range(len(square)):
         start = ties[s, 0]
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
-            rate[:] = 0.0
+            known, rate[:] = own[s, k, 0] >= 0, 0.0
             for c in range(channels):
-                own = g[y, x, c]
-                rate[0] += own * steady[start, c]
-                rate[1] += own * steady[end, c]
+                rate[0] += g[y, x, c] * steady[start, c]
+                rate[1] += g[y, x, c] * steady[end, c]
                 if len(g_jump):
-                    g_jump[start, c] += share[s, k, 0] * own
-                    g_jump[end, c] += share[s, k, 1] * own
+                    g_jump[start, c] += share[s, k, 0] * g[y, x, c]
+                    g_jump[end, c] += share[s, k, 1] * g[y, x, c]
+                if len(g_rgba) and known:
+                    one, other = abs(share[s, k, 0]) * g[y, x, c], abs(share[s, k, 1]) * g[y, x, c]
+                    _add_to(g_rgba, shown[start, own[s, k, 0]], c, one)
+                    _add_to(g_rgba, shown[end, own[s, k, 1]], c, other)
+                    _add_to(g_rgba, row[y, x], c, -one - other)
             if len(g_motion) and (rate[0] != 0 or rate[1] != 0):
                 for m in range(4):
                     b = _last(s, ties, m, beyond)
@@ -446,8 +488,8 @@ def add_sides(row, rows, shown, cells, sides, steady, rgba, positions, points, o
                     change = (steady[last, c] - steady[here, c]) * move
                     near, far = sides[b, i, 0] * change, (1 - sides[b, i, 0]) * change
                 if len(rgba):
-                    change = rgba[last, c] - rgba[former, c]
-                    near, far = near + sides[b, i, 1] * change, far + sides[b, i, 2] * change
+                    near += sides[b, i, 1] * (rgba[former, c] - rgba[here, c])
+                    far += sides[b, i, 2] * (rgba[last, c] - rgba[former, c])
                 out[y, x, c] += near
                 out[there_y, there_x, c] += far
 
@@ -468,9 +510,10 @@ def pull_sides(row, rows, shown, cells, sides, steady, g, g_rgba, g_positions):
                 near, far = g[y, x, c], g[there_y, there_x, c]
                 move += (sides[b, i, 0] * near + (1 - sides[b, i, 0]) * far) * (steady[last, c] - steady[here, c])
                 if len(g_rgba):
-                    own = sides[b, i, 1] * near + sides[b, i, 2] * far
-                    g_rgba[last, c] += own
-                    g_rgba[former, c] -= own
+                    own, other = sides[b, i, 1] * near, sides[b, i, 2] * far
+                    g_rgba[last, c] += other
+                    g_rgba[former, c] += own - other
+                    g_rgba[here, c] -= own
             if len(g_positions) and move != 0:
                 for a in range(2):
                     g_positions[rows[b, i], a] += sides[b, i, 3 + a] * move

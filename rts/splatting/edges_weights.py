@@ -29,6 +29,7 @@ class _Weights(NamedTuple):
         points: (B, 2, 2), x and y of the last samples.
         moves: (B, 2, 3, 2).
         share: (S, 4, 2).
+        own: (S, 4, 2) int8.
         flux: (S, 4, 2, 4, 2).
         cells: (B, 2, 3) int32.
         sides: (B, 2, 5).
@@ -38,6 +39,7 @@ class _Weights(NamedTuple):
     points: np.ndarray
     moves: np.ndarray
     share: np.ndarray
+    own: np.ndarray
     flux: np.ndarray
     cells: np.ndarray
     sides: np.ndarray
@@ -53,14 +55,16 @@ class _Weights(NamedTuple):
         points = gap[:, None, 1::-1] + 0.5 + np.asarray(outlines.points, np.float64)[..., None] * step[:, None]
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
+        own = np.empty((segments, 4, 2), np.int8)
         loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
         ties = outlines.ties
-        known = outlines.place, gap, outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER
-        parallel(loops.weigh_segments, segments, *known, path, share, flux, work=400 * segments)
+        known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER, path, share, own, flux
+        at = outlines.place, gap, outlines.ends
+        parallel(loops.weigh_segments, segments, *at, *known, work=400 * segments)
         seen, normal = outlines.rows >= 0, np.empty((count, 2))
         arrays = outlines.place, gap, outlines.ends, seen, ties, path, outlines.joined, normal, cells, sides
         loops.weigh_sides(*arrays)
-        return cls(shown, points, moves, share, flux, cells, sides)
+        return cls(shown, points, moves, share, own, flux, cells, sides)
 
 
 def forward(operands: Arrays, out: np.ndarray) -> _Weights:
@@ -109,8 +113,7 @@ def _add(
     from rts.splatting import edges_loops as loops
 
     (rgba, positions, points), (steady, *at_breaks) = samples, jumps
-    segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux
-    loops.add_segments(*segments, *at_breaks, out)
+    loops.add_segments(*_segments(outlines, weights, row), rgba, *at_breaks, out)
     sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
     loops.add_sides(*sides, steady, rgba, positions, points, out)
 
@@ -126,14 +129,19 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
     loops.pull_inside(rgba, row, outlines.joined, g, g_positions, g_rgba)
     count, steady = len(weights.shown), _jumps(rgba, weights)
     g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
-    segments = outlines.square, outlines.ties, outlines.beyond, weights.share, weights.flux
-    loops.pull_segments(*segments, steady, g, g_jump, g_motion)
+    loops.pull_segments(*_segments(outlines, weights, row), steady, g, g_rgba, g_jump, g_motion)
     if len(g_positions):
         loops.pull_motions(outlines.rows, weights.moves, g_motion, g_positions)
     if len(g_rgba):
         loops.pull_jumps(weights.shown, g_jump, g_rgba)
     sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
     loops.pull_sides(*sides, rgba, g, g_rgba, g_positions)
+
+
+def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The first operands of `edges_loops.add_segments`."""
+    ties = outlines.square, outlines.ties, outlines.beyond
+    return *ties, weights.share, weights.own, weights.flux, row, weights.shown
 
 
 def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:
