@@ -129,10 +129,13 @@ def of_motion(motion: other_motions.Motion) -> Case:
 
 def of_edges(scene: edges.SceneAt) -> Case:
     """A scene of `benchmarks.edges`."""
-    first, second = (edges.truth(scene, samples)[1] for samples in (20, 23))
+    first, second = (edges.truth(scene, samples)[1][..., :3] for samples in (20, 23))
     ways = {
         name: partial(
-            lambda given: edges.derivative(lambda t: rts.render(scene(t), edges.CAMERA, edges.SIZE, **given))[1], given
+            lambda given: edges.derivative(lambda t: rts.render(scene(t), edges.CAMERA, edges.SIZE, **given)[..., :3])[
+                1
+            ],
+            given,
         )
         for name, given in options(2).items()
     }
