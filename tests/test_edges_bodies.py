@@ -10,7 +10,7 @@ from rts.diagnostics.smoothing import low_pass
 torch = pytest.importorskip("torch")
 forward = pytest.importorskip("torch.autograd.forward_ad")
 
-pytestmark = [pytest.mark.splatting, pytest.mark.thorough]
+pytestmark = pytest.mark.splatting
 
 SIZE, DEPTH, HALF = (64, 64), 3.2, 0.15
 PIXEL = 2 * DEPTH * np.tan(np.radians(20)) / SIZE[0]
@@ -80,6 +80,7 @@ def error(name, **options):
     return np.linalg.norm(low_pass(own) - true) / np.linalg.norm(true)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", SCENES)
 def test_one_layer_shows_what_outlines_uncover(name):
     assert error(name, splatter="edges") <= 0.04
