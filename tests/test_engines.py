@@ -328,6 +328,25 @@ def test_torch_compile_keeps_value_and_gradient(on_torch):
     assert_trees_close(gradient(target, compiled, scene), gradient(target, loss, scene))
 
 
+@pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch's own, where a call that it does not trace begins.
+def test_torch_compile_takes_poses_and_cameras(on_torch):
+    torch, target = on_torch
+    pose = arrays(target, np.full(6, 0.1))
+
+    def numbers(pose):
+        eye = pose[:3] + 4.0
+        cameras = (
+            Camera.look_at(eye, (0.0, 0.0, 0.0)),
+            Camera.perspective(50 + pose[0]),
+            Camera.orthographic(eye, (0.0, 0.0, 0.0), height=1 + pose[0]),
+        )
+        return sum((c.projection @ c.view).square().sum() for c in cameras) + rts.rigid(pose).square().sum()
+
+    compiled = torch.compile(numbers, backend="aot_eager")
+    assert_trees_close(gradient(target, compiled, pose), gradient(target, numbers, pose))
+
+
 def test_torch_autocast_leaves_cameras_and_projection_as_exact_as_they_are(on_torch):
     torch, target = on_torch
     scene = arrays(target, SCENE)

@@ -28,7 +28,7 @@ from rts.arrays.argument_checks import (
     quoted,
 )
 from rts.arrays.array_functions import described, from_numbers, promote, shape_of, unit
-from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
+from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves, record
 from rts.errors import InputError
 from rts.operations.linear import affine, matmul, specified_affine_map
@@ -142,6 +142,7 @@ class Camera:
     # ---------------------------------------------------------------------------------------- constructors
 
     @classmethod
+    @uncompiled
     def look_at(
         cls,
         eye: Any,
@@ -184,6 +185,7 @@ class Camera:
         return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
+    @uncompiled
     def perspective(
         cls,
         fov_y: Any = 45.0,
@@ -222,6 +224,7 @@ class Camera:
         return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
+    @uncompiled
     def orthographic(
         cls,
         eye: Any,
@@ -255,6 +258,7 @@ class Camera:
         return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
+    @uncompiled
     def from_opencv(
         cls,
         K: Any,
@@ -305,6 +309,7 @@ class Camera:
         return cls(view, projection, width / height)
 
     @classmethod
+    @uncompiled
     def from_mvp(cls, matrix: Any) -> Camera:
         """A camera from one matrix: model-view-projection, the product that takes the world to clip space.
 
@@ -347,6 +352,7 @@ class Camera:
         return cls(view, xp.concat([projection[:3, :], matrix_of(xp, last, m[3, 3])]))
 
     @classmethod
+    @uncompiled
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
         """A camera from OpenGL's matrices, which have the conventions of this library.
 
@@ -363,6 +369,7 @@ class Camera:
         return cls(view, projection)
 
     @classmethod
+    @uncompiled
     def from_nvdiffrast(cls, modelview: Any, projection: Any, *, top_down: bool = False) -> Camera:
         """A camera from the matrices whose product feeds `nvdiffrast`.
 
@@ -378,6 +385,7 @@ class Camera:
         return camera._flipped() if top_down else camera
 
     @classmethod
+    @uncompiled
     def from_pytorch3d(
         cls,
         R: Any,
@@ -430,6 +438,7 @@ class Camera:
         return cls(view, projection, width / height)
 
     @classmethod
+    @uncompiled
     def from_blender(
         cls, camera_to_world: Any, size: tuple[int, int], *, focal: Any, near: Any = 0.01, far: Any = 1000.0
     ) -> Camera:

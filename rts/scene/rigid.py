@@ -8,7 +8,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import check_numbers
 from rts.arrays.array_functions import is_finite, promote, shape_of
-from rts.arrays.engines import engine_of, is_constant, namespace
+from rts.arrays.engines import engine_of, is_constant, namespace, uncompiled
 from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
@@ -17,6 +17,7 @@ from rts.scene.transforms import affine_matrix
 ORIGIN = 0.0, 0.0, 0.0
 
 
+@uncompiled
 def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
 
