@@ -112,7 +112,10 @@ def spans_of(triangles, rows, vertices, faces, clip, keep, number):
         _bounds(corners, height, width, bounds)
         for axis in range(2):
             along, across = axis, 1 - axis
+            least, most = int(max(np.floor(bounds[2 * along] - 0.5), 0)), _last(bounds, along, number)
             for n in range(int(max(np.ceil(bounds[2 * across] - 0.5), 0)), _last(bounds, across, number) + 1):
+                if not _any(number, axis, n, least, most):
+                    continue
                 _on_line(t, corners, sign, clip, vertices, faces, along, n + 0.5, line)
                 low, high = _inside(line, bounds[2 * along] - 1.0, bounds[2 * along + 1] + 1.0)
                 for m in range(int(max(np.floor(low - 0.5), 0)), int(min(high - 0.5, number.shape[2 - axis] - 1)) + 1):
@@ -127,6 +130,15 @@ def spans_of(triangles, rows, vertices, faces, clip, keep, number):
                     _fill(spans[count], start, end, line, corners, m + 0.5)
                     count += 1
     return names[:count], spans[:count]
+
+
+@compiled
+def _any(number, axis, n, least, most):
+    """True if one of the gaps from `least` to `most` along a line is looked at."""
+    for m in range(least, most + 1):
+        if (number[axis, n, m] if axis == 0 else number[axis, m, n]) >= 0:
+            return True
+    return False
 
 
 @compiled
