@@ -156,7 +156,9 @@ class _Segments(NamedTuple):
         ties: (S, 2) int, the breaks at start and end.
         jump: (2, S, C), at start and end, the colour on the right of the way less that on the left.
         right: (2, S, C), the colour on the right.
-        next: (4, S) bool, is a corner of the square an end of one of these breaks' gaps, with no break between?
+        before: (2, S) bool, at start and end, is what lies before the break on the right of the way?
+        next: (4, 2, S) int, the side of the breaks, 0 or 1, that a corner of the square is next to, or −1.
+        seen: (2, S, 2) bool, is there a sample on these sides?
         moves: (3, S, 2), the motion of start, corner and end.
     """
 
@@ -167,7 +169,9 @@ class _Segments(NamedTuple):
     ties: Array
     jump: Array
     right: Array
+    before: Array
     next: Array
+    seen: Array
     moves: Array
 
     @classmethod
@@ -184,24 +188,28 @@ class _Segments(NamedTuple):
         end = xp.where(lone[:, None], along * start + (1 - along) * (1 - start), end)  # On the opposite side.
         start, end = (xp.clip(x, 0.0, 1.0) for x in (start, end))
         corner = xp.where(lone[:, None], (start + end) / 2, outlines.corner)
-        jump, right, moves = [], [], []
+        jump, right, turned, moves = [], [], [], []
         for i in (0, 1):
             before, behind = (xp.take(breaks.color[k], ties[:, i], axis=0) for k in (0, 1))
             # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
             forward = (side[:, i] < 2) if i == 0 else (side[:, i] >= 2)
             jump.append(xp.where(forward[:, None], before - behind, behind - before))
             right.append(xp.where(forward[:, None], before, behind))
+            turned.append(forward)
             moves.append(xp.take(breaks.moves, ties[:, i], axis=0))
         jump[1], right[1] = (xp.where(lone[:, None], x[0], x[1]) for x in (jump, right))
-        beside = [_next(k, ties, side, lone, outlines.ends) for k in range(4)]
+        turned[1] = xp.where(lone, turned[0], turned[1])
+        beside = xp.stack([_next(k, ties, side, lone, outlines.ends) for k in range(4)])
+        seen = xp.stack([xp.stack([xp.take(breaks.seen[k], ties[:, i]) for k in (0, 1)], axis=-1) for i in (0, 1)])
         beyond = [
             xp.take(breaks.moves, xp.where(at >= 0, at, 0), axis=0)
             for at in (outlines.beyond[:, 0], outlines.beyond[:, 1])
         ]
         pulled = (beyond[0], *moves, beyond[1])
         moves.insert(1, sum(outlines.pull[:, i, None] * x for i, x in enumerate(pulled)))
-        path, sides = xp.stack([start, corner, end]), (xp.stack(jump), xp.stack(right))
-        return cls(square, lone, path, side, ties, *sides, xp.stack(beside), xp.stack(moves))
+        path = xp.stack([start, corner, end])
+        sides = xp.stack(jump), xp.stack(right), xp.stack(turned), beside, seen
+        return cls(square, lone, path, side, ties, *sides, xp.stack(moves))
 
     def parts(self, color: Array) -> list[tuple[Array, Array, Array]]:
         """Changes that segments make: cells (x and y) and changes (S, C), for each corner of the square.
@@ -230,9 +238,18 @@ class _Segments(NamedTuple):
             share = xp.where(self.lone & ~beside, 0.0, share)[:, None]
             own = xp.where(on_right[:, None], self.right, self.right - self.jump)
             centre = xp.take(flat, y * color.shape[1] + x, axis=0)
-            differs = xp.where(self.next[k][:, None], centre - (own[0] + own[1]) / 2, 0.0)
+            differs = xp.where(self._knows(k, on_right)[:, None], centre - (own[0] + own[1]) / 2, 0.0)
             parts.append((x, y, change + share * mean - xp.abs(share) * differs))
         return parts
+
+    def _knows(self, k: int, on_right: Array) -> Array:
+        """(S,) True where the segment's side towards a corner is the surface that is seen at this corner."""
+        xp, found, fails = namespace(self.path), False, False
+        for e in (0, 1):
+            own = xp.where(self.before[e] == on_right, 0, 1)
+            found = found | (self.next[k, e] == own)
+            fails = fails | (self.next[k, e] == 1 - own) | ~xp.where(own == 0, self.seen[e, :, 0], self.seen[e, :, 1])
+        return found & ~fails
 
     def normals(self, breaks: _Breaks) -> Array:
         """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
@@ -301,13 +318,12 @@ class _Segments(NamedTuple):
 
 def _next(k: int, ties: Array, side: Array, lone: Array, ends: Array) -> Array:
     """`_Segments.next` of the corner k."""
-    xp, found = namespace(ties), None
+    xp, found = namespace(ties), []
     for e in (0, 1):
         first, last = (xp.take(ends[:, i], ties[:, e]) for i in (0, 1))
         begins, stops = ((side[:, e] == a) | (side[:, e] == b) for a, b in FIRST_AND_LAST[k])
-        here = (begins & first) | (stops & last)
-        found = here if found is None else found | (here & ~lone)
-    return found
+        found.append(xp.where(begins & first, 0, xp.where(stops & last, 1, -1)))
+    return xp.stack([found[0], xp.where(lone, -1, found[1])])
 
 
 FIRST_AND_LAST = (((0, 3), (9, 9)), ((1, 9), (0, 9)), ((9, 9), (1, 2)), ((2, 9), (3, 9)))

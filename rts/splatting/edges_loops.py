@@ -50,11 +50,11 @@ def _right_of_bottom(start, end, low, high):
 
 
 @compiled
-def _is_next(b, side, k, near_ends):
-    """True if a square's corner is an end of the gap of a break, on a side of the square, and no break lies between."""
-    first = (0, 1, 3, 0)[side]
-    second = (1, 2, 2, 3)[side]
-    return (k == first and near_ends[b, 0]) or (k == second and near_ends[b, 1])
+def _next_side(b, side, k, near_ends):
+    """The side of a break, 0 or 1, that a square's corner is next to; −1 if another break lies between, or no gap."""
+    if k == (0, 1, 3, 0)[side] and near_ends[b, 0]:
+        return 0
+    return 1 if k == (1, 2, 2, 3)[side] and near_ends[b, 1] else -1
 
 
 @compiled
@@ -68,7 +68,7 @@ def _point(place, gap, b, square, s, out):
 
 @loop
 def weigh_segments(
-    first, last, place, gap, near_ends, square, ties, side, corner, pull, border, path, share, own, flux
+    first, last, place, gap, near_ends, seen, square, ties, side, corner, pull, border, path, share, own, flux
 ):
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
@@ -78,6 +78,7 @@ def weigh_segments(
         place: (B,) of outlines.
         gap: (B, 3).
         near_ends: (B, 2), `Outlines.ends`.
+        seen: (B, 2) bool, is there a sample before and behind?
         square: (S, 2).
         ties: (S, 2).
         side: (S, 2).
@@ -156,9 +157,12 @@ def weigh_segments(
             counts = not lone or side0 == k or side0 == (k + 3) % 4
             beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
             share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
-            own[s, k, 0] = own[s, k, 1] = -1
-            if _is_next(ties[s, 0], side0, k, near_ends) or (not lone and _is_next(ties[s, 1], side1, k, near_ends)):
-                own[s, k, 0], own[s, k, 1] = (sign0 > 0) != on_right, (sign1 > 0) != on_right
+            first, second = int((sign0 > 0) != on_right), int((sign1 > 0) != on_right)
+            at_start = _next_side(ties[s, 0], side0, k, near_ends)
+            at_end = -1 if lone else _next_side(ties[s, 1], side1, k, near_ends)
+            known = (at_start == first or at_end == second) and at_start != 1 - first and at_end != 1 - second
+            known = known and seen[ties[s, 0], first] and seen[ties[s, 0] if lone else ties[s, 1], second]
+            own[s, k, 0], own[s, k, 1] = (first, second) if known else (-1, -1)
 
 
 @loop

@@ -59,11 +59,11 @@ class _Weights(NamedTuple):
         loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
         ties = outlines.ties
         known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER, path, share, own, flux
-        at = outlines.place, gap, outlines.ends
+        seen = outlines.rows >= 0
+        at = outlines.place, gap, outlines.ends, seen
         parallel(loops.weigh_segments, segments, *at, *known, work=400 * segments)
-        seen, normal = outlines.rows >= 0, np.empty((count, 2))
-        arrays = outlines.place, gap, outlines.ends, seen, ties, path, outlines.joined, normal, cells, sides
-        loops.weigh_sides(*arrays)
+        normal = np.empty((count, 2))
+        loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
         return cls(shown, points, moves, share, own, flux, cells, sides)
 
 
