@@ -198,7 +198,7 @@ def compare(
     if not is_count(truth_samples):
         raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     names, without = usable("rts.splatters", splatters)
-    if not any(combine(name, samples) for name in names for samples in samples_a_pixel):
+    if names and not any(combine(name, samples) for name in names for samples in samples_a_pixel):
         raise InputError(
             f"supersample is {quoted(supersample)}, and {', '.join(names)} finds outlines without further samples; "
             f"give whole numbers, too, or another splatter"

@@ -5,7 +5,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("trimesh")
 
-pytestmark = [pytest.mark.splatting, pytest.mark.thorough]
+pytestmark = pytest.mark.splatting
 
 BOUNDS = {
     "silhouette": {"edges 1 × 1": (0.12, 0.04), "edges 4 × 4": (0.12, 0.04)},
@@ -15,6 +15,7 @@ BOUNDS = {
 """The largest error and difference of the gain from 1, by the kind of vertices."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", BOUNDS)
 def test_gradients_of_vertices_are_those_of_area_sampled_images(kind):
     from benchmarks.edges_vertices import scores
@@ -25,6 +26,7 @@ def test_gradients_of_vertices_are_those_of_area_sampled_images(kind):
     assert found["visible 1 × 1"][0] > found["edges 1 × 1"][0]
 
 
+@pytest.mark.thorough
 def test_silhouettes_move_vertices_several_times_as_truly_as_with_visible():
     from benchmarks.edges_vertices import scores
 

@@ -86,6 +86,22 @@ def _room(table, more):
     return longer
 
 
+@compiled
+def _add_spans(t, axis, n, begin, stop, low, high, number, line, corners, count, names, spans):
+    """Add a triangle's spans on the gaps from `begin` to `stop` of a line, of which it covers what is from low to high.
+
+    Returns the number of all spans.
+    """
+    for m in range(begin, stop):
+        gap, start, end = (number[axis, n, m] if axis == 0 else number[axis, m, n]), low - 0.5 - m, high - 0.5 - m
+        if gap < 0 or min(end, 1.0) - max(start, 0.0) <= TINY:
+            continue
+        names[count, 0], names[count, 1] = gap, t
+        _fill(spans[count], start, end, line, corners, m + 0.5)
+        count += 1
+    return count
+
+
 @loop
 def spans_of(triangles, rows, vertices, faces, clip, keep, number):
     """Spans of triangles on gaps.
@@ -118,17 +134,9 @@ def spans_of(triangles, rows, vertices, faces, clip, keep, number):
                     continue
                 _on_line(t, corners, sign, clip, vertices, faces, along, n + 0.5, line)
                 low, high = _inside(line, bounds[2 * along] - 1.0, bounds[2 * along + 1] + 1.0)
-                for m in range(int(max(np.floor(low - 0.5), 0)), int(min(high - 0.5, number.shape[2 - axis] - 1)) + 1):
-                    gap = number[axis, n, m] if axis == 0 else number[axis, m, n]
-                    if gap < 0:
-                        continue
-                    start, end = low - 0.5 - m, high - 0.5 - m
-                    if min(end, 1.0) - max(start, 0.0) <= TINY:
-                        continue
-                    names, spans = _room(names, count + 1), _room(spans, count + 1)
-                    names[count, 0], names[count, 1] = gap, t
-                    _fill(spans[count], start, end, line, corners, m + 0.5)
-                    count += 1
+                begin, stop = int(max(np.floor(low - 0.5), 0)), int(min(high - 0.5, number.shape[2 - axis] - 1)) + 1
+                names, spans = _room(names, count + stop - begin), _room(spans, count + stop - begin)
+                count = _add_spans(t, axis, n, begin, stop, low, high, number, line, corners, count, names, spans)
     return names[:count], spans[:count]
 
 
@@ -232,7 +240,7 @@ def _z(spans, i, place):
 
 @compiled
 def _nearest(spans, own, place, beyond):
-    """Of a gap's spans, the nearest that covers `place`, and goes on after it; −1 for none."""
+    """The nearest of a gap's spans that covers `place`, and goes on after it; −1 for none."""
     best = NOTHING
     for i in own:
         if spans[i, 0] <= place + beyond and spans[i, 1] > place + beyond:

@@ -66,6 +66,24 @@ def _point(place, gap, b, square, s, out):
     out[0], out[1] = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
 
 
+@compiled
+def _add_flux(flux, pull, i, lone, t, first, second, dx, dy):
+    """Add a straight piece (dx, dy), with weights of both jumps, to the `flux` (2, 4, 2) of a cell; see below.
+
+    The piece lies at t between start and corner (i = 0), or between corner and end.
+    """
+    if first == 0 and second == 0:
+        return
+    for m in range(4):
+        rate = (1 - t) * (m == 1) + t * pull[m] if i == 0 else (1 - t) * pull[m] + t * (m == 2)
+        if lone:
+            rate = 1.0 if m == 1 else 0.0
+        flux[0, m, 0] += rate * first * dy
+        flux[0, m, 1] -= rate * first * dx
+        flux[1, m, 0] += rate * second * dy
+        flux[1, m, 1] -= rate * second * dx
+
+
 @loop
 def weigh_segments(
     first, last, place, gap, near_ends, seen, square, ties, side, corner, pull, border, path, share, own, flux
@@ -135,21 +153,10 @@ def weigh_segments(
                 below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
                 for k in range(4):
                     east, south = k == 1 or k == 2, k >= 2
-                    if (px >= 0.5) == east:
-                        area[k] -= min(max(py - (0.5 if south else 0.0), 0.0), 0.5) * dx
-                    of_cell = (right if east else 1 - right) * (below if south else 1 - below)
-                    if of_cell == 0 or not counts:
-                        continue
-                    for m in range(4):
-                        # Of start and corner, or corner and end.
-                        rate = (1 - t) * (m == 1) + t * pull[s, m] if i == 0 else (1 - t) * pull[s, m] + t * (m == 2)
-                        if lone:
-                            rate = 1.0 if m == 1 else 0.0
-                        rate *= of_cell
-                        flux[s, k, 0, m, 0] += rate * (1 - u) * sign0 * dy
-                        flux[s, k, 0, m, 1] -= rate * (1 - u) * sign0 * dx
-                        flux[s, k, 1, m, 0] += rate * u * sign1 * dy
-                        flux[s, k, 1, m, 1] -= rate * u * sign1 * dx
+                    height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
+                    area[k] -= height * dx
+                    of_cell = (right if east else 1 - right) * (below if south else 1 - below) * counts
+                    _add_flux(flux[s, k], pull[s], i, lone, t, of_cell * (1 - u) * sign0, of_cell * u * sign1, dx, dy)
         for k in range(4):
             # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
             after, until = side0 >= k, side1 >= k
@@ -294,11 +301,9 @@ def pull_inside(rgba, row, joined, g, g_positions, g_rgba):
                     g_rgba[n, c] += g[y, x, c]
             if len(g_positions):
                 _around(row, joined, y, x, around)
-                for axis in range(2):
-                    total = 0.0
-                    for c in range(rgba.shape[1]):
-                        total += _slope(rgba, around, axis, c) * g[y, x, c]
-                    g_positions[n, axis] -= total
+                for c in range(rgba.shape[1]):
+                    g_positions[n, 0] -= _slope(rgba, around, 0, c) * g[y, x, c]
+                    g_positions[n, 1] -= _slope(rgba, around, 1, c) * g[y, x, c]
 
 
 @compiled
@@ -355,6 +360,26 @@ def motions(positions, rows, points, moves, out):
                     out[b, a] += moves[b, i, 0, a] * x + moves[b, i, 1, a] * y + moves[b, i, 2, a] * positions[n, 2]
 
 
+@compiled
+def _fill_rates(s, ties, beyond, flux, motion, rate):
+    """Fill `rate` (2,): the flux through a segment in one cell, for each of its two jumps."""
+    for m in range(4):
+        b = _last(s, ties, m, beyond)
+        if b >= 0:
+            rate[0] += flux[0, m, 0] * motion[b, 0] + flux[0, m, 1] * motion[b, 1]
+            rate[1] += flux[1, m, 0] * motion[b, 0] + flux[1, m, 1] * motion[b, 1]
+
+
+@compiled
+def _pull_rates(s, ties, beyond, flux, rate, g_motion):
+    """Add to gradients of motions those of `_fill_rates`; `rate` (2,) are those of the rates."""
+    for m in range(4):
+        b = _last(s, ties, m, beyond)
+        if b >= 0:
+            g_motion[b, 0] += rate[0] * flux[0, m, 0] + rate[1] * flux[1, m, 0]
+            g_motion[b, 1] += rate[0] * flux[0, m, 1] + rate[1] * flux[1, m, 1]
+
+
 @loop
 def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump, steady, motion, out):
     """Add to an image (H, W, C) the changes that segments make.
@@ -382,20 +407,16 @@ def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump,
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
             known, rate[:] = own[s, k, 0] >= 0, 0.0
             if len(motion):
-                for m in range(4):
-                    b = _last(s, ties, m, beyond)
-                    if b >= 0:
-                        for e in range(2):
-                            rate[e] += flux[s, k, e, m, 0] * motion[b, 0] + flux[s, k, e, m, 1] * motion[b, 1]
+                _fill_rates(s, ties, beyond, flux[s, k], motion, rate)
             for c in range(channels):
                 value = rate[0] * steady[start, c] + rate[1] * steady[end, c]
                 if len(jump):
                     value += share[s, k, 0] * jump[start, c] + share[s, k, 1] * jump[end, c]
-                    if known:
-                        # What is taken away of the cell's own surface has the colour at its centre.
-                        here = _of(rgba, row[y, x], c)
-                        value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, own[s, k, 0]], c))
-                        value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, own[s, k, 1]], c))
+                if len(jump) and known:
+                    # What is taken away of the cell's own surface has the colour at its centre.
+                    here = _of(rgba, row[y, x], c)
+                    value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, own[s, k, 0]], c))
+                    value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, own[s, k, 1]], c))
                 out[y, x, c] += value
 
 
@@ -421,11 +442,7 @@ def pull_segments(square, ties, beyond, share, own, flux, row, shown, steady, g,
                     _add_to(g_rgba, shown[end, own[s, k, 1]], c, other)
                     _add_to(g_rgba, row[y, x], c, -one - other)
             if len(g_motion) and (rate[0] != 0 or rate[1] != 0):
-                for m in range(4):
-                    b = _last(s, ties, m, beyond)
-                    if b >= 0:
-                        for a in range(2):
-                            g_motion[b, a] += rate[0] * flux[s, k, 0, m, a] + rate[1] * flux[s, k, 1, m, a]
+                _pull_rates(s, ties, beyond, flux[s, k], rate, g_motion)
 
 
 @loop

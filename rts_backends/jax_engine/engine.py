@@ -41,7 +41,7 @@ SMALL = 64
 """The most numbers of an array, such as a camera's matrix, whose shape is one of few."""
 
 
-def _on_device(x: np.ndarray) -> jax.Array:
+def _on_device(x: jax.Array | np.ndarray) -> jax.Array:
     """A copy of `x` as a jax array.
 
     `jnp.asarray` takes half the time, but since jax 0.10 it compiles a program for each shape, and keeps it.
