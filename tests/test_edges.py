@@ -1,5 +1,7 @@
 """Found edges: images and derivatives in closed form, flux that adds up, and what is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,6 +9,7 @@ from polygons import covered
 
 import rts
 from rts import InputError
+from rts.contracts.records import Outlines
 
 torch = pytest.importorskip("torch")
 forward = pytest.importorskip("torch.autograd.forward_ad")
@@ -274,3 +277,41 @@ def test_no_colour_leaves_the_range_of_those_that_are_seen():
     image = rts.render(rts.Part(rts.Mesh(ball.faces), theta, "lambert"), camera, (128, 128), splatter="edges")
     assert image.min() > -1e-6
     assert (image[..., :3] - image[..., 3:]).max() < 1e-6
+
+
+def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over():
+    """A triangle through the camera plane may meet a line of centres farther away than integers reach."""
+    from rts.sampling.sheets import Sheets
+
+    clip, rows = np.array([[0, 0, 1, -0.1], [0, 0, -1, 100.0]]), np.eye(4)[[0, 1, 2, 2]]
+    faces, none = np.array([[0, 1, 2], [1, 0, 2]], np.int32), np.full((2, 3), -1, np.int32)
+    number = np.full((2, 8, 8), -1, np.int32)
+    number[0, :, :-1], number[1, :-1] = np.arange(56).reshape(8, 7), np.arange(56, 112).reshape(7, 8)
+    for side in (1e-25, -1e-25):
+        for third in ((9, -5, -1), (9, 5, -1), (-9, -5, -1), (-9, 5, -1)):
+            vertices = np.array([(-1000, side, 1), (1000, 0, 1), third], np.float32)
+            names, spans = Sheets(vertices, faces, none, rows, clip, 0.0).spans(number)
+            assert ((names[:, 0] >= 0) & (names[:, 0] < 112)).all()
+            assert np.isfinite(spans).all()
+
+
+def test_a_side_where_nothing_is_seen_has_no_colour():
+    from rts.splatting import edges as module
+
+    drawn, given = module.EDGES, []
+
+    def kept(*operands):
+        given[:] = operands
+        return drawn(*operands)
+
+    module.EDGES = kept
+    try:
+        edges(two_colors())
+    finally:
+        module.EDGES = drawn
+    names = ["positions", "rgba", "row", *(field.name for field in dataclasses.fields(Outlines))]
+    rows = given[names.index("rows")].copy()
+    assert (given[names.index("inner")][::3, 0] >= 0).any()
+    rows[::3, 0] = -1
+    given[names.index("rows")] = rows
+    np.testing.assert_allclose(drawn(*given), module._specification(*given), atol=1e-5)

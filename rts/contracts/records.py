@@ -317,8 +317,8 @@ class Fine(_OnCells):
 class Outlines:
     """Outlines between the centres of cells: places where a front ends, joined into segments. They have no derivative.
 
-    A gap lies between two neighbouring centres, along a row or a column, whose fronts are not one surface. Each place
-    in a gap where the front changes is a break. Four neighbouring centres are the corners of a square; breaks on its
+    A gap lies between two neighbouring centres, along a row or a column. Each place in a gap where the front changes to
+    another surface is a break. Four neighbouring centres are the corners of a square; breaks on its
     sides are joined into segments.
 
     Attributes:

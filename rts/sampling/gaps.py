@@ -65,7 +65,7 @@ class Oracle(NamedTuple):
 
 
 class Breaks(NamedTuple):
-    """Breaks, in order of their gaps and along each. Host arrays; see `rts.contracts.records.Outlines`.
+    """Breaks, those of a gap in order along it. Host arrays; see `rts.contracts.records.Outlines`.
 
     Attributes:
         gap: (B, 3) int32.

@@ -38,10 +38,10 @@ def joined(breaks: Breaks) -> Segments:
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, height, width)
     # By squares; in each of them clockwise.
     order = np.lexsort((along, square))
-    square, along, ends = square[order], along[order], ends[order]
+    square, ends = square[order], ends[order]
     begins = np.append(np.flatnonzero(np.diff(square, prepend=-1)), len(square))
     partner = np.full(len(square), -1, np.int32)
-    loops.join(begins, along, ends, breaks.place, partner)
+    loops.join(begins, ends, breaks.place, partner)
     origin, ties, side = loops.segments_of(square, ends, partner, width)
     around = loops.beyond(ties, len(breaks.place))
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))

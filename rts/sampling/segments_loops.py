@@ -50,7 +50,7 @@ def ends_of(gap, place, near, parts, height, width):
 
 
 @loop
-def join(begins, along, ends, place, partner):
+def join(begins, ends, place, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
     Only ends with the same part in front are joined, one that leaves it with one that enters it. The least cost of
@@ -58,15 +58,14 @@ def join(begins, along, ends, place, partner):
 
     Args:
         begins: (Q + 1,) where the ends of each square begin.
-        along: (E,) places on the square's sides, in order.
-        ends: (E, 5), see `ends_of`.
+        ends: (E, 5), see `ends_of`; clockwise in each square.
         place: (B, 2) x and y of breaks.
         partner: (E,) int32, filled with −1.
     """
     for q in range(len(begins) - 1):
         first, n = begins[q], begins[q + 1] - begins[q]
         if n == 2:
-            if _cost(first, first + 1, along, ends, place) < 2 * LONE:
+            if _cost(first, first + 1, ends, place) < 2 * LONE:
                 partner[first], partner[first + 1] = first + 1, first
             continue
         if n < 2:
@@ -77,7 +76,7 @@ def join(begins, along, ends, place, partner):
             for i in range(n - m + 1):
                 best, choice = LONE + least[i + 1, m - 1], -1
                 for k in range(1, m):
-                    cost = _cost(first + i, first + i + k, along, ends, place)
+                    cost = _cost(first + i, first + i + k, ends, place)
                     cost += least[i + 1, k - 1] + least[i + k + 1, m - k - 1]
                     best, choice = (cost, k) if cost < best else (best, choice)
                 least[i, m], chosen[i, m] = best, choice
@@ -85,13 +84,13 @@ def join(begins, along, ends, place, partner):
 
 
 @compiled
-def _cost(a, b, along, ends, place):
+def _cost(a, b, ends, place):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
     if ends[a, 3] != ends[b, 3] or ends[a, 2] * ends[b, 2] > 0:
         return np.inf
     p, q = ends[a, 0], ends[b, 0]
     cost = np.hypot(place[p, 0] - place[q, 0], place[p, 1] - place[q, 1])
-    cost += ON_ONE_SIDE * (int(along[a]) == int(along[b])) + OTHER_BEHIND * (ends[a, 4] != ends[b, 4])
+    cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (ends[a, 4] != ends[b, 4])
     return cost + OTHER_KIND * ((ends[a, 2] == 0) != (ends[b, 2] == 0))
 
 

@@ -197,7 +197,7 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
                     # Rounding may tell neighbours apart; sheets that pass through one another share no corner.
                     sign, there = corners_of(end, rows, vertices, faces, corners), depth[y + dy, x + dx]
                     z = _depth(corners, sign, x + dx + 0.5, y + dy + 0.5)[0]
-                    joined[axis, y, x] = abs(z - there) <= 1e-5 * there
+                    joined[axis, y, x] = abs(z - there) <= 1e-5 * abs(there)
 
 
 @loop

@@ -51,8 +51,16 @@ def _crosses(low_x, high_x, low_y, high_y, number):
     for axis in range(2):  # Along rows, then along columns.
         # Centres are at half cells; a gap reaches over one cell from its first centre on.
         far_x, far_y = (1.5, 0.5) if axis == 0 else (0.5, 1.5)
-        for y in range(int(max(np.ceil(low_y - far_y), 0)), int(min(np.floor(high_y - 0.5), height - 1)) + 1):
-            for x in range(int(max(np.ceil(low_x - far_x), 0)), int(min(np.floor(high_x - 0.5), width - 1)) + 1):
+        first_y, last_y = (
+            min(max(np.ceil(low_y - far_y), 0.0), height),
+            max(min(np.floor(high_y - 0.5), height - 1), -1.0),
+        )
+        first_x, last_x = (
+            min(max(np.ceil(low_x - far_x), 0.0), width),
+            max(min(np.floor(high_x - 0.5), width - 1), -1.0),
+        )
+        for y in range(int(first_y), int(last_y) + 1):
+            for x in range(int(first_x), int(last_x) + 1):
                 if number[axis, y, x] >= 0:
                     return True
     return False
@@ -123,7 +131,7 @@ def spans_of(triangles, rows, vertices, faces, clip, keep, number):
     corners, bounds, line = np.empty((3, 4)), np.empty(4), np.empty((6, 2))
     for t in triangles:
         sign = corners_of(t, rows, vertices, faces, corners)
-        if sign == 0 or sign * keep < 0:
+        if not abs(sign) > 0 or sign * keep < 0:  # NaN, too.
             continue
         _bounds(corners, height, width, bounds)
         for axis in range(2):
@@ -203,7 +211,8 @@ def _inside(line, low, high):
             high = min(high, -c / d)
         elif c < 0:
             return 0.0, -1.0
-    return low, high
+    # An edge along the line, but for rounding, meets it farther away than integers reach.
+    return (low, high) if low < high else (0.0, -1.0)
 
 
 @compiled
@@ -269,9 +278,9 @@ def _overtaken(spans, own, x, place):
             continue
         z = _z(spans, x, low)
         before, after = _z(spans, i, low) - z, _z(spans, i, high) - _z(spans, x, high)
-        if before < -MARGIN * z:
+        if before < -MARGIN * abs(z):
             at = low
-        elif after < -MARGIN * z:
+        elif after < -MARGIN * abs(z):
             # Linear in homogeneous coordinates, where depths are.
             wide = (spans[i, 4] + spans[i, 5] * low) * (spans[x, 4] + spans[x, 5] * low)
             far = (spans[i, 4] + spans[i, 5] * high) * (spans[x, 4] + spans[x, 5] * high)
@@ -345,7 +354,7 @@ def _agree(spans, own, seen, depth, centre):
     """Empty the spans that reach over a centre before what is seen there: they touch the line with an edge alone."""
     for i in own:
         if spans[i, 0] < centre - TOUCH and spans[i, 1] > centre + TOUCH:
-            if not seen or _z(spans, i, centre) < (1 - ALIKE) * depth:
+            if not seen or _z(spans, i, centre) < depth - ALIKE * abs(depth):
                 spans[i, 0], spans[i, 1] = 9.0, 9.0
 
 
@@ -354,7 +363,7 @@ def _goes_on(spans, parts, own, x, place, way):
     """True if a surface that ends (way 1) or starts (way 0) at a place with the span x goes on there with another."""
     for i in own:
         if i != x and parts[i] == parts[x] and abs(spans[i, 1 - way] - place) <= TOUCH:
-            if abs(_z(spans, i, place) - _z(spans, x, place)) <= ALIKE * _z(spans, x, place):
+            if abs(_z(spans, i, place) - _z(spans, x, place)) <= ALIKE * abs(_z(spans, x, place)):
                 return True
     return False
 
@@ -376,7 +385,7 @@ def _kind(spans, parts, own, a, b, depth, place):
         return 1 if a == NOTHING else 0
     za = _z(spans, a, place) if a >= 0 else depth[0]
     zb = _z(spans, b, place) if b >= 0 else depth[1]
-    if abs(za - zb) > ALIKE * max(za, zb):
+    if abs(za - zb) > ALIKE * max(abs(za), abs(zb)):
         return 0 if za < zb else 1
     # What is seen at a centre goes on beyond it.
     ends = a >= 0 and spans[a, 1] <= place + TOUCH
@@ -399,7 +408,7 @@ def _continues(spans, parts, names, ends, depth, a, b, place):
     if ta == tb:
         return True
     za, zb = _z(spans, a, place) if a >= 0 else depth[0], _z(spans, b, place) if b >= 0 else depth[1]
-    if abs(za - zb) > ALIKE * max(za, zb):
+    if abs(za - zb) > ALIKE * max(abs(za), abs(zb)):
         return False
     return (a < 0 or spans[a, 1] <= place + TOUCH) and (b < 0 or spans[b, 0] >= place - TOUCH)
 

@@ -5,11 +5,12 @@
 
     C       the colour of the centre's sample; ∇C its slope across the image, from the next centres on the same surface
     m       the motion of this sample in the image: 0 in value, it has the derivative
-    J       the colour on one side of a segment less that on the other, from the last samples beside its two breaks
+    J       the colour on one side of a segment less that on the other, from the last samples beside its two breaks;
+            in the shares, on the side of the cell's own surface, the colour C
     v       the motion of a break, linear between the two: that of the last sample of the surface that ends there
     n ds    along the part of the segment inside the pixel
 
-Shares have no derivative, and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the
+Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative, and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the
 flux, J are constants.
 """
 
@@ -135,7 +136,10 @@ class _Breaks(NamedTuple):
         motion = [xp.where(seen[i][:, None], found[i][:, :2] - points[i], 0.0) for i in (0, 1)]
         # Where surfaces pass through one another, the line moves to where their depths are equal.
         slope = outlines.slope
-        still = [found[i][:, 2] - stopped(found[i][:, 2]) - xp.sum(slope[:, i] * motion[i], axis=-1) for i in (0, 1)]
+        still = [
+            xp.where(seen[i], found[i][:, 2] - stopped(found[i][:, 2]), 0.0) - xp.sum(slope[:, i] * motion[i], axis=-1)
+            for i in (0, 1)
+        ]
         apart = slope[:, 0] - slope[:, 1]
         square = xp.sum(apart * apart, axis=-1)
         crossing = outlines.near == 2
@@ -338,8 +342,8 @@ def _beside_breaks(
     From the centre to the break, at a distance d, the colour changes from C to that of the last sample, X. Of this
     change the share up to the border, at ½, belongs to the centre's cell, and the rest to the next one. It moves along
     the outline's normal n, with the mean motion of both samples. What is left of a cell that the outline cuts has a
-    mean colour other than C: the slope from the centre before tells it, so that no colour leaves the range of those
-    that are seen. The strip in the next cell differs from X by half the slope times its width.
+    mean colour other than C: the slope from the centre before tells it. The strip in the next cell differs from X by
+    half the slope times its width.
     """
     xp, (height, width) = namespace(color), color.shape[:2]
     y, x, row = (outlines.gap[:, i] for i in range(3))

@@ -104,7 +104,7 @@ def weigh_segments(
         pull: (S, 4).
         border: width of the strip along a border of two pixels in which an edge belongs to both.
         path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
-        share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps before and behind both breaks.
+        share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps at start and end.
         own: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that the cell's
             centre shows; −1 if another may lie between.
         flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
@@ -184,7 +184,7 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
         ties: (S, 2).
         path: (S, 3, 2), see `weigh_segments`.
         joined: (2, H, W).
-        normal: (B, 2), zeros.
+        normal: (B, 2) to fill.
         cells: (B, 2, 3) int32 to fill, for each side: the gap's cell on it (flat), the other one, and the one before,
             if it shows the same surface, else the first again; −1 in first place for a side that does not count.
         sides: (B, 2, 5) to fill: the share of the change that belongs to the first cell; in that cell the weight of the

@@ -50,7 +50,7 @@ class _Weights(NamedTuple):
         from rts.splatting import edges_loops as loops
 
         count, segments, gap = len(outlines.place), len(outlines.square), outlines.gap
-        shown = np.where(outlines.inner >= 0, outlines.inner, outlines.rows)
+        shown = np.where((outlines.rows >= 0) & (outlines.inner >= 0), outlines.inner, outlines.rows)
         step = np.stack([gap[:, 2], 1 - gap[:, 2]], axis=1)
         points = gap[:, None, 1::-1] + 0.5 + np.asarray(outlines.points, np.float64)[..., None] * step[:, None]
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
