@@ -45,22 +45,22 @@ def projected(first, last, vertices, rows, seen):
 
 
 @compiled
+def _within(low, high, count):
+    """The first and last of `count` cells from `low` to `high`, which may be farther away than integers reach."""
+    return int(min(max(low, 0.0), count)), int(max(min(high, count - 1.0), -1.0))
+
+
+@compiled
 def _crosses(low_x, high_x, low_y, high_y, number):
     """True if a gap with a number meets a box."""
     height, width = number.shape[1:]
     for axis in range(2):  # Along rows, then along columns.
         # Centres are at half cells; a gap reaches over one cell from its first centre on.
         far_x, far_y = (1.5, 0.5) if axis == 0 else (0.5, 1.5)
-        first_y, last_y = (
-            min(max(np.ceil(low_y - far_y), 0.0), height),
-            max(min(np.floor(high_y - 0.5), height - 1), -1.0),
-        )
-        first_x, last_x = (
-            min(max(np.ceil(low_x - far_x), 0.0), width),
-            max(min(np.floor(high_x - 0.5), width - 1), -1.0),
-        )
-        for y in range(int(first_y), int(last_y) + 1):
-            for x in range(int(first_x), int(last_x) + 1):
+        first_x, last_x = _within(np.ceil(low_x - far_x), np.floor(high_x - 0.5), width)
+        first_y, last_y = _within(np.ceil(low_y - far_y), np.floor(high_y - 0.5), height)
+        for y in range(first_y, last_y + 1):
+            for x in range(first_x, last_x + 1):
                 if number[axis, y, x] >= 0:
                     return True
     return False

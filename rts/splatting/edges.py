@@ -10,8 +10,8 @@
     v       the motion of a break, linear between the two: that of the last sample of the surface that ends there
     n ds    along the part of the segment inside the pixel
 
-Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative, and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the
-flux, J are constants.
+Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative,
+and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the flux, J are constants.
 """
 
 from __future__ import annotations
@@ -136,10 +136,8 @@ class _Breaks(NamedTuple):
         motion = [xp.where(seen[i][:, None], found[i][:, :2] - points[i], 0.0) for i in (0, 1)]
         # Where surfaces pass through one another, the line moves to where their depths are equal.
         slope = outlines.slope
-        still = [
-            xp.where(seen[i], found[i][:, 2] - stopped(found[i][:, 2]), 0.0) - xp.sum(slope[:, i] * motion[i], axis=-1)
-            for i in (0, 1)
-        ]
+        depth = [xp.where(seen[i], found[i][:, 2] - stopped(found[i][:, 2]), 0.0) for i in (0, 1)]
+        still = [depth[i] - xp.sum(slope[:, i] * motion[i], axis=-1) for i in (0, 1)]
         apart = slope[:, 0] - slope[:, 1]
         square = xp.sum(apart * apart, axis=-1)
         crossing = outlines.near == 2
