@@ -13,6 +13,30 @@ from rts.sampling.points import kept_sign, near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
 
+class Gaps(NamedTuple):
+    """Gaps to look at: those of each row of centres, one row after the other, then those of each column.
+
+    Attributes:
+        gap: (M, 3) int32, y and x of the first centre; 1 for a gap along a row, 0 along a column.
+        rows: (H, W) int32, how many of them come before each centre of a row.
+        columns: (W, H) int32, and of a column.
+    """
+
+    gap: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of(cls, marks: np.ndarray) -> Gaps:
+        """The gaps that are marked (2, H, W), along rows and along columns."""
+        from rts.sampling import spans_loops
+
+        (height, width), gap = marks.shape[1:], np.empty((np.count_nonzero(marks), 3), np.int32)
+        rows, columns = np.empty((height, width), np.int32), np.empty((width, height), np.int32)
+        spans_loops.number(marks, gap, rows, columns)
+        return cls(gap, rows, columns)
+
+
 class Sheets(NamedTuple):
     """A part's triangles as a camera sees them.
 
@@ -23,6 +47,7 @@ class Sheets(NamedTuple):
         rows: (4, 4), see `Camera.pixel_rows`.
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: sign of the determinants on screen of triangles to keep; 0 for both.
+        seen: (V, 2) float32, where vertices lie in the image, in cells; NaN for those behind the camera.
     """
 
     vertices: np.ndarray
@@ -31,13 +56,18 @@ class Sheets(NamedTuple):
     rows: np.ndarray
     clip: np.ndarray
     keep: float
+    seen: np.ndarray
 
     @classmethod
     def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int], cull: str) -> Sheets:
         """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
-        tables = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
-        seen = pixel_rows(camera, size), near_and_far(camera), kept_sign(camera, cull)
-        return cls(*tables, _beyond(proxy.faces), *seen)
+        from rts.sampling import sheets_loops
+
+        vertices, faces = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
+        rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
+        parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
+        beyond = _beyond(proxy.faces)
+        return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen)
 
     def join(self, own: int, part: np.ndarray, triangle: np.ndarray, depth: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose fronts, of the part `own`, a sheet joins to the next ones'.
@@ -46,19 +76,32 @@ class Sheets(NamedTuple):
         """
         from rts.sampling import sheets_loops
 
-        mesh, height = (self.rows, self.vertices, self.faces, self.beyond), len(part)
+        mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(part)
         arguments = part, triangle, depth, own, *mesh, self.keep != 0, joined
         parallel(sheets_loops.seams, height, *arguments, work=20 * part.size)
 
-    def spans(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The triangles' spans on gaps, whose numbers stand in `number` (2, H, W): see `spans_loops.spans_of`."""
+    def near(self, cells: np.ndarray) -> np.ndarray:
+        """The triangles (M,), that may meet one of the cells which are marked (H, W)."""
         from rts.sampling import spans_loops
 
-        seen, near = np.empty((len(self.vertices), 2), np.float32), np.empty(len(self.faces), np.bool_)
-        parallel(spans_loops.projected, len(seen), self.vertices, self.rows, seen, work=10 * len(seen))
-        parallel(spans_loops.near_gaps, len(near), self.faces, seen, self.keep, number, near, work=20 * len(near))
-        mesh = self.rows, self.vertices, self.faces, self.clip, self.keep
-        return spans_loops.spans_of(np.flatnonzero(near), *mesh, number)
+        near = np.empty(len(self.faces), np.bool_)
+        parallel(spans_loops.near, len(near), self.faces, self.seen, self.keep, cells, near, work=10 * len(near))
+        return np.flatnonzero(near)
+
+    def spans(self, triangles: np.ndarray, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
+        """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
+        from rts.sampling import spans_loops
+
+        most, count = np.empty(len(triangles), np.int64), len(triangles)
+        own = triangles, self.faces, self.seen, self.keep
+        parallel(spans_loops.most_spans, count, *own, gaps.rows, gaps.columns, most, work=20 * count)
+        triangles, most = triangles[most > 0], most[most > 0]
+        begins = np.cumsum(most) - most
+        names, spans = np.full((most.sum(), 2), -1, np.int32), np.empty((most.sum(), 6))
+        mesh = self.rows, self.vertices, self.faces, self.clip, self.keep, self.seen
+        arguments = triangles, begins, *mesh, *gaps, names, spans
+        parallel(spans_loops.spans_of, len(triangles), *arguments, work=200 * len(names))
+        return names, spans
 
     def at(self, triangle: np.ndarray, points: np.ndarray) -> tuple[Fragments, np.ndarray]:
         """Fragments (1, 1, M) of triangles (M,) at points (M, 2); slopes (M, 2) of depth along x and y, a cell."""

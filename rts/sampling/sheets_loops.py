@@ -75,6 +75,19 @@ def neighbours(faces, order):
     return found
 
 
+@loop
+def projected(first, last, vertices, rows, seen):
+    """Fill `seen` (V, 2) float32: where vertices lie in the image, in cells; NaN for those behind the camera."""
+    for v in range(first, last):
+        x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
+        w = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3]
+        if w > 0:
+            seen[v, 0] = (rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]) / w
+            seen[v, 1] = (rows[1, 0] * x + rows[1, 1] * y + rows[1, 2] * z + rows[1, 3]) / w
+        else:
+            seen[v] = np.nan
+
+
 @compiled
 def _opposite(faces, t, i, j):
     """The corner of triangle t that is neither i nor j."""
@@ -85,65 +98,56 @@ def _opposite(faces, t, i, j):
 
 
 @compiled
-def _beside(v, axis, at, rows, vertices, corner):
-    """Fill `corner` with a vertex's position along a line of centres, times w; its distance from the line; and w."""
-    x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
-    along, across = axis, 1 - axis
-    w = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3]
-    corner[0] = rows[along, 0] * x + rows[along, 1] * y + rows[along, 2] * z + rows[along, 3]
-    corner[1] = rows[across, 0] * x + rows[across, 1] * y + rows[across, 2] * z + rows[across, 3] - at * w
-    corner[2] = w
+def _meets(a, b, axis, at, seen):
+    """Where an edge between two vertices, on both sides of a line of centres, meets the line."""
+    far, near = seen[b, 1 - axis] - at, seen[a, 1 - axis] - at
+    return seen[a, axis] - near * (seen[b, axis] - seen[a, axis]) / (far - near)
 
 
 @compiled
-def _meets(a, b):
-    """Where an edge between two corners, on both sides of a line, meets the line."""
-    return (a[0] * b[1] - b[0] * a[1]) / (a[2] * b[1] - b[2] * a[1])
-
-
-@compiled
-def _walked(t, start, axis, at, rows, vertices, faces, beyond, corners):
+def _walked(t, target, start, axis, at, seen, faces, beyond):
     """The triangle that a walk from triangle to triangle, a cell along a line of centres, ends on.
 
-    It ends before that, with −1, where the sheet ends or turns away.
+    It ends before that, with −1, where the sheet ends, turns away, or reaches behind the camera.
 
     Args:
         t: the first triangle, which the line meets at `start`.
+        target: a triangle which the walk need not leave.
         start: where the walk starts, along the line.
         axis: 0 for lines along x, 1 along y.
         at: the line's place along the other axis.
-        rows: (4, 4), see `corners_of`.
-        vertices: (V, 3).
+        seen: (V, 2), see `projected`.
         faces: (T, 3).
         beyond: (T, 3).
-        corners: (3, 3), room for corners.
     """
-    for c in range(3):
-        _beside(faces[t, c], axis, at, rows, vertices, corners[c])
     out, place = -1, -np.inf
     for c in range(3):
-        a, b = corners[(c + 1) % 3], corners[(c + 2) % 3]
-        if (a[1] >= 0) != (b[1] >= 0) and _meets(a, b) > place:
-            out, place = c, _meets(a, b)
+        a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
+        if np.isnan(seen[a, 0]):
+            return np.int32(-1)
+        if (seen[a, 1 - axis] >= at) != (seen[b, 1 - axis] >= at):
+            there = _meets(a, b, axis, at, seen)
+            if there > place:
+                out, place = c, there
     if out < 0:
         return np.int32(-1)
-    # The edge that the line goes out through: its vertices, and the places of their corners.
-    a, b, third = (out + 1) % 3, (out + 2) % 3, out
-    first, second = faces[t, a], faces[t, b]
+    # The edge that the line goes out through.
+    first, second = faces[t, (out + 1) % 3], faces[t, (out + 2) % 3]
     for _ in range(STEPS):
         if place >= start + 1:
             return t
         s = beyond[t, out]
-        if s < 0:
+        if s < 0 or s == target:
+            return s
+        third = faces[s, _opposite(faces, s, first, second)]
+        if np.isnan(seen[third, 0]):
             return np.int32(-1)
-        k = _opposite(faces, s, first, second)
-        _beside(faces[s, k], axis, at, rows, vertices, corners[third])
-        # The corner on the other side of the line than the third one stays.
-        if (corners[a, 1] >= 0) != (corners[third, 1] >= 0):
-            b, third, second = third, b, faces[s, k]
+        # The vertex on the other side of the line than the third one stays.
+        if (seen[first, 1 - axis] >= at) != (seen[third, 1 - axis] >= at):
+            second = third
         else:
-            a, third, first = third, a, faces[s, k]
-        before, place = place, _meets(corners[a], corners[b])
+            first = third
+        before, place = place, _meets(first, second, axis, at, seen)
         if place < before:
             return np.int32(-1)  # The triangle lies on the same side of the edge: the sheet turns away.
         t, out = s, _opposite(faces, s, first, second)
@@ -161,7 +165,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond, one_sided, joined):
+def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, beyond, one_sided, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
 
     Args:
@@ -171,6 +175,7 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
         triangle: (H, W) int32, and their triangles.
         depth: (H, W) float64.
         own: the part that the further arguments belong to.
+        seen: (V, 2), see `projected`.
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
@@ -178,7 +183,7 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
         one_sided: True if only one side of triangles is seen, so that two which share an edge do not fold there.
         joined: (2, H, W) bool to fill: along x, and along y.
     """
-    (height, width), corners, edges = part.shape, np.empty((3, 4)), np.empty((3, 3))
+    (height, width), corners = part.shape, np.empty((3, 4))
     for y in range(first, last):
         for x in range(width):
             if part[y, x] != own:
@@ -191,7 +196,7 @@ def seams(first, last, part, triangle, depth, own, rows, vertices, faces, beyond
                 end = s
                 if t != s and not (one_sided and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
-                    end = _walked(t, start, axis, at, rows, vertices, faces, beyond, edges)
+                    end = _walked(t, s, start, axis, at, seen, faces, beyond)
                 joined[axis, y, x] = end == s
                 if end >= 0 and end != s and _touch(faces, end, s):
                     # Rounding may tell neighbours apart; sheets that pass through one another share no corner.

@@ -12,11 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import FINE, INNER, Breaks, Fronts
-from rts.sampling.sheets import Sheets
+from rts.sampling.gaps import INNER, Breaks, Fronts
+from rts.sampling.sheets import Gaps, Sheets
 
 ROUNDS = 8
 """How often the search goes on where outlines leave the gaps that were searched, each time twice as far."""
+
+REACH = 3
+"""How many cells around the gaps of the first round those of the second may lie."""
 
 
 def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndarray) -> Breaks:
@@ -30,18 +33,16 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     joined = np.zeros((2, *fronts.part.shape), np.bool_)
     for part, own in enumerate(sheets):
         own.join(part, *fronts, joined)
-    open_ = _open(fronts.part, joined)
-    searched, found = open_.copy(), [_swept(open_, fronts, sheets)]
+    search = _Search(fronts, sheets)
+    searched = _gaps_apart(fronts.part, joined)
+    found = [search.breaks(searched)]
     for n in range(ROUNDS):
-        squares = _squares_of(found[-1][0], searched)
-        if not len(squares):
+        more = _gaps_beyond(found[-1][0], searched, 2**n)
+        if more is None:
             break
-        more = np.zeros_like(searched)
-        _mark(squares, 2**n, more)
-        more &= ~searched
         searched |= more
-        found.append(_swept(more, fronts, sheets))
-    gap, whole, numbers = (np.concatenate(x) for x in zip(*found, strict=True))
+        found.append(search.breaks(more))
+    gap, whole, numbers = found[0] if len(found) == 1 else (np.concatenate(x) for x in zip(*found, strict=True))
     # In one surface from centre to centre.
     inside = fronts.part >= 0
     joined[0, :, :-1] = inside[:, 1:] & (fronts.part[:, 1:] == fronts.part[:, :-1])
@@ -58,76 +59,97 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     return Breaks(gap, points[:, 0], near, slope, ends, points[:, 1:3], points[:, 3:], parts, joined, triangles)
 
 
-def _swept(open_: np.ndarray, fronts: Fronts, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The breaks in the gaps that are marked (2, H, W): the gap of each (B, 3); see `spans_loops.breaks`."""
-    from rts.sampling import spans_loops
+class _Search:
+    """A search for the breaks in gaps, which remembers the triangles around the gaps of the last one.
 
-    gap, number = _numbered(open_)
-    ends = np.empty((len(gap), 2, 2), np.int32)
-    depth, step = np.empty((len(gap), 2)), np.column_stack([1 - gap[:, 2], gap[:, 2]])
-    for k in (0, 1):
-        y, x = (gap[:, :2] + k * step).T
-        ends[:, k, 0], ends[:, k, 1], depth[:, k] = fronts.part[y, x], fronts.triangle[y, x], fronts.depth[y, x]
-    several = [own.spans(number) for own in sheets]
-    names, spans = (np.concatenate([one[i] for one in several]) for i in (0, 1))
-    parts = np.repeat(np.arange(len(sheets), dtype=np.int32), [len(one[0]) for one in several])
-    begins, order = spans_loops.by_gap(names[:, 0], len(gap))
-    room = 2 * len(spans) + 4 * len(gap)
-    pieces, starts, counts = np.empty(room, np.int32), np.empty(room), np.empty(len(gap), np.int32)
-    known = begins, order, spans, names, parts, ends, depth, pieces, starts, counts
-    parallel(spans_loops.fronts, len(gap), *known, work=300 * len(gap))
-    whole, numbers = np.empty((counts.sum(), 10), np.int32), np.empty((counts.sum(), 5))
-    found = spans_loops.breaks(*known, 0.4 * FINE, INNER, whole, numbers)
-    return gap[whole[:found, 0]], whole[:found], numbers[:found]
+    Attributes:
+        fronts: what is seen at centres.
+        sheets: the triangles of each part.
+        cells: (H, W) bool.
+        near: for each part the triangles that may meet these cells.
+    """
+
+    def __init__(self, fronts: Fronts, sheets: Sequence[Sheets]):
+        self.fronts, self.sheets = fronts, sheets
+        self.cells, self.near = np.zeros(fronts.part.shape, np.bool_), [np.empty(0, np.int64)] * len(sheets)
+
+    def breaks(self, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The breaks in the gaps that are marked (2, H, W): the gap of each (B, 3); see `spans_loops.breaks`."""
+        from rts.sampling import spans_loops
+
+        gaps = Gaps.of(marks)
+        gap, count = gaps.gap, len(gaps.gap)
+        names, spans, parts = self._spans(gaps)
+        ends, depth = np.empty((count, 2, 2), np.int32), np.empty((count, 2))
+        for k, (y, x) in enumerate(_centres(gap)):
+            ends[:, k, 0], ends[:, k, 1] = self.fronts.part[y, x], self.fronts.triangle[y, x]
+            depth[:, k] = self.fronts.depth[y, x]
+        begins, order = spans_loops.by_gap(names[:, 0], count)
+        room = 2 * len(order) + 4 * count
+        pieces, starts, counts = np.empty(room, np.int32), np.empty(room), np.empty(count, np.int32)
+        known = begins, order, spans, names, parts, ends, depth, pieces, starts, counts
+        parallel(spans_loops.fronts, count, *known, work=300 * count)
+        at = np.cumsum(counts) - counts
+        whole, numbers = np.full((counts.sum(), 10), -1, np.int32), np.empty((counts.sum(), 5))
+        parallel(spans_loops.breaks, count, *known, at, INNER, whole, numbers, work=300 * count)
+        found = np.flatnonzero(whole[:, 0] >= 0)
+        whole = whole[found]
+        return gap[whole[:, 0]], whole, numbers[found]
+
+    def _spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Spans of all parts on gaps, and their parts (N,) int32; see `Sheets.spans`."""
+        from rts.sampling import spans_loops
+
+        (first_y, first_x), (last_y, last_x) = _centres(gaps.gap)
+        if not (self.cells[first_y, first_x] & self.cells[last_y, last_x]).all():
+            self.cells = np.zeros_like(self.cells)
+            spans_loops.around(np.column_stack([first_y, last_y, first_x, last_x]), REACH, self.cells)
+            self.near = [own.near(self.cells) for own in self.sheets]
+        several = [own.spans(near, gaps) for own, near in zip(self.sheets, self.near, strict=True)]
+        parts = np.repeat(np.arange(len(several), dtype=np.int32), [len(names) for names, _ in several])
+        names, spans = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
+        return names, spans, parts
 
 
-def _open(part: np.ndarray, joined: np.ndarray) -> np.ndarray:
+def _centres(gap: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Indices y and x (M,) of the first and of the second centre of gaps (M, 3)."""
+    y, x, row = gap.T
+    return (y, x), (y + 1 - row, x + row)
+
+
+def _gaps_apart(part: np.ndarray, joined: np.ndarray) -> np.ndarray:
     """Marks (2, H, W) of the gaps to search first: those between fronts that no sheet joins, and those around.
 
     A tip that no centre sees may reach through a gap beside; so all sides of a square are searched together.
     """
-    seen, open_ = part >= 0, ~joined
-    open_[0, :, :-1] &= seen[:, :-1] | seen[:, 1:]
-    open_[1, :-1] &= seen[:-1] | seen[1:]
-    open_[0, :, -1], open_[1, -1] = False, False
-    square = open_[0, :-1, :-1] | open_[0, 1:, :-1] | open_[1, :-1, :-1] | open_[1, :-1, 1:]
-    for side in _sides(open_):
-        side |= square
-    return open_
+    from rts.sampling import spans_loops
+
+    (height, width), marks = part.shape, np.empty(joined.shape, np.bool_)
+    parallel(spans_loops.apart, height, part, joined, marks, work=2 * part.size)
+    squares = np.empty((height - 1, width - 1), np.bool_)
+    parallel(spans_loops.squares, height - 1, marks, squares, work=part.size)
+    parallel(spans_loops.sides, height, squares, marks, work=2 * part.size)
+    return marks
 
 
-def _sides(marks: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Views (H − 1, W − 1) of marks of gaps (2, H, W): the four sides of each square."""
-    return marks[0, :-1, :-1], marks[0, 1:, :-1], marks[1, :-1, :-1], marks[1, :-1, 1:]
+def _gaps_beyond(gap: np.ndarray, searched: np.ndarray, far: int) -> np.ndarray | None:
+    """Marks (2, H, W) of gaps not yet searched around breaks, whose gaps (B, 3) are given; None if there are none.
 
+    They are the sides of squares up to `far` squares away from those beside a break that have a side not searched.
+    """
+    from rts.sampling import spans_loops
 
-def _squares_of(gap: np.ndarray, searched: np.ndarray) -> np.ndarray:
-    """The squares (M, 2), y and x, beside gaps of breaks (B, 3), that have a side which was not searched."""
-    before = gap[:, :2] - np.column_stack([gap[:, 2], 1 - gap[:, 2]])
-    squares = np.concatenate([gap[:, :2], before])
     size = np.array(searched.shape[1:]) - 1
-    y, x = squares[((squares >= 0) & (squares < size)).all(axis=1)].T
-    left = ~np.logical_and.reduce([side[y, x] for side in _sides(searched)])
-    return np.column_stack([y[left], x[left]])
-
-
-def _mark(squares: np.ndarray, far: int, marks: np.ndarray) -> None:
-    """Mark the sides of squares (M, 2) and of all that are up to `far` squares away."""
-    steps = np.mgrid[-far : far + 1, -far : far + 1].reshape(2, -1).T
-    around = (squares[:, None] + steps).reshape(-1, 2)
-    size = np.array(marks.shape[1:]) - 1
-    y, x = around[((around >= 0) & (around < size)).all(axis=1)].T
-    for side in _sides(marks):
-        side[y, x] = True
-
-
-def _numbered(open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gaps (M, 3) that are marked, and their numbers (2, H, W), −1 for the others."""
-    number = np.full(open_.shape, -1, np.int32)
-    at = np.flatnonzero(open_)
-    number.reshape(-1)[at] = np.arange(len(at))
-    axis, y, x = np.unravel_index(at, open_.shape)
-    return np.column_stack([y, x, 1 - axis]).astype(np.int32), number
+    y, x = np.concatenate([gap[:, :2], gap[:, :2] - np.column_stack([gap[:, 2], 1 - gap[:, 2]])]).T
+    y, x = (i[(y >= 0) & (x >= 0) & (y < size[0]) & (x < size[1])] for i in (y, x))
+    whole = searched[0, y, x] & searched[0, y + 1, x] & searched[1, y, x] & searched[1, y, x + 1]
+    if whole.all():
+        return None
+    y, x = y[~whole], x[~whole]
+    squares, more = np.zeros(size, np.bool_), np.zeros_like(searched)
+    spans_loops.around(np.column_stack([y, y, x, x]), far, squares)
+    parallel(spans_loops.sides, len(searched[0]), squares, more, work=2 * more[0].size)
+    return more & ~searched
 
 
 def _slopes(whole: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]) -> np.ndarray:

@@ -14,6 +14,9 @@ from rts.sampling.sheets_loops import corners_of, edge
 TINY = 1e-9
 """Shortest length of a span."""
 
+LAST = 4e-5
+"""Distance of last samples from breaks, in cells."""
+
 TOUCH = 1e-6
 """Greatest distance along a gap, and greatest share of the depth, by which the ends of two spans differ where a surface
 goes on from one to the other."""
@@ -30,167 +33,212 @@ ALIKE = 1e-5
 SHORT = 2e-5
 """Length of a piece of front that counts."""
 
-
-@loop
-def projected(first, last, vertices, rows, seen):
-    """Fill `seen` (V, 2) float32: where vertices lie in the image, in cells; NaN for those behind the camera."""
-    for v in range(first, last):
-        x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
-        w = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3]
-        if w > 0:
-            seen[v, 0] = (rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]) / w
-            seen[v, 1] = (rows[1, 0] * x + rows[1, 1] * y + rows[1, 2] * z + rows[1, 3]) / w
-        else:
-            seen[v] = np.nan
-
-
-@compiled
-def _within(low, high, count):
-    """The first and last of `count` cells from `low` to `high`, which may be farther away than integers reach."""
-    return int(min(max(low, 0.0), count)), int(max(min(high, count - 1.0), -1.0))
-
-
-@compiled
-def _crosses(low_x, high_x, low_y, high_y, number):
-    """True if a gap with a number meets a box."""
-    height, width = number.shape[1:]
-    for axis in range(2):  # Along rows, then along columns.
-        # Centres are at half cells; a gap reaches over one cell from its first centre on.
-        far_x, far_y = (1.5, 0.5) if axis == 0 else (0.5, 1.5)
-        first_x, last_x = _within(np.ceil(low_x - far_x), np.floor(high_x - 0.5), width)
-        first_y, last_y = _within(np.ceil(low_y - far_y), np.floor(high_y - 0.5), height)
-        for y in range(first_y, last_y + 1):
-            for x in range(first_x, last_x + 1):
-                if number[axis, y, x] >= 0:
-                    return True
-    return False
+SLACK = np.float32(0.01)
+"""By how much boxes of triangles are larger than these, against rounding, in cells."""
 
 
 @loop
-def near_gaps(first, last, faces, seen, keep, number, near):
-    """Fill `near` (T,) bool: may a triangle that is kept meet a gap? For `keep` and `number` see `spans_of`."""
-    slack = np.float32(0.01)
-    for t in range(first, last):
-        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        low_x, high_x = min(seen[a, 0], seen[b, 0], seen[c, 0]), max(seen[a, 0], seen[b, 0], seen[c, 0])
-        low_y, high_y = min(seen[a, 1], seen[b, 1], seen[c, 1]), max(seen[a, 1], seen[b, 1], seen[c, 1])
-        area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
-        area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
-        if np.isnan(area):
-            near[t] = True
-        elif area * keep < -slack:
-            near[t] = False
-        else:
-            near[t] = _crosses(low_x - slack, high_x + slack, low_y - slack, high_y + slack, number)
+def apart(first, last, part, joined, gaps):
+    """Fill `gaps` (2, H, W) bool: something is seen at one of both centres, and no sheet joins them."""
+    height, width = part.shape
+    for y in range(first, last):
+        for x in range(width):
+            seen = part[y, x] >= 0
+            gaps[0, y, x] = x + 1 < width and (seen or part[y, x + 1] >= 0) and not joined[0, y, x]
+            gaps[1, y, x] = y + 1 < height and (seen or part[y + 1, x] >= 0) and not joined[1, y, x]
+
+
+@loop
+def squares(first, last, gaps, marks):
+    """Fill `marks` (H − 1, W − 1) bool: is a side of a square a gap that is marked in `gaps` (2, H, W)?"""
+    for y in range(first, last):
+        for x in range(marks.shape[1]):
+            marks[y, x] = gaps[0, y, x] | gaps[0, y + 1, x] | gaps[1, y, x] | gaps[1, y, x + 1]
+
+
+@loop
+def sides(first, last, marks, gaps):
+    """Mark, in `gaps` (2, H, W), all sides of the squares that are marked (H − 1, W − 1)."""
+    (height, width) = marks.shape
+    for y in range(first, last):
+        for x in range(width + 1):
+            for k in range(2):
+                if 0 <= y - k < height and x < width:
+                    gaps[0, y, x] |= marks[y - k, x]
+                if 0 <= x - k < width and y < height:
+                    gaps[1, y, x] |= marks[y, x - k]
+
+
+@loop
+def around(boxes, far, marks):
+    """Mark, in `marks` (H, W) bool, boxes (M, 4) of cells, first and last y and x, and all up to `far` cells away."""
+    for n in range(len(boxes)):
+        top, bottom, left, right = boxes[n, 0] - far, boxes[n, 1] + far, boxes[n, 2] - far, boxes[n, 3] + far
+        marks[max(top, 0) : max(bottom + 1, 0), max(left, 0) : max(right + 1, 0)] = True
+
+
+@loop
+def number(marks, gap, by_row, by_column):
+    """Fill in the fields of `Gaps` from marks (2, H, W)."""
+    (height, width), count = marks.shape[1:], 0
+    for y in range(height):
+        for x in range(width):
+            by_row[y, x] = count
+            if marks[0, y, x]:
+                gap[count, 0], gap[count, 1], gap[count, 2] = y, x, 1
+                count += 1
+    for x in range(width):
+        for y in range(height):
+            by_column[x, y] = count
+            if marks[1, y, x]:
+                gap[count, 0], gap[count, 1], gap[count, 2] = y, x, 0
+                count += 1
 
 
 @compiled
-def _room(table, more):
-    """The table, with its rows copied to one twice as long if `more` rows do not fit."""
-    if more <= len(table):
-        return table
-    longer = np.empty((max(2 * len(table), more), table.shape[1]), table.dtype)
-    longer[: len(table)] = table
-    return longer
+def _box(a, b, c, seen, height, width, box):
+    """Fill `box` with the least x, largest x, least and largest y of a triangle in the image, and a little around.
 
-
-@compiled
-def _add_spans(t, axis, n, begin, stop, low, high, number, line, corners, count, names, spans):
-    """Add a triangle's spans on the gaps from `begin` to `stop` of a line, of which it covers what is from low to high.
-
-    Returns the number of all spans.
+    Returns twice its area; NaN, and a box of the whole image, if it is seen in part.
     """
-    for m in range(begin, stop):
-        gap, start, end = (number[axis, n, m] if axis == 0 else number[axis, m, n]), low - 0.5 - m, high - 0.5 - m
-        if gap < 0 or min(end, 1.0) - max(start, 0.0) <= TINY:
-            continue
-        names[count, 0], names[count, 1] = gap, t
-        _fill(spans[count], start, end, line, corners, m + 0.5)
-        count += 1
-    return count
+    area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
+    area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
+    if np.isnan(area):
+        box[0], box[1], box[2], box[3] = 0.0, width, 0.0, height
+        return area
+    for axis in range(2):
+        box[2 * axis] = min(seen[a, axis], seen[b, axis], seen[c, axis]) - SLACK
+        box[2 * axis + 1] = max(seen[a, axis], seen[b, axis], seen[c, axis]) + SLACK
+    return area
+
+
+@compiled
+def _range(low, high, count):
+    """The first of `count` numbers from `low` to `high`, which may be beyond integers, and the one after the last."""
+    return int(min(max(np.ceil(low), 0.0), count)), int(max(min(np.floor(high), count - 1.0), -1.0)) + 1
 
 
 @loop
-def spans_of(triangles, rows, vertices, faces, clip, keep, number):
+def near(first, last, faces, seen, keep, cells, marks):
+    """Fill `marks` (T,) bool: may a triangle that is kept meet one of the cells (H, W) that are marked?
+
+    For `keep` see `spans_of`.
+    """
+    (height, width), box = cells.shape, np.empty(4, np.float32)
+    for t in range(first, last):
+        area = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, height, width, box)
+        if area * keep < -SLACK:
+            marks[t] = False
+            continue
+        left, right = _range(box[0] - 1, box[1], width)
+        top, bottom = _range(box[2] - 1, box[3], height)
+        marks[t] = False
+        for y in range(top, bottom):
+            for x in range(left, right):
+                marks[t] |= cells[y, x]
+
+
+@compiled
+def _gaps_of(box, axis, by_row, by_column):
+    """The lines of centres that a box meets, then the gaps of each: the first and the one after the last."""
+    lines, count = by_row.shape if axis == 0 else by_column.shape
+    begin, stop = _range(box[2 - 2 * axis] - 0.5, box[3 - 2 * axis] - 0.5, lines)
+    # A gap reaches from its first centre to the next one.
+    low, high = _range(box[2 * axis] - 1.5, box[2 * axis + 1] - 0.5, count - 1)
+    return begin, stop, low, max(high, low)
+
+
+@loop
+def most_spans(first, last, triangles, faces, seen, keep, by_row, by_column, most):
+    """Fill `most` (M,) with bounds on the numbers of spans of triangles; see `spans_of`."""
+    box = np.empty(4, np.float32)
+    for i in range(first, last):
+        a, b, c = faces[triangles[i], 0], faces[triangles[i], 1], faces[triangles[i], 2]
+        area, most[i] = _box(a, b, c, seen, len(by_row), len(by_column), box), 0
+        if area * keep < -SLACK:
+            continue
+        for axis in range(2):
+            begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
+            table = by_row if axis == 0 else by_column
+            for n in range(begin, stop):
+                most[i] += table[n, high] - table[n, low]
+
+
+@loop
+def spans_of(
+    first, last, triangles, begins, rows, vertices, faces, clip, keep, seen, gap, by_row, by_column, names, spans
+):
     """Spans of triangles on gaps.
 
     Args:
+        first: the first triangle.
+        last: the triangle after the last.
         triangles: (M,) the triangles.
+        begins: (M,) where the spans of each begin.
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: sign of the determinants of triangles to keep; 0 keeps both.
-        number: (2, H, W) int32, numbers of the gaps along rows and along columns; −1 for those not looked at.
-
-    Returns:
-        (N, 2) int32, gap and triangle of each span; and (N, 6) float64, its ends, and its depth's a, b, c, d.
+        seen: (V, 2), see `sheets_loops.projected`.
+        gap: see `Gaps`.
+        by_row: see `Gaps`.
+        by_column: see `Gaps`.
+        names: (N, 2) int32 to fill, gap and triangle of each span; filled with −1.
+        spans: (N, 6) float64 to fill: its ends, and its depth's a, b, c, d.
     """
-    height, width = number.shape[1:]
-    names, spans, count = np.empty((64, 2), np.int32), np.empty((64, 6)), 0
-    corners, bounds, line = np.empty((3, 4)), np.empty(4), np.empty((6, 2))
-    for t in triangles:
+    corners, box, line = np.empty((3, 4)), np.empty(4, np.float32), np.empty((6, 2))
+    for i in range(first, last):
+        t, count = triangles[i], begins[i]
         sign = corners_of(t, rows, vertices, faces, corners)
         if not abs(sign) > 0 or sign * keep < 0:  # NaN, too.
             continue
-        _bounds(corners, height, width, bounds)
+        _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, len(by_row), len(by_column), box)
+        cut = _cut(t, clip, vertices, faces)
         for axis in range(2):
-            along, across = axis, 1 - axis
-            least, most = int(max(np.floor(bounds[2 * along] - 0.5), 0)), _last(bounds, along, number)
-            for n in range(int(max(np.ceil(bounds[2 * across] - 0.5), 0)), _last(bounds, across, number) + 1):
-                if not _any(number, axis, n, least, most):
+            begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
+            table = by_row if axis == 0 else by_column
+            for n in range(begin, stop):
+                if table[n, low] == table[n, high]:
                     continue
-                _on_line(t, corners, sign, clip, vertices, faces, along, n + 0.5, line)
-                low, high = _inside(line, bounds[2 * along] - 1.0, bounds[2 * along + 1] + 1.0)
-                begin, stop = int(max(np.floor(low - 0.5), 0)), int(min(high - 0.5, number.shape[2 - axis] - 1)) + 1
-                names, spans = _room(names, count + stop - begin), _room(spans, count + stop - begin)
-                count = _add_spans(t, axis, n, begin, stop, low, high, number, line, corners, count, names, spans)
-    return names[:count], spans[:count]
+                _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
+                least, most = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
+                for g in range(table[n, low], table[n, high]):
+                    m = gap[g, 1 - axis]
+                    start, end = least - 0.5 - m, most - 0.5 - m
+                    if min(end, 1.0) - max(start, 0.0) <= TINY:
+                        continue
+                    names[count, 0], names[count, 1] = g, t
+                    _fill(spans[count], start, end, line, corners, m + 0.5)
+                    count += 1
 
 
 @compiled
-def _any(number, axis, n, least, most):
-    """True if one of the gaps from `least` to `most` along a line is looked at."""
-    for m in range(least, most + 1):
-        if (number[axis, n, m] if axis == 0 else number[axis, m, n]) >= 0:
-            return True
+def _cut(t, clip, vertices, faces):
+    """True if the near or the far plane may cut a triangle."""
+    for k in range(3):
+        v = faces[t, k]
+        for p in range(2):
+            value = clip[p, 3]
+            for r in range(3):
+                value += clip[p, r] * vertices[v, r]
+            if not value > 0:
+                return True
     return False
 
 
 @compiled
-def _last(bounds, axis, number):
-    """The last line, of rows (1) or columns (0), that a box meets."""
-    return int(min(np.floor(bounds[2 * axis + 1] - 0.5), number.shape[2 - axis] - 1))
-
-
-@compiled
-def _bounds(corners, height, width, bounds):
-    """Fill `bounds` with the least and largest x, then y, of a triangle; those of the grid if it is seen in part."""
-    for a in range(2):
-        bounds[2 * a], bounds[2 * a + 1] = np.inf, -np.inf
-    for c in range(3):
-        if not corners[c, 2] > 0:
-            bounds[0], bounds[1], bounds[2], bounds[3] = 0.0, width, 0.0, height
-            return
-        for a in range(2):
-            value = corners[c, a] / corners[c, 2]
-            bounds[2 * a], bounds[2 * a + 1] = min(bounds[2 * a], value), max(bounds[2 * a + 1], value)
-    for a in range(2):  # Against rounding; also keeps what is far outside within integers.
-        most = width if a == 0 else height
-        bounds[2 * a] = min(max(bounds[2 * a] - 1e-6, -1.0), most + 1.0)
-        bounds[2 * a + 1] = max(min(bounds[2 * a + 1] + 1e-6, most + 1.0), -1.0)
-
-
-@compiled
-def _on_line(t, corners, sign, clip, vertices, faces, along, at, line):
+def _on_line(t, corners, sign, clip, cut, vertices, faces, along, at, line):
     """Fill `line` with functions c + d · x that are positive on what is seen of a triangle along a line of centres.
 
-    Rows 0 to 2 are the edge functions, 3 and 4 the near and the far plane.
+    Rows 0 to 2 are the edge functions, 3 and 4 the near and the far plane, if these may cut the triangle.
     """
     line[3:] = 0.0
     for k in range(3):
         ex, ey, e = edge(corners, k, sign)
         line[k, 0], line[k, 1] = (ey * at + e, ex) if along == 0 else (ex * at + e, ey)
+        if not cut:
+            continue
         v = faces[t, k]
         for p in range(2):
             value = clip[p, 3]
@@ -229,16 +277,21 @@ def _fill(span, start, end, line, corners, origin):
 
 @loop
 def by_gap(gaps, count):
-    """Where the spans of each of `count` gaps begin in a list in their order (count + 1,); and this list (N,)."""
+    """Where the spans of each of `count` gaps begin in a list in their order (count + 1,); and this list.
+
+    `gaps` (N,) are those of spans, or −1.
+    """
     begins = np.zeros(count + 1, np.int64)
     for gap in gaps:
-        begins[gap + 1] += 1
+        if gap >= 0:
+            begins[gap + 1] += 1
     for g in range(count):
         begins[g + 1] += begins[g]
-    order, next_ = np.empty(len(gaps), np.int64), begins[:-1].copy()
+    order, next_ = np.empty(begins[count], np.int64), begins[:-1].copy()
     for n in range(len(gaps)):
-        order[next_[gaps[n]]] = n
-        next_[gaps[n]] += 1
+        if gaps[n] >= 0:
+            order[next_[gaps[n]]] = n
+            next_[gaps[n]] += 1
     return begins, order
 
 
@@ -343,10 +396,19 @@ def fronts(first, last, begins, order, spans, names, parts, ends, end_depth, pie
         if not known and not (x == NOTHING and last_part < 0):
             pieces[base + n], starts[base + n] = (SECOND if last_part >= 0 else NOTHING), 1.0
             n += 1
-            # The line runs along an edge that both samples are on: nothing ends there.
-            if pieces[base] == FIRST and last_part == ends[g, 0, 0]:
+            # The line runs along an edge that both samples are on: nothing ends there, nor lies before it.
+            if pieces[base] == FIRST and last_part == ends[g, 0, 0] and _all_of(pieces, parts, base, n, last_part):
                 n = 1
         counts[g] = n
+
+
+@compiled
+def _all_of(pieces, parts, base, n, part):
+    """True if no piece of front is another part's."""
+    for k in range(base, base + n):
+        if pieces[k] >= 0 and parts[pieces[k]] != part:
+            return False
+    return True
 
 
 @compiled
@@ -369,55 +431,51 @@ def _goes_on(spans, parts, own, x, place, way):
 
 
 @compiled
-def _kind(spans, parts, own, a, b, depth, place):
-    """How a front ends at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, they are one.
+def _kind(spans, parts, names, own, ends, depth, a, b, place):
+    """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, not at all.
 
     Args:
         spans: (N, 6).
         parts: (N,).
+        names: (N, 2).
         own: the gap's spans.
-        a: the span before; NOTHING or FIRST.
-        b: the span behind; NOTHING or SECOND.
-        depth: (2,) depths of the samples at both centres.
+        ends: (2, 2) part and triangle of the samples at both centres.
+        depth: (2,) their depths.
+        a: the piece of front before the place.
+        b: the piece behind.
         place: the place.
     """
-    if a == NOTHING or b == NOTHING:
-        return 1 if a == NOTHING else 0
-    za = _z(spans, a, place) if a >= 0 else depth[0]
-    zb = _z(spans, b, place) if b >= 0 else depth[1]
+    before, behind = _part(parts, ends, a), _part(parts, ends, b)
+    if before < 0 or behind < 0:
+        return 3 if before == behind else (1 if before < 0 else 0)
+    t, s = names[a, 1] if a >= 0 else ends[0, 1], names[b, 1] if b >= 0 else ends[1, 1]
+    if before == behind and t == s:
+        return 3
+    za, zb = _z(spans, a, place) if a >= 0 else depth[0], _z(spans, b, place) if b >= 0 else depth[1]
     if abs(za - zb) > ALIKE * max(abs(za), abs(zb)):
         return 0 if za < zb else 1
     # What is seen at a centre goes on beyond it.
-    ends = a >= 0 and spans[a, 1] <= place + TOUCH
-    ends = ends and not _goes_on(spans, parts, own, a, place, 1)
-    starts = b >= 0 and spans[b, 0] >= place - TOUCH
+    stops, starts = a >= 0 and spans[a, 1] <= place + TOUCH, b >= 0 and spans[b, 0] >= place - TOUCH
+    if before == behind and (a < 0 or stops) and (b < 0 or starts):
+        return 3
+    stops = stops and not _goes_on(spans, parts, own, a, place, 1)
     starts = starts and not _goes_on(spans, parts, own, b, place, 0)
-    if ends != starts:
-        return 0 if ends else 1
-    return 3 if ends else 2
-
-
-@compiled
-def _continues(spans, parts, names, ends, depth, a, b, place):
-    """True if two pieces of front, one after the other, are one surface."""
-    pa = parts[a] if a >= 0 else (ends[0, 0] if a == FIRST else -1)
-    pb = parts[b] if b >= 0 else (ends[1, 0] if b == SECOND else -1)
-    if pa != pb or pa < 0:
-        return pa == pb
-    ta, tb = names[a, 1] if a >= 0 else ends[0, 1], names[b, 1] if b >= 0 else ends[1, 1]
-    if ta == tb:
-        return True
-    za, zb = _z(spans, a, place) if a >= 0 else depth[0], _z(spans, b, place) if b >= 0 else depth[1]
-    if abs(za - zb) > ALIKE * max(abs(za), abs(zb)):
-        return False
-    return (a < 0 or spans[a, 1] <= place + TOUCH) and (b < 0 or spans[b, 0] >= place - TOUCH)
+    if stops != starts:
+        return 0 if stops else 1
+    if not stops:
+        return 2
+    return 3 if before == behind else 0
 
 
 @loop
-def breaks(begins, order, spans, names, parts, ends, end_depth, pieces, starts, counts, fine, inner, whole, numbers):
-    """Fill in the breaks along gaps, in order, and return their number.
+def breaks(
+    first, last, begins, order, spans, names, parts, ends, end_depth, pieces, starts, counts, at, inner, whole, numbers
+):
+    """Fill in the breaks along gaps, in order.
 
     Args:
+        first: the first gap.
+        last: the gap after the last.
         begins: see `fronts`.
         order: see `fronts`.
         spans: see `fronts`.
@@ -428,49 +486,47 @@ def breaks(begins, order, spans, names, parts, ends, end_depth, pieces, starts, 
         pieces: see `fronts`.
         starts: see `fronts`.
         counts: see `fronts`.
-        fine: distance of last samples from breaks.
+        at: (M,) where the breaks of each gap begin in `whole` and `numbers`; at most as many as its pieces.
         inner: distance of the samples that tell colours.
         whole: (P, 10) int32 to fill: gap, kind (0, 1 or 2), parts before and behind, then triangles of the last
             samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for its last.
+            Filled with −1.
         numbers: (P, 5) float64 to fill: place of the break, of the last samples, and of those that tell colours.
     """
-    count = 0
-    for g in range(len(counts)):
+    for g in range(first, last):
         own, base = order[begins[g] : begins[g + 1]], 2 * begins[g] + 4 * g
-        begun, a = count, 0
+        count, a = at[g], 0
         for n in range(1, counts[g]):
             # A piece that is too short to count belongs to what comes after it.
             if n + 1 < counts[g] and starts[base + n + 1] - starts[base + n] < SHORT:
                 continue
             x, y, place = pieces[base + a], pieces[base + n], starts[base + n]
-            joined = _continues(spans, parts, names, ends[g], end_depth[g], x, y, place)
-            kind = 3 if joined else _kind(spans, parts, own, x, y, end_depth[g], place)
-            px, py = _part(parts, ends[g], x), _part(parts, ends[g], y)
-            if kind < 3 or px != py:
-                kind = 0 if kind == 3 else kind
-                whole[count, 0], whole[count, 1], whole[count, 2], whole[count, 3] = g, kind, px, py
-                whole[count, 4] = names[x, 1] if x >= 0 else ends[g, 0, 1]
-                whole[count, 5] = names[y, 1] if y >= 0 else ends[g, 1, 1]
-                whole[count, 8], whole[count, 9] = count == begun, 0
-                numbers[count, 0] = place
-                numbers[count, 1] = min(max(place - fine, spans[x, 0], 0.0), place) if x >= 0 else place
-                numbers[count, 2] = max(min(place + fine, spans[y, 1], 1.0), place) if y >= 0 else place
-                count += 1
+            kind = _kind(spans, parts, names, own, ends[g], end_depth[g], x, y, place)
             a = n
-        if count > begun:
+            if kind == 3:
+                continue
+            whole[count, 0], whole[count, 1] = g, kind
+            whole[count, 2], whole[count, 3] = _part(parts, ends[g], x), _part(parts, ends[g], y)
+            whole[count, 4] = names[x, 1] if x >= 0 else ends[g, 0, 1]
+            whole[count, 5] = names[y, 1] if y >= 0 else ends[g, 1, 1]
+            whole[count, 8], whole[count, 9] = count == at[g], 0
+            numbers[count, 0] = place
+            numbers[count, 1] = min(max(place - LAST, spans[x, 0], 0.0), place) if x >= 0 else place
+            numbers[count, 2] = max(min(place + LAST, spans[y, 1], 1.0), place) if y >= 0 else place
+            count += 1
+        if count > at[g]:
             whole[count - 1, 9] = 1
-        for b in range(begun, count):
-            before = numbers[b - 1, 0] if b > begun else 0.0
+        for b in range(at[g], count):
+            before = numbers[b - 1, 0] if b > at[g] else 0.0
             after = numbers[b + 1, 0] if b + 1 < count else 1.0
             for side in range(2):
-                last = numbers[b, 1 + side]
-                length = last - before if side == 0 else after - last
-                at = last - min(inner, length / 2) if side == 0 else last + min(inner, length / 2)
-                numbers[b, 3 + side], whole[b, 6 + side] = last, whole[b, 4 + side]
-                found = _piece(pieces, starts, base, counts[g], at)
-                if found >= 0 and parts[found] == whole[b, 2 + side] and abs(at - last) > TINY:
-                    numbers[b, 3 + side], whole[b, 6 + side] = at, names[found, 1]
-    return count
+                end = numbers[b, 1 + side]
+                length = end - before if side == 0 else after - end
+                inward = end - min(inner, length / 2) if side == 0 else end + min(inner, length / 2)
+                numbers[b, 3 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
+                found = _piece(pieces, starts, base, counts[g], inward)
+                if found >= 0 and parts[found] == whole[b, 2 + side] and abs(inward - end) > TINY:
+                    numbers[b, 3 + side], whole[b, 6 + side] = inward, names[found, 1]
 
 
 @compiled
