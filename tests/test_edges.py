@@ -261,13 +261,6 @@ def test_adaptive_samples_are_refused():
         edges(card(flat(SQUARE + 12)), supersample=rts.Adaptive(4))
 
 
-def test_traced_samples_are_refused():
-    jax = pytest.importorskip("jax")
-    vertices = jax.numpy.asarray(flat(SQUARE + 12))
-    with pytest.raises(InputError, match="these samples are traced"):
-        jax.jit(lambda v: edges(card(v)))(vertices)
-
-
 def test_no_colour_leaves_the_range_of_those_that_are_seen():
     """Light that turns away at the limb: the sample at a centre is dark, that beside the outline bright, or the other
     way around."""
@@ -281,17 +274,20 @@ def test_no_colour_leaves_the_range_of_those_that_are_seen():
 
 def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over():
     """A triangle through the camera plane may meet a line of centres farther away than integers reach."""
-    from rts.sampling.sheets import Sheets
+    from rts.sampling.sheets import Gaps, Sheets
 
     clip, rows = np.array([[0, 0, 1, -0.1], [0, 0, -1, 100.0]]), np.eye(4)[[0, 1, 2, 2]]
     faces, none = np.array([[0, 1, 2], [1, 0, 2]], np.int32), np.full((2, 3), -1, np.int32)
-    number = np.full((2, 8, 8), -1, np.int32)
-    number[0, :, :-1], number[1, :-1] = np.arange(56).reshape(8, 7), np.arange(56, 112).reshape(7, 8)
+    marks = np.zeros((2, 8, 8), bool)
+    marks[0, :, :-1], marks[1, :-1] = True, True
     for side in (1e-25, -1e-25):
         for third in ((9, -5, -1), (9, 5, -1), (-9, -5, -1), (-9, 5, -1)):
             vertices = np.array([(-1000, side, 1), (1000, 0, 1), third], np.float32)
-            names, spans = Sheets(vertices, faces, none, rows, clip, 0.0).spans(number)
-            assert ((names[:, 0] >= 0) & (names[:, 0] < 112)).all()
+            seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
+            seen[vertices[:, 2] <= 0] = np.nan
+            names, spans = Sheets(vertices, faces, none, rows, clip, 0.0, seen).spans(np.arange(2), Gaps.of(marks))
+            names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
+            assert (names[:, 0] < 112).all()
             assert np.isfinite(spans).all()
 
 

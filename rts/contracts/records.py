@@ -335,7 +335,7 @@ class Outlines:
         ends: (B, 2) bool: is this the gap's first break, and its last?
         square: (S, 2) int32, the first corner (y, x) of each segment's square.
         ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
-            the other. −1 in second place if a break is alone.
+            the other. −1 in second place if a break is alone. A segment from a break to itself has no effect.
         side: (S, 2) int32, the sides of the square that these breaks lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
         beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
         corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.

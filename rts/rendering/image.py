@@ -63,7 +63,8 @@ def render(
             beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them. If the
             image is rendered in bands, each band has this capacity. With `rts.Adaptive` the fine samples have as many
             rows again, `layers` for each fine cell of active pixels and their aprons. Pixels that find no room stay
-            coarse, and `overflow` counts them, too.
+            coarse, and `overflow` counts them, too. For the splatter "edges" there is also room for breaks of outlines:
+            8 a row and a column of the grid, or `capacity` / 4 if that is more.
         engine: name of the engine to compute with, "torch" or "jax". Needed where all arrays are NumPy, but a shader
             holds a network. None for the engine of the arrays.
 

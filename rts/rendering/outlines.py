@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, stopped, value_of
-from rts.arrays.trees import Array, Tree, map_leaves
-from rts.contracts.records import Fragments, Outlines, Request, Sampled, Samples
+from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.registry import name_of
@@ -24,54 +24,156 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 
-def with_outlines(sampled: Sampled, scene: Scene, grid: Grid) -> Sampled:
+def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
     """Samples at cells' centres, of one layer, with `Sampled.outlines` and the samples beside breaks.
 
+    Args:
+        sampled: the samples at centres.
+        scene: the scene.
+        grid: the cells.
+        capacity: `Request.capacity`. Where values are traced, there is room for a quarter as many breaks, or for 8 a
+            row and a column of the grid, if that is more. `overflow` counts those beyond.
+
     Raises:
-        InputError: arrays are traced; or a sampler cannot sample single points.
+        InputError: a sampler cannot sample single points.
     """
-    points = _Points.of(scene, grid)
-    breaks = points.breaks(points.at_centres(sampled))
-    segments = joined(breaks)
-    # For each break the two last samples, and the two that tell colours.
-    parts, every = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
-    triangles = breaks.triangles
-    samples, rows, first = [], np.full(parts.shape, -1, np.int32), 0
-    for part, own in enumerate(sampled.samples):
-        asked = parts == part
-        more = points.sample(part, every[asked], triangles[asked])
+    known = []
+    for part in scene.parts:
+        known.append((part.transform, {name: part.theta[name] for name in part.surface.reads(part.theta)}))
+    triangles = [own.triangle for own in sampled.samples]
+    inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
+    if any(map(is_traced, leaves(inputs))):
+        found, more = _traced(sampled, scene, grid, max(8 * sum(grid.size), (capacity or 0) // 4), inputs)
+    else:
+        row, depth, own = map_leaves(_known, inputs[3:])
+        fronts = _at_centres(row, depth, own, sampled.samples)
+        here, more = _Points.of(scene, grid).found(fronts)
+        # Engines that compile eager operations anew for each shape pad them.
+        found = _Found(*engine_of(sampled.row).call_host(lambda _: here, _Found.specs(0, grid.size), sampled.row))
+    xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
+    for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         count = own.ids.shape[-2]
-        found = _known(more.row)[0, 0]
-        rows[asked] = np.where(found >= 0, first + count + found, -1)
-        samples.append(in_one_table([own, more]))
+        rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
+        samples.append(in_one_table([own, extra]))
         first += samples[-1].ids.shape[-2]
-    shifted = _renumbered(sampled, samples)
-    fields = {name: getattr(breaks, name) for name in ("gap", "near", "slope", "ends", "joined")}
-    along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
-    first = breaks.gap[:, 1::-1] + 0.5
-    fields["place"] = ((breaks.place - first) * along).sum(-1)
-    fields["points"] = ((breaks.points - first[:, None]) * along[:, None]).sum(-1)
-    outlines = Outlines(rows=rows[:, :2], inner=rows[:, 2:], **fields, **segments._asdict())
-    return replace(sampled, samples=tuple(samples), cells=shifted, outlines=outlines)
+    named = {"rows": rows[:, :2], "inner": rows[:, 2:]}
+    outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
+    overflow, cells = sampled.overflow + found.left, _renumbered(sampled, samples)
+    return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
 
 
-def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Any:
+class _Found(NamedTuple):
+    """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
+
+    Attributes:
+        rows: (B, 4) int32, the two last samples of each break and the two that tell colours, counted in their part.
+        parts: (B, 4) int32, their parts, or −1.
+        left: () int32, number of breaks left out for want of room.
+    """
+
+    rows: Array
+    parts: Array
+    place: Array
+    gap: Array
+    points: Array
+    near: Array
+    slope: Array
+    ends: Array
+    square: Array
+    ties: Array
+    side: Array
+    beyond: Array
+    corner: Array
+    pull: Array
+    joined: Array
+    left: Array
+
+    @staticmethod
+    def specs(most: int, size: tuple[int, int], real: Any = np.float64) -> list[ArraySpec]:
+        """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
+        integers, ends = np.int32, 2 * most
+        breaks = [ArraySpec(shape, integers, packed=True) for shape in ((most, 4), (most, 4))]
+        breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
+        breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
+        breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
+        segments = [ArraySpec((ends, 2), integers, packed=True)] * 4
+        segments += [ArraySpec((ends, 2), real, packed=True), ArraySpec((ends, 4), real, packed=True)]
+        return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
+
+
+def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree) -> tuple[_Found, list[Samples]]:
+    """`_Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
+    known = map_leaves(lambda x: x if is_traced(x) else value_of(x), inputs)
+    owners = [_tables(own) for own in sampled.samples]
+
+    def host(*arrays: np.ndarray) -> list[np.ndarray]:
+        given = iter(arrays)
+        of_parts, whole, camera, row, depth, own = map_leaves(lambda x: next(given) if is_traced(x) else x, known)
+        parts = [replace(p, transform=t, theta=theta) for p, (t, theta) in zip(scene.parts, of_parts, strict=True)]
+        points = _Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size))
+        found, more = points.found(_at_centres(row, depth, own, sampled.samples), most)
+        arrays_of = []
+        for part, samples, tables in zip(parts, more, owners, strict=True):
+            known_of, kinds = _tables(samples), {kind for kind, _ in tables}
+            gbuffer = part.surface.evaluate(part.theta, replace(samples, asked=None)) if "gbuffer" in kinds else {}
+            filled = [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
+            arrays_of += [np.asarray(x, spec.dtype) for x, spec in zip(filled, tables.values(), strict=True)]
+        return [*found, *arrays_of]
+
+    real = np.float64 if floating_bits(scene.context.like) == 64 else np.float32
+    specs = _Found.specs(most, grid.size, real)
+    rows = [ArraySpec((4 * most, *x.shape[1:]), x.dtype, packed=True) for own in owners for x in own.values()]
+    operands = [x for x in leaves(known) if is_traced(x)]
+    results = iter(engine_of(*operands).call_host(host, [*specs, *rows], *operands))
+    found = _Found(*(next(results) for _ in specs))
+    return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
+
+
+def _tables(samples: Samples) -> dict[tuple[str, str], Array]:
+    """The arrays of samples that have a row for each, by kind and name."""
+    return {
+        ("", "ids"): samples.ids,
+        ("", "params"): samples.params,
+        **{("tables", name): x for name, x in samples.tables.items()},
+        **{("gbuffer", name): x for name, x in (samples.gbuffer or {}).items()},
+    }
+
+
+def _with_tables(samples: Samples, arrays: dict[tuple[str, str], Array]) -> Samples:
+    """Samples with other arrays of `_tables`."""
+    of = {kind: {name: x for (own, name), x in arrays.items() if own == kind} for kind in ("", "tables", "gbuffer")}
+    gbuffer = None if samples.gbuffer is None else of["gbuffer"]
+    return replace(samples, **of[""], tables=of["tables"], gbuffer=gbuffer)
+
+
+def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
     """The cells of a scene whose parts have got further rows behind their own."""
-    row = _known(sampled.row)
-    bounds = np.cumsum([own.ids.shape[-2] for own in sampled.samples])
-    more = np.cumsum([0, *(s.ids.shape[-2] - o.ids.shape[-2] for s, o in zip(samples, sampled.samples, strict=True))])
-    moved = np.where(row >= 0, row + more[np.searchsorted(bounds, row, side="right").clip(0, len(bounds))], -1)
-    return replace(sampled.cells, row=engine_of(sampled.row).constant(moved.astype(np.int32), sampled.row))
+    if sampled.one_part:
+        return sampled.cells
+    row, counts = sampled.row, [own.ids.shape[-2] for own in sampled.samples]
+    more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
+    shift = engine_of(row).constant(np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), row)
+    xp = namespace(row)
+    moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
+    return replace(sampled.cells, row=xp.where(row >= 0, moved, row))
+
+
+def _at_centres(
+    row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
+) -> Fronts:
+    """The fronts (H, W) of a sampled scene: its `row` and `depth`, and the triangles of each part's samples."""
+    counts = [own.ids.shape[-2] for own in samples]
+    of_part = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    none = [np.full(count, -1, np.int32) for count in counts]
+    triangle = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
+    part, triangle = (np.where(row[0] >= 0, table[row[0]], np.int32(-1)) for table in (of_part, triangle))
+    return Fronts(part, triangle, depth[0].astype(np.float64))
 
 
 def _known(x: Array) -> np.ndarray:
-    """The values of an array; refused if it is traced."""
+    """The value of an array, which is not traced."""
     value = value_of(x)
-    if value is None:
-        raise InputError(
-            "splatter 'edges' looks for outlines while Python runs, and these samples are traced; render outside of "
-            "jit and vmap, or give splatter='visible'"
-        )
+    assert value is not None
     return value
 
 
@@ -97,6 +199,27 @@ class _Points:
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
 
+    def found(self, fronts: Fronts, most: int | None = None) -> tuple[_Found, list[Samples]]:
+        """Outlines between the fronts (H, W) at centres, of at most `most` breaks; each part's samples beside them."""
+        breaks = self.breaks(fronts)
+        left = 0 if most is None else max(0, len(breaks.gap) - most)
+        if left:
+            breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
+        # For each break the two last samples, and the two that tell colours.
+        parts, every = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
+        samples, rows = [], np.full(parts.shape, -1, np.int32)
+        for part in range(len(self._parts)):
+            asked = parts == part
+            samples.append(self.sample(part, every[asked], breaks.triangles[asked]))
+            rows[asked] = _known(samples[-1].row)[0, 0]
+        along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
+        first = breaks.gap[:, 1::-1] + 0.5
+        place = ((breaks.place - first) * along).sum(-1)
+        points = ((breaks.points - first[:, None]) * along[:, None]).sum(-1)
+        own = breaks.gap, points, breaks.near, breaks.slope, breaks.ends
+        found = _Found(rows, parts, place, *own, *joined(breaks), breaks.joined, np.int32(left))
+        return found, samples
+
     def breaks(self, fronts: Fronts) -> Breaks:
         """The breaks between the fronts (H, W) at centres."""
         sheets = [own for *_, own in self._parts if own is not None]
@@ -108,7 +231,7 @@ class _Points:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
         if sheets is not None and triangles is not None and (triangles >= 0).all():
-            sampler = _Found(sheets.at(triangles, points)[0])
+            sampler = _OnTriangles(sheets.at(triangles, points)[0])
         request = Request(points=points, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" not in samples.followed:
@@ -128,18 +251,8 @@ class _Points:
             part[nearer], depth[nearer] = index, z[nearer]
         return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
 
-    def at_centres(self, sampled: Sampled) -> Fronts:
-        """The fronts (H, W) of a sampled scene."""
-        row, counts = _known(sampled.row)[0], [own.ids.shape[-2] for own in sampled.samples]
-        of_part = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        none = [np.full(count, -1, np.int32) for count in counts]
-        own = [s.triangle if s.triangle is not None else n for s, n in zip(sampled.samples, none, strict=True)]
-        triangles = np.concatenate([_known(x) for x in own])
-        part, triangle = (np.where(row >= 0, table[row], np.int32(-1)) for table in (of_part, triangles))
-        return Fronts(part, triangle, _known(sampled.depth)[0].astype(np.float64))
 
-
-class _Found(TriangleSampler):
+class _OnTriangles(TriangleSampler):
     """A sampler of points whose triangles are known."""
 
     def __init__(self, fragments: Fragments):

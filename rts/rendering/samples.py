@@ -136,7 +136,7 @@ def _on_one_grid(
     else:
         sampled = taken(settings.layers, hidden)
     if outlines:
-        sampled = with_outlines(sampled, scene, grid)
+        sampled = with_outlines(sampled, scene, grid, capacity)
     return replace(sampled, supersample=side, apron=settings.apron)
 
 

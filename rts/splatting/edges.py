@@ -241,7 +241,9 @@ class _Segments(NamedTuple):
             own = xp.where(on_right[:, None], self.right, self.right - self.jump)
             centre = xp.take(flat, y * color.shape[1] + x, axis=0)
             differs = xp.where(self._knows(k, on_right)[:, None], centre - (own[0] + own[1]) / 2, 0.0)
-            parts.append((x, y, change + share * mean - xp.abs(share) * differs))
+            change = change + share * mean - xp.abs(share) * differs
+            nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone
+            parts.append((x, y, xp.where(nothing[:, None], 0.0, change)))
         return parts
 
     def _knows(self, k: int, on_right: Array) -> Array:
@@ -256,12 +258,12 @@ class _Segments(NamedTuple):
     def normals(self, breaks: _Breaks) -> Array:
         """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
         xp, way = namespace(self.path), self.path[2] - self.path[0]
-        engine, count = engine_of(self.path), breaks.place.shape[0]
+        engine, count, same = engine_of(self.path), breaks.place.shape[0], self.ties[:, 0] == self.ties[:, 1]
         normal, total = xp.stack([way[:, 1], -way[:, 0]], axis=-1), breaks.step * 1e-6
         for i in (0, 1):
             # Two segments at a line of crossing may run in opposite directions.
             ahead = xp.sum(normal * xp.take(breaks.step, self.ties[:, i], axis=0), axis=-1) >= 0
-            turned = xp.where(self.lone[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
+            turned = xp.where(same[:, None], 0.0, xp.where(ahead[:, None], normal, -normal))
             total = total + engine.segment_sum(turned, self.ties[:, i], count)
         return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
 

@@ -112,6 +112,9 @@ def weigh_segments(
     """
     cuts, area = np.empty(4), np.empty(4)
     for s in range(first, last):
+        if ties[s, 0] == ties[s, 1]:
+            path[s], share[s], own[s], flux[s] = 0.0, 0.0, -1, 0.0
+            continue
         lone = ties[s, 1] < 0
         side0 = side[s, 0]
         side1 = (side0 + 2) % 4 if lone else side[s, 1]
@@ -195,7 +198,7 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
     for b in range(count):
         normal[b, 0], normal[b, 1] = 1e-6 * gap[b, 2], 1e-6 * (1 - gap[b, 2])
     for s in range(len(ties)):
-        if ties[s, 1] < 0:
+        if ties[s, 1] < 0 or ties[s, 0] == ties[s, 1]:
             continue
         nx, ny = path[s, 2, 1] - path[s, 0, 1], path[s, 0, 0] - path[s, 2, 0]
         for e in range(2):
