@@ -285,7 +285,7 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             vertices = np.array([(-1000, side, 1), (1000, 0, 1), third], np.float32)
             seen = np.float32((vertices @ rows[:3, :3].T)[:, :2] / vertices[:, 2:])
             seen[vertices[:, 2] <= 0] = np.nan
-            names, spans = Sheets(vertices, faces, none, rows, clip, 0.0, seen).spans(np.arange(2), Gaps.of(marks))
+            names, spans = Sheets(vertices, faces, none, rows, clip, 0.0, seen, np.int8([2, 2])).spans(Gaps.of(marks))
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
             assert np.isfinite(spans).all()

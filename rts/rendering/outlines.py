@@ -49,7 +49,9 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         fronts = _at_centres(row, depth, own, sampled.samples)
         here, more = _Points.of(scene, grid).found(fronts)
         # Engines that compile eager operations anew for each shape pad them.
-        found = _Found(*engine_of(sampled.row).call_host(lambda _: here, _Found.specs(0, grid.size), sampled.row))
+        specs = _Found.specs(0, grid.size, _real(scene))
+        arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
+        found = _Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
     for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         count = own.ids.shape[-2]
@@ -89,7 +91,7 @@ class _Found(NamedTuple):
     left: Array
 
     @staticmethod
-    def specs(most: int, size: tuple[int, int], real: Any = np.float64) -> list[ArraySpec]:
+    def specs(most: int, size: tuple[int, int], real: Any) -> list[ArraySpec]:
         """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
         integers, ends = np.int32, 2 * most
         breaks = [ArraySpec(shape, integers, packed=True) for shape in ((most, 4), (most, 4))]
@@ -118,15 +120,20 @@ def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree)
             gbuffer = part.surface.evaluate(part.theta, replace(samples, asked=None)) if "gbuffer" in kinds else {}
             filled = [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
             arrays_of += [np.asarray(x, spec.dtype) for x, spec in zip(filled, tables.values(), strict=True)]
-        return [*found, *arrays_of]
+        return [*(np.asarray(x, spec.dtype) for x, spec in zip(found, specs, strict=False)), *arrays_of]
 
-    real = np.float64 if floating_bits(scene.context.like) == 64 else np.float32
-    specs = _Found.specs(most, grid.size, real)
+    specs = _Found.specs(most, grid.size, _real(scene))
     rows = [ArraySpec((4 * most, *x.shape[1:]), x.dtype, packed=True) for own in owners for x in own.values()]
     operands = [x for x in leaves(known) if is_traced(x)]
     results = iter(engine_of(*operands).call_host(host, [*specs, *rows], *operands))
     found = _Found(*(next(results) for _ in specs))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
+
+
+def _real(scene: Scene) -> Any:
+    """The dtype of a scene's floating arrays."""
+    like = scene.context.like
+    return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
 
 
 def _tables(samples: Samples) -> dict[tuple[str, str], Array]:

@@ -48,6 +48,7 @@ class Sheets(NamedTuple):
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: sign of the determinants on screen of triangles to keep; 0 for both.
         seen: (V, 2) float32, where vertices lie in the image, in cells; NaN for those behind the camera.
+        sides: (T,) int8, which side of triangles is seen; see `silhouettes_loops.turns`.
     """
 
     vertices: np.ndarray
@@ -57,17 +58,19 @@ class Sheets(NamedTuple):
     clip: np.ndarray
     keep: float
     seen: np.ndarray
+    sides: np.ndarray
 
     @classmethod
     def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int], cull: str) -> Sheets:
         """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
-        from rts.sampling import sheets_loops
+        from rts.sampling import sheets_loops, silhouettes_loops
 
         vertices, faces = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
-        beyond = _beyond(proxy.faces)
-        return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen)
+        beyond, sides = _beyond(proxy.faces), np.empty(len(faces), np.int8)
+        parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
+        return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen, sides)
 
     def join(self, own: int, part: np.ndarray, triangle: np.ndarray, depth: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose fronts, of the part `own`, a sheet joins to the next ones'.
@@ -80,22 +83,29 @@ class Sheets(NamedTuple):
         arguments = part, triangle, depth, own, *mesh, self.keep != 0, joined
         parallel(sheets_loops.seams, height, *arguments, work=20 * part.size)
 
-    def near(self, cells: np.ndarray) -> np.ndarray:
-        """The triangles (M,), that may meet one of the cells which are marked (H, W)."""
-        from rts.sampling import spans_loops
+    def meet(self, part: np.ndarray, depth: np.ndarray, width: np.ndarray, gaps: np.ndarray) -> None:
+        """Mark, in `gaps` (2, H, W), those in which a sheet may end or turn away before what both centres show.
 
-        near = np.empty(len(self.faces), np.bool_)
-        parallel(spans_loops.near, len(near), self.faces, self.seen, self.keep, cells, near, work=10 * len(near))
-        return np.flatnonzero(near)
+        `part` and `depth` (H, W) tell what is seen at each centre; for `width` see `Oracle`.
+        """
+        from rts.sampling import silhouettes_loops
 
-    def spans(self, triangles: np.ndarray, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
+        mesh, count = (self.rows, self.vertices, self.faces), len(self.faces)
+        own = self.clip[0], self.keep, self.seen, self.beyond, self.sides
+        parallel(silhouettes_loops.meet, count, *mesh, *own, part, depth, width, gaps, work=10 * count)
+
+    def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
         """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
         from rts.sampling import spans_loops
 
-        most, count = np.empty(len(triangles), np.int64), len(triangles)
-        own = triangles, self.faces, self.seen, self.keep
-        parallel(spans_loops.most_spans, count, *own, gaps.rows, gaps.columns, most, work=20 * count)
-        triangles, most = triangles[most > 0], most[most > 0]
+        cells, close = np.zeros(gaps.rows.shape, np.bool_), np.empty(len(self.seen), np.bool_)
+        spans_loops.around(gaps.gap, cells)
+        parallel(spans_loops.close, len(close), self.seen, cells, close, work=3 * len(close))
+        most, count = np.empty(len(self.faces), np.int32), len(self.faces)
+        own = self.faces, self.seen, self.sides, self.keep, close
+        parallel(spans_loops.most_spans, count, *own, gaps.rows, gaps.columns, most, work=10 * count)
+        triangles = np.flatnonzero(most)
+        most = most[triangles]
         begins = np.cumsum(most) - most
         names, spans = np.full((most.sum(), 2), -1, np.int32), np.empty((most.sum(), 6))
         mesh = self.rows, self.vertices, self.faces, self.clip, self.keep, self.seen

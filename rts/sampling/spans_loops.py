@@ -49,32 +49,14 @@ def apart(first, last, part, joined, gaps):
 
 
 @loop
-def squares(first, last, gaps, marks):
-    """Fill `marks` (H − 1, W − 1) bool: is a side of a square a gap that is marked in `gaps` (2, H, W)?"""
-    for y in range(first, last):
-        for x in range(marks.shape[1]):
-            marks[y, x] = gaps[0, y, x] | gaps[0, y + 1, x] | gaps[1, y, x] | gaps[1, y, x + 1]
-
-
-@loop
-def sides(first, last, marks, gaps):
-    """Mark, in `gaps` (2, H, W), all sides of the squares that are marked (H − 1, W − 1)."""
-    (height, width) = marks.shape
-    for y in range(first, last):
-        for x in range(width + 1):
-            for k in range(2):
-                if 0 <= y - k < height and x < width:
-                    gaps[0, y, x] |= marks[y - k, x]
-                if 0 <= x - k < width and y < height:
-                    gaps[1, y, x] |= marks[y, x - k]
-
-
-@loop
-def around(boxes, far, marks):
-    """Mark, in `marks` (H, W) bool, boxes (M, 4) of cells, first and last y and x, and all up to `far` cells away."""
-    for n in range(len(boxes)):
-        top, bottom, left, right = boxes[n, 0] - far, boxes[n, 1] + far, boxes[n, 2] - far, boxes[n, 3] + far
-        marks[max(top, 0) : max(bottom + 1, 0), max(left, 0) : max(right + 1, 0)] = True
+def around(gap, cells):
+    """Mark, in `cells` (H, W) bool, the cells of gaps (M, 3), and those around them."""
+    height, width = cells.shape
+    for n in range(len(gap)):
+        y, x, row = gap[n, 0], gap[n, 1], gap[n, 2]
+        for j in range(max(y - 1, 0), min(y + 2 - row, height - 1) + 1):
+            for i in range(max(x - 1, 0), min(x + 1 + row, width - 1) + 1):
+                cells[j, i] = True
 
 
 @loop
@@ -119,23 +101,14 @@ def _range(low, high, count):
 
 
 @loop
-def near(first, last, faces, seen, keep, cells, marks):
-    """Fill `marks` (T,) bool: may a triangle that is kept meet one of the cells (H, W) that are marked?
-
-    For `keep` see `spans_of`.
-    """
-    (height, width), box = cells.shape, np.empty(4, np.float32)
-    for t in range(first, last):
-        area = _box(faces[t, 0], faces[t, 1], faces[t, 2], seen, height, width, box)
-        if area * keep < -SLACK:
-            marks[t] = False
-            continue
-        left, right = _range(box[0] - 1, box[1], width)
-        top, bottom = _range(box[2] - 1, box[3], height)
-        marks[t] = False
-        for y in range(top, bottom):
-            for x in range(left, right):
-                marks[t] |= cells[y, x]
+def close(first, last, seen, cells, marks):
+    """Fill `marks` (V,) bool: is a vertex in one of the cells (H, W) that are marked, or beyond the border there?"""
+    height, width = cells.shape
+    for v in range(first, last):
+        x, y = seen[v, 0], seen[v, 1]
+        marks[v] = False
+        if not np.isnan(x):
+            marks[v] = cells[int(min(max(y, 0.0), height - 1.0)), int(min(max(x, 0.0), width - 1.0))]
 
 
 @compiled
@@ -149,19 +122,35 @@ def _gaps_of(box, axis, by_row, by_column):
 
 
 @loop
-def most_spans(first, last, triangles, faces, seen, keep, by_row, by_column, most):
-    """Fill `most` (M,) with bounds on the numbers of spans of triangles; see `spans_of`."""
+def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, most):
+    """Fill `most` (T,) int32 with bounds on the numbers of spans of triangles.
+
+    Args:
+        first: the first triangle.
+        last: the triangle after the last.
+        faces: see `spans_of`.
+        seen: see `spans_of`.
+        sides: (T,) int8, see `silhouettes_loops.turns`.
+        keep: see `spans_of`.
+        close: (V,) bool, see the loop of this name, of cells around gaps.
+        by_row: see `Gaps`.
+        by_column: see `Gaps`.
+        most: to fill.
+    """
     box = np.empty(4, np.float32)
-    for i in range(first, last):
-        a, b, c = faces[triangles[i], 0], faces[triangles[i], 1], faces[triangles[i], 2]
-        area, most[i] = _box(a, b, c, seen, len(by_row), len(by_column), box), 0
-        if area * keep < -SLACK:
+    for t in range(first, last):
+        most[t] = 0
+        if sides[t] * keep < 0:
             continue
+        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+        if abs(sides[t]) < 2 and not (close[a] or close[b] or close[c]):
+            continue
+        _box(a, b, c, seen, len(by_row), len(by_column), box)
         for axis in range(2):
             begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
             table = by_row if axis == 0 else by_column
             for n in range(begin, stop):
-                most[i] += table[n, high] - table[n, low]
+                most[t] += table[n, high] - table[n, low]
 
 
 @loop

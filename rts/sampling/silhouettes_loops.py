@@ -1,0 +1,148 @@
+"""Silhouettes: edges of triangles where a sheet ends or turns away; and the gaps that they meet. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+from rts.sampling.sheets_loops import corners_of
+
+SLACK = 0.01
+"""By how much edges are wider than these, against rounding, in cells."""
+
+
+@loop
+def turns(first, last, rows, vertices, faces, seen, sides):
+    """Fill `sides` (T,) int8: which side of a triangle is seen, by the sign of its determinant.
+
+    A triangle that is more than a cell wide or high, or is seen in part, has 2 or −2, a smaller one 1 or −1.
+
+    Args:
+        first: the first triangle.
+        last: the triangle after the last.
+        rows: (4, 4), see `corners_of`.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3) of the proxy.
+        seen: (V, 2), see `sheets_loops.projected`.
+        sides: (T,) to fill.
+    """
+    corners = np.empty((3, 4))
+    for t in range(first, last):
+        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+        area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
+        area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
+        if area == 0 or np.isnan(area):
+            area = np.float32(corners_of(t, rows, vertices, faces, corners))
+        small = True
+        for axis in range(2):
+            wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
+            small &= wide <= 1  # False for NaN.
+        sides[t] = ((area > 0) - (area < 0)) * (1 if small else 2)
+
+
+@loop
+def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sides, part, depth, width, gaps):
+    """Mark, in `gaps` (2, H, W), those that silhouettes meet, unless both centres show something nearer.
+
+    Args:
+        first: the first triangle.
+        last: the triangle after the last.
+        rows: (4, 4), see `corners_of`.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3) of the proxy.
+        near_plane: (4,), positive on what is seen.
+        keep: sign of the determinants of triangles to keep; 0 keeps both.
+        seen: (V, 2), see `sheets_loops.projected`.
+        beyond: (T, 3), see `sheets_loops.neighbours`.
+        sides: (T,), see `turns`.
+        part: (H, W) int32, −1 where a centre shows nothing.
+        depth: (H, W) float64.
+        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+        gaps: (2, H, W) bool.
+    """
+    ends, deep = np.empty((2, 2)), np.empty(2)
+    for t in range(first, last):
+        side = sides[t]
+        if side == 0 or side * keep < 0:
+            continue
+        for c in range(3):
+            s = beyond[t, c]
+            # Two kept triangles that fold have an edge in common, which is told once.
+            if s >= 0 and (sides[s] * side > 0 or (keep == 0 and s < t and sides[s] != 0)):
+                continue
+            a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
+            if not _in_image(a, b, seen, part.shape) or not _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
+                continue
+            for axis in range(2):
+                _mark(axis, ends, min(deep[0], deep[1]), part, depth, width, gaps)
+
+
+@compiled
+def _in_image(a, b, seen, size):
+    """False for an edge that lies beyond one border of the image."""
+    for axis in range(2):
+        if seen[a, axis] < 0 and seen[b, axis] < 0:
+            return False
+        if seen[a, axis] > size[1 - axis] and seen[b, axis] > size[1 - axis]:
+            return False
+    return True
+
+
+@compiled
+def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
+    """Fill in both ends of an edge in the image, and their depths; False if it lies before the near plane.
+
+    An edge that reaches behind the camera is cut there.
+    """
+    for k in range(2):
+        v = a if k == 0 else b
+        ends[k, 0], ends[k, 1], deep[k] = seen[v, 0], seen[v, 1], rows[3, 3]
+        for r in range(3):
+            deep[k] += rows[3, r] * vertices[v, r]
+    if not np.isnan(ends[0, 0] + ends[1, 0]):
+        return True
+    values = near_plane[3], near_plane[3]
+    first, second = values
+    for r in range(3):
+        first += near_plane[r] * vertices[a, r]
+        second += near_plane[r] * vertices[b, r]
+    if first <= 0 and second <= 0:
+        return False
+    cut = first / (first - second) if (first > 0) != (second > 0) else 0.0
+    for k in range(2):
+        value, share = (first, 0.0) if k == 0 else (second, 1.0)
+        share = share if value > 0 else cut
+        x, y, w, deep[k] = rows[0, 3], rows[1, 3], rows[2, 3], rows[3, 3]
+        for r in range(3):
+            place = (1 - share) * vertices[a, r] + share * vertices[b, r]
+            x, y, w = x + rows[0, r] * place, y + rows[1, r] * place, w + rows[2, r] * place
+            deep[k] += rows[3, r] * place
+        if not w > 0:
+            return False
+        ends[k, 0], ends[k, 1] = x / w, y / w
+    return True
+
+
+@compiled
+def _mark(axis, ends, nearest, part, depth, width, gaps):
+    """Mark the gaps along an axis that an edge meets, unless both centres show something nearer than all of it."""
+    height, across = part.shape
+    lines, count = (height, across) if axis == 0 else (across, height)
+    k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1
+    x, y = ends[k, axis], ends[k, 1 - axis]
+    dx, dy = ends[1 - k, axis] - x, ends[1 - k, 1 - axis] - y
+    low, high = np.ceil(max(y - 0.5 - SLACK, 0.0)), np.floor(min(y + dy - 0.5 + SLACK, lines - 1.0))
+    for n in range(int(min(low, lines * 1.0)), int(max(high, -1.0)) + 1):
+        start, stop = x, x + dx
+        if dy > 0:
+            start = x + dx * min(max((n + 0.5 - SLACK - y) / dy, 0.0), 1.0)
+            stop = x + dx * min(max((n + 0.5 + SLACK - y) / dy, 0.0), 1.0)
+        begin, end = min(start, stop) - 0.5 - SLACK, max(start, stop) - 0.5 + SLACK
+        for m in range(int(max(np.floor(begin), 0.0)), int(min(end, count - 2.0)) + 1):
+            y0, x0 = (n, m) if axis == 0 else (m, n)
+            y1, x1 = (n, m + 1) if axis == 0 else (m + 1, n)
+            if part[y0, x0] >= 0 and part[y1, x1] >= 0:
+                far = max(depth[y0, x0], depth[y1, x1])
+                if nearest > far + abs(depth[y1, x1] - depth[y0, x0]) + width[0] + width[1] * far:
+                    continue
+            gaps[axis, y0, x0] = True
