@@ -124,6 +124,15 @@ class Sheets(NamedTuple):
         weights, depth = weights.astype(np.float32), depth.astype(np.float32)
         return Fragments(triangle[None, None], weights[None, None], depth[None, None]), slopes
 
+    def along(self, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Directions (M, 2), in the image, of the edges of triangles (M,) that are nearest to points (M, 2)."""
+        from rts.sampling import silhouettes_loops
+
+        found = np.empty((len(triangle), 2))
+        arguments = triangle, points, self.rows, self.vertices, self.faces, found
+        parallel(silhouettes_loops.along, len(found), *arguments, work=100 * len(found))
+        return found
+
 
 _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.sampling.sheets_loops import corners_of
+from rts.sampling.sheets_loops import corners_of, edge
 
 SLACK = 0.01
 """By how much edges are wider than these, against rounding, in cells."""
@@ -146,3 +146,18 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
                 if nearest > far + abs(depth[y1, x1] - depth[y0, x0]) + width[0] + width[1] * far:
                     continue
             gaps[axis, y0, x0] = True
+
+
+@loop
+def along(first, last, triangles, points, rows, vertices, faces, found):
+    """Fill `found` (M, 2): the direction in the image of the edge of a triangle that is nearest to a point (M, 2)."""
+    corners = np.empty((3, 4))
+    for m in range(first, last):
+        sign, least = corners_of(triangles[m], rows, vertices, faces, corners), np.inf
+        found[m] = 0.0
+        for k in range(3):
+            ex, ey, e = edge(corners, k, sign)
+            size = np.hypot(ex, ey)
+            if size > 0 and abs(ex * points[m, 0] + ey * points[m, 1] + e) < least * size:
+                least = abs(ex * points[m, 0] + ey * points[m, 1] + e) / size
+                found[m, 0], found[m, 1] = ey, -ex
