@@ -42,7 +42,7 @@ def turns(first, last, rows, vertices, faces, seen, sides):
 
 @loop
 def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sides, part, depth, width, gaps):
-    """Mark, in `gaps` (2, H, W), those that silhouettes meet, unless both centres show something nearer.
+    """Mark, in `gaps` (2, H, W), those that silhouettes meet: 2, or 1 where both centres show something nearer.
 
     Args:
         first: the first triangle.
@@ -58,7 +58,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
-        gaps: (2, H, W) bool.
+        gaps: (2, H, W) uint8.
     """
     ends, deep = np.empty((2, 2)), np.empty(2)
     for t in range(first, last):
@@ -125,7 +125,7 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
 
 @compiled
 def _mark(axis, ends, nearest, part, depth, width, gaps):
-    """Mark the gaps along an axis that an edge meets, unless both centres show something nearer than all of it."""
+    """Mark the gaps along an axis that an edge meets, with 1 where both centres show something nearer than all of it."""
     height, across = part.shape
     lines, count = (height, across) if axis == 0 else (across, height)
     k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1
@@ -144,8 +144,9 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
             if part[y0, x0] >= 0 and part[y1, x1] >= 0:
                 far = max(depth[y0, x0], depth[y1, x1])
                 if nearest > far + abs(depth[y1, x1] - depth[y0, x0]) + width[0] + width[1] * far:
+                    gaps[axis, y0, x0] = max(gaps[axis, y0, x0], 1)
                     continue
-            gaps[axis, y0, x0] = True
+            gaps[axis, y0, x0] = 2
 
 
 @loop

@@ -27,13 +27,14 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     """
     from rts.sampling import spans_loops
 
-    joined = np.zeros((2, *fronts.part.shape), np.bool_)
-    for part, own in enumerate(sheets):
-        own.join(part, *fronts, joined)
-    gaps = np.empty_like(joined)
-    parallel(spans_loops.apart, len(fronts.part), fronts.part, joined, gaps, work=2 * fronts.part.size)
+    met = np.zeros((2, *fronts.part.shape), np.uint8)
     for own in sheets:
-        own.meet(fronts.part, fronts.depth, width, gaps)
+        own.meet(fronts, width, met)
+    joined = np.zeros(met.shape, np.bool_)
+    for part, own in enumerate(sheets):
+        own.join(part, fronts, met, joined)
+    gaps = np.empty_like(joined)
+    parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, gaps, work=2 * fronts.part.size)
     gap, whole, numbers = _breaks_in(gaps, fronts, sheets)
     # In one surface from centre to centre.
     inside = fronts.part >= 0
