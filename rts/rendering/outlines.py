@@ -15,17 +15,20 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
-from rts.rendering.scene import Grid, Scene
+from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
 from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
 from rts.sampling.spans import breaks_of_triangles
+from rts.sampling.stacks_of_spans import breaks_of_stacks
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 
 def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
-    """Samples at cells' centres, of one layer, with `Sampled.outlines` and the samples beside breaks.
+    """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
+
+    Of several layers the outlines are those of all that light reaches; all parts must have `layered` outlines then.
 
     Args:
         sampled: the samples at centres.
@@ -46,10 +49,9 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         found, more = _traced(sampled, scene, grid, max(8 * sum(grid.size), (capacity or 0) // 4), inputs)
     else:
         row, depth, own = map_leaves(_known, inputs[3:])
-        fronts = _at_centres(row, depth, own, sampled.samples)
-        here, more = _Points.of(scene, grid).found(fronts)
+        here, more = _Points.of(scene, grid).found(_at_centres(row, depth, own, sampled.samples))
         # Engines that compile eager operations anew for each shape pad them.
-        specs = _Found.specs(0, grid.size, _real(scene))
+        specs = _Found.specs(0, grid.size, _real(scene), len(row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         found = _Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
@@ -58,7 +60,9 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
         samples.append(in_one_table([own, extra]))
         first += samples[-1].ids.shape[-2]
-    named = {"rows": rows[:, :2], "inner": rows[:, 2:]}
+    named = {"rows": rows[:, :2], "inner": rows[:, 2:4]}
+    if sampled.row.shape[0] > 1:
+        named = {"rows": rows[:, :2], "inner": rows[:, :2], **_stacks(found, rows[:, 2:])}
     outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
     overflow, cells = sampled.overflow + found.left, _renumbered(sampled, samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
@@ -68,13 +72,18 @@ class _Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
-        rows: (B, 4) int32, the two last samples of each break and the two that tell colours, counted in their part.
-        parts: (B, 4) int32, their parts, or −1.
+        rows: (B, 4) int32, the two last samples of each break and the two that tell colours, counted in their part. Of
+            K layers (B, 2 + K + 1): the two last samples, and those of the stack there.
+        parts: of the shape of `rows`, int32, their parts, or −1.
+        sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
+        places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.
         left: () int32, number of breaks left out for want of room.
     """
 
     rows: Array
     parts: Array
+    sides: Array
+    places: Array
     place: Array
     gap: Array
     points: Array
@@ -91,10 +100,11 @@ class _Found(NamedTuple):
     left: Array
 
     @staticmethod
-    def specs(most: int, size: tuple[int, int], real: Any) -> list[ArraySpec]:
+    def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
         """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
-        integers, ends = np.int32, 2 * most
-        breaks = [ArraySpec(shape, integers, packed=True) for shape in ((most, 4), (most, 4))]
+        integers, ends, (columns, entries, of_sides) = np.int32, 2 * most, _columns(layers)
+        breaks = [ArraySpec((most, columns), integers, packed=True)] * 2
+        breaks += [ArraySpec((most, 2, of_sides), integers, packed=True), ArraySpec((most, entries), real, packed=True)]
         breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
         breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
         breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
@@ -122,12 +132,27 @@ def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree)
             arrays_of += [np.asarray(x, spec.dtype) for x, spec in zip(filled, tables.values(), strict=True)]
         return [*(np.asarray(x, spec.dtype) for x, spec in zip(found, specs, strict=False)), *arrays_of]
 
-    specs = _Found.specs(most, grid.size, _real(scene))
-    rows = [ArraySpec((4 * most, *x.shape[1:]), x.dtype, packed=True) for own in owners for x in own.values()]
+    layers = sampled.row.shape[0]
+    specs = _Found.specs(most, grid.size, _real(scene), layers)
+    rows = [ArraySpec((_columns(layers)[0] * most, *x.shape[1:]), x.dtype, packed=True) for own in owners for x in own.values()]
     operands = [x for x in leaves(known) if is_traced(x)]
     results = iter(engine_of(*operands).call_host(host, [*specs, *rows], *operands))
     found = _Found(*(next(results) for _ in specs))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
+
+
+def _columns(layers: int) -> tuple[int, int, int]:
+    """The numbers of samples of a break, of those of its stack, and of layers on each side; see `_Found`."""
+    return (4, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)
+
+
+def _stacks(found: _Found, rows: Array) -> dict[str, Array]:
+    """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
+    xp, (count, _, layers) = namespace(rows), found.sides.shape
+    flat, there = xp.reshape(found.sides, (count, -1)), found.sides >= 0
+    at = xp.where(flat >= 0, flat, 0)
+    stack, places = (xp.reshape(xp.take_along_axis(x, at, axis=1), (count, 2, layers)) for x in (rows, found.places))
+    return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
 
 
 def _real(scene: Scene) -> Any:
@@ -168,14 +193,14 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
 def _at_centres(
     row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
 ) -> Fronts:
-    """The fronts (H, W) of a sampled scene: its `row` and `depth`, and the triangles of each part's samples."""
-    row, counts = row[0], [own.ids.shape[-2] for own in samples]
+    """What is seen at centres (K, H, W): the `row` and `depth` of a scene, and the triangles of its parts' samples."""
+    counts = [own.ids.shape[-2] for own in samples]
     none = [np.full(count, -1, np.int32) for count in counts]
     of_samples = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
     part = np.where(row >= 0, np.int32(0), np.int32(-1))
     for first in np.cumsum(counts)[:-1]:
         part += row >= first
-    return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth[0].astype(np.float64))
+    return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth.astype(np.float64))
 
 
 def _known(x: Array) -> np.ndarray:
@@ -202,38 +227,54 @@ class _Points:
             if isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface):
                 host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
                 entry = _entry(part, sampler, entry, host, grid.size)
-                if not (surface.refines and surface.refine_moves):
+                if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
 
-    def found(self, fronts: Fronts, most: int | None = None) -> tuple[_Found, list[Samples]]:
-        """Outlines between the fronts (H, W) at centres, of at most `most` breaks; each part's samples beside them."""
-        breaks = self.breaks(fronts)
+    def found(self, layers: Fronts, most: int | None = None) -> tuple[_Found, list[Samples]]:
+        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; each part's samples there."""
+        breaks, parts, points, triangles, sides = self.breaks(layers)
         left = 0 if most is None else max(0, len(breaks.gap) - most)
         if left:
             breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-        # For each break the two last samples, and the two that tell colours.
-        parts, every = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
+            parts, points, triangles, sides = (x[:most] for x in (parts, points, triangles, sides))
         samples, rows = [], np.full(parts.shape, -1, np.int32)
         for part in range(len(self._parts)):
             asked = parts == part
-            samples.append(self.sample(part, every[asked], breaks.triangles[asked]))
+            samples.append(self.sample(part, points[asked], triangles[asked]))
             rows[asked] = _known(samples[-1].row)[0, 0]
         along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
         first = breaks.gap[:, 1::-1] + 0.5
         place = ((breaks.place - first) * along).sum(-1)
-        points = ((breaks.points - first[:, None]) * along[:, None]).sum(-1)
-        own = breaks.gap, points, breaks.near, breaks.slope, breaks.ends
-        found = _Found(rows, parts, place, *own, *joined(breaks), breaks.joined, np.int32(left))
+        places = ((points - first[:, None]) * along[:, None]).sum(-1)
+        entries = places[:, 2:] if len(layers.part) > 1 else places[:, :0]
+        own = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
+        segments = joined(breaks, len(layers.part) > 1)
+        found = _Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
         return found, samples
 
-    def breaks(self, fronts: Fronts) -> Breaks:
-        """The breaks between the fronts (H, W) at centres."""
+    def breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The breaks between what is seen at centres (K, H, W), and the samples that they need.
+
+        Returns:
+            Breaks; parts (B, R), points (B, R, 2) and triangles (B, R) of samples, and `_Found.sides`.
+        """
         sheets = [own for *_, own in self._parts if own is not None]
+        if len(layers.part) > 1:
+            opaque = np.array(self._scene.opaque)
+            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
+            parts = np.concatenate([stacks.last, stacks.parts], 1)
+            points = np.concatenate([breaks.points, stacks.points], 1)
+            return breaks, parts, points, np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1), stacks.sides
+        fronts = layers.at((0,))
         if len(sheets) == len(self._parts):
-            return breaks_of_triangles(fronts, sheets, self._width)
-        return find_breaks(fronts, Oracle(self._fronts, self._width))
+            breaks = breaks_of_triangles(fronts, sheets, self._width)
+        else:
+            breaks = find_breaks(fronts, Oracle(self._fronts, self._width))
+        # For each break the two last samples, and the two that tell colours.
+        parts, points = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
+        return breaks, parts, points, breaks.triangles, np.empty((len(parts), 2, 0), np.int32)
 
     def sample(self, part: int, points: np.ndarray, triangles: np.ndarray | None = None) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
@@ -258,6 +299,14 @@ class _Points:
             nearer = seen & (z < depth)
             part[nearer], depth[nearer] = index, z[nearer]
         return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
+
+
+def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
+    """What is seen at centres (K, H, W), without what lies behind an opaque layer."""
+    solid = (layers.part >= 0) & opaque[layers.part]
+    hidden = np.cumsum(solid, axis=0) - solid > 0
+    part, triangle = (np.where(hidden, np.int32(-1), x) for x in (layers.part, layers.triangle))
+    return Fronts(part, triangle, np.where(hidden, 0.0, layers.depth))
 
 
 class _OnTriangles(TriangleSampler):

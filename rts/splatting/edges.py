@@ -16,7 +16,7 @@ and the flux ∫ v · n J ds has no value: it is the derivative of the shares. �
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,18 +27,27 @@ from rts.contracts.records import Outlines, Splats
 from rts.contracts.splatter import Splatter
 from rts.operations.operation import Operation
 from rts.splatting import edges_weights
+from rts.splatting.edges_stacks import Operands, cells_of, inside
 from rts.splatting.edges_weights import BORDER
 from rts.splatting.layers import check_rows, nothing, unpack
+
+FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
+"""The fields of outlines that the operation takes: those of one layer."""
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
 
 class Edges(Splatter):
-    """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque."""
+    """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque.
 
-    layers = 1
+    Where light passes through, layers are composited, and each outline that is seen moves with its own layer; see
+    `rts.splatting.edges_stacks`.
+    """
+
+    opaque_layers = 1
     reads = frozenset({"outlines"})
+    translucent = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
@@ -48,11 +57,23 @@ class Edges(Splatter):
         check_rows(row, rgba.shape[0])
         outlines = splats.outlines
         if outlines is None:
-            color, motion = _on_cells(positions, rgba, row[0, ...])
-            return color - _inside(color, motion - stopped(motion), _all_joined(row[0, ...] >= 0))
+            return _without_outlines(splats)
         check_rows(outlines.rows, rgba.shape[0], "outlines.rows")
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
-        return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, field.name) for field in fields(Outlines)))
+        if outlines.stack is None:
+            return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, name) for name in FIELDS))
+        check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
+        own = Operands.of(splats, outlines)
+        image = EDGES(own.positions, own.rgba, own.row, *(getattr(own.outlines, name) for name in FIELDS))
+        return image if own.motion is None else image + own.motion
+
+
+def _without_outlines(splats: Splats) -> Array:
+    """The image (H, W, 4) as if all cells showed one surface, or stacks of the same layers."""
+    row = splats.row[:1, ...] if splats.opaque else splats.row
+    stacks = cells_of(splats.positions, splats.rgba, row)
+    motion = stacks.motion - stopped(stacks.motion)
+    return stacks.whole + inside(stacks._replace(motion=motion), _all_joined(row[0, ...] >= 0))
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:

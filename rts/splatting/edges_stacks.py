@@ -1,0 +1,205 @@
+"""Stacks of layers that light passes through, for the splatter of found edges.
+
+    image of a pixel  =  C − Σ_k D_k · m_k  +  what segments add, as for opaque layers
+
+    C       the composite of the cell's K layers, front to back
+    D_k     its slope where layer k alone shifts: T_k (∇c_k − ∇α_k B_k), of colour and alpha of the layer, the light T_k
+            that passes to it, and the composite B_k behind it
+    m_k     the motion of the layer's sample: 0 in value, it has the derivative
+
+At a break the one layer that ends there moves it, or the two that cross. The colours on its sides are composites of the
+stacks there. The composites are further rows of the tables of samples; so the rest is that of opaque layers.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, namespace, stopped
+from rts.arrays.trees import Array
+from rts.contracts.records import Outlines, Splats
+from rts.splatting.layers import over, unpack
+
+
+class Stack(NamedTuple):
+    """Layers front to back, in cells or beside breaks.
+
+    Attributes:
+        color: (K, ..., 4), premultiplied; 0 where there is no layer.
+        motion: (K, ..., 2), of the layers' samples; 0 where there is no layer.
+        whole: (..., 4), the composite.
+    """
+
+    color: Array
+    motion: Array
+    whole: Array
+
+    @classmethod
+    def of(cls, positions: Array, rgba: Array, rows: Array, points: Array) -> Stack:
+        """The stack of samples `rows` (K, ...), −1 for none, which were at `points` (K or 1, ..., 2)."""
+        xp, there = namespace(rgba), (rows >= 0)[..., None]
+        color = xp.where(there, unpack(rgba, rows), 0.0)
+        motion = xp.where(there, unpack(positions, rows)[..., :2] - points, 0.0)
+        return cls(color, motion, functools.reduce(lambda back, k: over(color[k, ...], back), *_from_the_back(color)))
+
+    def weights(self) -> tuple[Array, Array]:
+        """The light (K, ..., 1) that passes to each layer, and the composite (K, ..., 4) behind it; constants."""
+        color = stopped(self.color)
+        xp, count = namespace(color), color.shape[0]
+        through, behind = [xp.ones_like(color[0, ..., 3:])], [xp.zeros_like(color[0, ...])]
+        for k in range(count - 1):
+            through.append(through[-1] * (1 - color[k, ..., 3:]))
+            behind.append(over(color[count - 1 - k, ...], behind[-1]))
+        return xp.stack(through), xp.stack(behind[::-1])
+
+
+def _from_the_back(color: Array) -> tuple[range, Array]:
+    """The indices of layers (K, ..., 4) before the last, back to front, and the last."""
+    return range(color.shape[0] - 2, -1, -1), color[-1, ...]
+
+
+class Operands(NamedTuple):
+    """What takes the place of stacks in `rts.splatting.edges`.
+
+    Attributes:
+        positions: (M, 3), those of samples; then of cells, and of both sides of breaks, which stand still.
+        rgba: (M, 4), colours of samples; then composites.
+        row: (H, W), the composites of cells.
+        outlines: whose colours are composites.
+        motion: (H, W, 4), to be added to the image: without value, with the derivative of motions inside; None if
+            there are no derivatives.
+    """
+
+    positions: Array
+    rgba: Array
+    row: Array
+    outlines: Outlines
+    motion: Array | None
+
+    @classmethod
+    def of(cls, splats: Splats, outlines: Outlines) -> Operands:
+        """The operands for splats of K layers."""
+        positions, rgba, row, stack = splats.positions, splats.rgba, splats.row, outlines.stack
+        xp, engine, (height, width), count = namespace(rgba), engine_of(rgba), row.shape[1:], rgba.shape[0]
+        cells, centres, places = cells_of(positions, rgba, row), _centres(row, rgba), _points_of(outlines)
+        sides = [
+            Stack.of(positions, rgba, xp.permute_dims(stack[:, i, :], (1, 0)), xp.permute_dims(at, (1, 0, 2)))
+            for i, at in enumerate(places)
+        ]
+        breaks, first = outlines.place.shape[0], count + height * width
+        inner = [_numbered(stack[:, i, 0], first + i * breaks) for i in (0, 1)]
+        rows = [xp.where(outlines.rows[:, i] >= 0, outlines.rows[:, i], inner[i]) for i in (0, 1)]
+        whole = replace(outlines, rows=xp.stack(rows, axis=-1), inner=xp.stack(inner, axis=-1))
+        still = xp.concat([xp.reshape(centres, (-1, 2)), *(_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1))])
+        motion = None
+        if engine.differentiates:
+            motion = inside(cells, outlines.joined) + _beside_breaks(cells, sides, whole, positions)
+        return cls(
+            xp.concat([positions, xp.concat([still, xp.zeros_like(still[:, :1])], axis=-1)]),
+            xp.concat([rgba, xp.reshape(cells.whole, (-1, 4)), *(own.whole for own in sides)]),
+            xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), count), (height, width)),
+            whole,
+            motion,
+        )
+
+
+def cells_of(positions: Array, rgba: Array, row: Array) -> Stack:
+    """The stacks (K, H, W) of cells."""
+    return Stack.of(positions, rgba, row, _centres(row, rgba)[None, ...])
+
+
+def _centres(row: Array, like: Array) -> Array:
+    """Centres (H, W, 2) of the cells of `row` (K, H, W), of the engine of `like`."""
+    height, width = row.shape[1:]
+    across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return engine_of(like).constant(np.stack([across, down], axis=-1), like)
+
+
+def _numbered(row: Array, first: int) -> Array:
+    """Indices (M,) of the composites of stacks, whose fronts are `row`; −1 for none."""
+    numbers = engine_of(row).constant(np.arange(first, first + row.shape[0], dtype=np.int32), row)
+    return namespace(row).where(row >= 0, numbers, -1)
+
+
+def _on_gaps(outlines: Outlines, places: Array) -> Array:
+    """Points (B, ..., 2) at places (B, ...) along the gaps of breaks."""
+    xp, gap = namespace(places), outlines.gap
+    first = xp.astype(xp.stack([gap[:, 1], gap[:, 0]], axis=-1), places.dtype) + 0.5
+    along = xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), places.dtype)
+    if places.ndim == 2:
+        first, along = first[:, None, :], along[:, None, :]
+    return first + places[..., None] * along
+
+
+def _points_of(outlines: Outlines) -> list[Array]:
+    """Points (B, K, 2) of the samples of the stacks before breaks, and of those behind."""
+    return [_on_gaps(outlines, outlines.stack_points[:, i, :]) for i in (0, 1)]
+
+
+def inside(cells: Stack, joined: Array) -> Array:
+    """−Σ D_k · m_k (H, W, 4): slopes are means of the differences from and to the next cells of the same layers."""
+    xp, color, total = namespace(cells.color), stopped(cells.color), 0.0
+    through, behind = cells.weights()
+    for axis in (0, 1):
+        here = joined[axis][None, ..., None]
+        rise = xp.where(here, xp.roll(color, -1, axis=2 - axis) - color, 0.0)
+        slope = (rise + xp.roll(rise, 1, axis=2 - axis)) / 2
+        change = through * (slope - slope[..., 3:] * behind)
+        total = total - xp.sum(change * cells.motion[..., axis, None], axis=0)
+    return total
+
+
+def _beside_breaks(cells: Stack, sides: Sequence[Stack], outlines: Outlines, positions: Array) -> Array:
+    """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
+
+    As `rts.splatting.edges._beside_breaks` of opaque layers, whose own part of it, of the composites and of the motion
+    of breaks, is taken off.
+    """
+    xp, engine, (height, width) = namespace(cells.color), engine_of(cells.color), cells.whole.shape[:2]
+    gap, normal, parts, indices = outlines.gap, _normals(outlines), [], []
+    along = xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), positions.dtype)
+    ahead = xp.sum(normal * along, axis=-1)
+    weights = [xp.reshape(x, (x.shape[0], height * width, -1)) for x in (cells.color, cells.motion, *cells.weights())]
+    composite = xp.reshape(stopped(cells.whole), (height * width, -1))
+    for i, way in enumerate((1, -1)):
+        step = xp.where(gap[:, 2] == 1, 1, width)
+        cell = gap[:, 0] * width + gap[:, 1] + (step if i == 1 else 0)
+        color, motion, through, behind = (xp.take(x, cell, axis=1) for x in weights)
+        rise = stopped(sides[i].color) - stopped(color)
+        moves = xp.sum((sides[i].motion + motion) / 2 * normal, axis=-1)[..., None]
+        change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
+        # What is added for the composite, as if it moved with the break.
+        at = xp.take(positions, xp.where(outlines.rows[:, i] >= 0, outlines.rows[:, i], 0), axis=0)
+        own = xp.sum((at[:, :2] - _on_gaps(outlines, outlines.points[:, i])) / 2 * normal, axis=-1)[:, None]
+        change = change - (stopped(sides[i].whole) - xp.take(composite, cell, axis=0)) * own
+        counts = outlines.ends[:, i] & (outlines.rows[:, i] >= 0)
+        length = xp.clip(outlines.place if i == 0 else 1 - outlines.place, 0.0, 1.0)
+        share = xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0)
+        change = xp.where(counts[:, None], change * (-way * ahead)[:, None], 0.0)
+        parts += [share[:, None] * change, (1 - share)[:, None] * change]
+        indices += [cell, cell + way * step]
+    return xp.reshape(engine.segment_sum(xp.concat(parts), xp.concat(indices), height * width), (height, width, -1))
+
+
+def _normals(outlines: Outlines) -> Array:
+    """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    xp, ties, place = namespace(outlines.place), outlines.ties, _on_gaps(outlines, outlines.place)
+    engine, count = engine_of(place), place.shape[0]
+    gap = xp.astype(outlines.gap[:, 2], place.dtype)
+    step = xp.stack([gap, 1 - gap], axis=-1)
+    ends = [xp.take(place, xp.where(ties[:, i] >= 0, ties[:, i], 0), axis=0) for i in (0, 1)]
+    way, total = ends[1] - ends[0], step * 1e-6
+    normal = xp.stack([way[:, 1], -way[:, 0]], axis=-1)
+    counts = (ties[:, 1] >= 0) & (ties[:, 0] != ties[:, 1])
+    for i in (0, 1):
+        at = xp.where(counts, ties[:, i], 0)
+        # Two segments at a line of crossing may run in opposite directions.
+        forward = xp.sum(normal * xp.take(step, at, axis=0), axis=-1) >= 0
+        turned = xp.where(counts[:, None], xp.where(forward[:, None], normal, -normal), 0.0)
+        total = total + engine.segment_sum(turned, at, count)
+    return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
