@@ -148,10 +148,10 @@ def _columns(layers: int) -> tuple[int, int, int]:
 
 def _stacks(found: _Found, rows: Array) -> dict[str, Array]:
     """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
-    xp, (count, _, layers) = namespace(rows), found.sides.shape
-    flat, there = xp.reshape(found.sides, (count, -1)), found.sides >= 0
-    at = xp.where(flat >= 0, flat, 0)
-    stack, places = (xp.reshape(xp.take_along_axis(x, at, axis=1), (count, 2, layers)) for x in (rows, found.places))
+    xp, shape, there = namespace(rows), found.sides.shape, found.sides >= 0
+    first = engine_of(rows).constant(np.arange(shape[0], dtype=np.int32) * rows.shape[1], rows)[:, None, None]
+    at = xp.reshape(xp.where(there, first + found.sides, 0), (-1,))
+    stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, found.places))
     return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
 
 

@@ -98,7 +98,7 @@ class Operands(NamedTuple):
         still = xp.concat([xp.reshape(centres, (-1, 2)), *(_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1))])
         motion = None
         if engine.differentiates:
-            motion = inside(cells, outlines.joined) + _beside_breaks(cells, sides, whole, positions)
+            motion = inside(cells, outlines.joined) + _beside_breaks(cells, sides, outlines, positions)
         return cls(
             xp.concat([positions, xp.concat([still, xp.zeros_like(still[:, :1])], axis=-1)]),
             xp.concat([rgba, xp.reshape(cells.whole, (-1, 4)), *(own.whole for own in sides)]),
@@ -174,10 +174,12 @@ def _beside_breaks(cells: Stack, sides: Sequence[Stack], outlines: Outlines, pos
         moves = xp.sum((sides[i].motion + motion) / 2 * normal, axis=-1)[..., None]
         change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
         # What is added for the composite, as if it moved with the break.
-        at = xp.take(positions, xp.where(outlines.rows[:, i] >= 0, outlines.rows[:, i], 0), axis=0)
-        own = xp.sum((at[:, :2] - _on_gaps(outlines, outlines.points[:, i])) / 2 * normal, axis=-1)[:, None]
+        ending = outlines.rows[:, i]
+        at = xp.take(positions, xp.where(ending >= 0, ending, 0), axis=0)[:, :2]
+        own = xp.sum((at - _on_gaps(outlines, outlines.points[:, i])) / 2 * normal, axis=-1)
+        own = xp.where(ending >= 0, own, 0.0)[:, None]
         change = change - (stopped(sides[i].whole) - xp.take(composite, cell, axis=0)) * own
-        counts = outlines.ends[:, i] & (outlines.rows[:, i] >= 0)
+        counts = outlines.ends[:, i] & (outlines.stack[:, i, 0] >= 0)
         length = xp.clip(outlines.place if i == 0 else 1 - outlines.place, 0.0, 1.0)
         share = xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0)
         change = xp.where(counts[:, None], change * (-way * ahead)[:, None], 0.0)
