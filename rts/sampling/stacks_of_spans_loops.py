@@ -139,13 +139,14 @@ def _seen(stack, at, most, own, parts, opaque):
 
 
 @compiled
-def _partner(i, own, spans, parts, place, ends, neighbour):
-    """Another run of the same part that ends (or starts) where one does, at one depth: a sheet turns there; or −1.
+def _partner(i, own, parts, place, ends, neighbour):
+    """Another run of the same part that ends (or starts) where one does: a sheet turns away there; or −1.
+
+    Their depths differ where triangles in between are seen from the side.
 
     Args:
         i: the span with which the run ends.
         own: the gap's spans.
-        spans: (N, 6).
         parts: (N,).
         place: where it ends.
         ends: (n,), where spans end (or start).
@@ -153,8 +154,7 @@ def _partner(i, own, spans, parts, place, ends, neighbour):
     """
     for j in range(len(own)):
         if j != i and neighbour[j] < 0 and parts[own[j]] == parts[own[i]] and abs(ends[j] - place) <= TOUCH:
-            if _alike(spans, own[i], own[j], place):
-                return j
+            return j
     return -1
 
 
@@ -320,7 +320,7 @@ def changes(
                 if high[i] > place:
                     m += 1
                     continue
-                other = _partner(i, own, spans, parts, place, high, after)
+                other = _partner(i, own, parts, place, high, after)
                 partner = -1
                 for k in range(count):
                     partner = k if k != m and other >= 0 and stack[k] == other else partner
@@ -350,7 +350,7 @@ def changes(
                     continue
                 front = _insert(stack, count, i, own, spans, low[i], min(farther, high[i]))
                 inside[i], count = True, count + 1
-                other, partner = _partner(i, own, spans, parts, low[i], low, before), -1
+                other, partner = _partner(i, own, parts, low[i], low, before), -1
                 if other >= 0 and live[other] and not inside[other]:
                     partner = _insert(stack, count, other, own, spans, low[i], min(farther, high[other]))
                     inside[other], count = True, count + 1
