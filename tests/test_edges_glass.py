@@ -240,3 +240,77 @@ def test_glass_that_lets_no_light_through_is_drawn_as_opaque():
     # Where an edge ends behind another surface, one pixel is off by about an eighth.
     assert np.sort(np.abs(glass - image).max(-1).ravel())[-13] < 1e-3
     assert np.linalg.norm(pushed_glass - derivative) < 0.05 * np.linalg.norm(derivative)
+
+
+def mixed(t):
+    """Panes, a ball of glass and cards, some of which cross."""
+    corners = turned(SQUARE, 0.3, (14.2, 11.7))
+    ramp = np.random.default_rng(2).random((4, 3))
+    slope = 0.3 * (corners[:, 0] - 12.2)
+    parts = [glass_ball(t, (1.0, 0.2, 0.3)), pane(corners, 20.5 + slope, ramp, 0.7, t, (0.3, -0.5, 0.4))]
+    return [*parts, pane(turned(SQUARE, -0.2, (9, 12)), 20 - slope, ramp[::-1], 0.4), pane(EVERYWHERE, 40, ramp, 1.0)]
+
+
+def test_compiled_loops_draw_and_pull_what_the_rule_does(monkeypatch):
+    from rts.splatting import edges, edges_stacks
+
+    weights = torch.as_tensor(np.random.default_rng(0).normal(size=(*SIZE, 4)), dtype=torch.float32)
+
+    def result():
+        t = torch.zeros((), requires_grad=True)
+        image = drawn(mixed(t))
+        (image * weights).sum().backward()
+        return image.detach().numpy(), float(t.grad), pushed(lambda t: drawn(mixed(t)))[1]
+
+    image, slope, derivative = result()
+    monkeypatch.setattr(edges, "EDGES", edges._specification)
+    monkeypatch.setattr(edges, "CELLS", edges_stacks._specification)
+    monkeypatch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
+    by_rule, slope_of_rule, derivative_of_rule = result()
+    np.testing.assert_allclose(image, by_rule, atol=1e-5)
+    np.testing.assert_allclose(derivative, derivative_of_rule, atol=1e-4)
+    assert slope == pytest.approx(slope_of_rule, rel=1e-3)
+
+
+def test_numpy_draws_what_torch_draws():
+    parts = mixed(torch.zeros(()))
+    known = [part.replace(theta={name: np.asarray(x) for name, x in part.theta.items()}) for part in parts]
+    np.testing.assert_allclose(drawn(known), drawn(parts).numpy(), atol=1e-5)
+
+
+@pytest.mark.thorough
+def test_jax_draws_and_pushes_what_torch_does_in_compiled_programs_too():
+    jax = pytest.importorskip("jax")
+
+    def scene(shift):
+        parts = mixed(torch.zeros(()))
+        parts = [p.replace(theta={k: jax.numpy.asarray(np.asarray(x)) for k, x in p.theta.items()}) for p in parts]
+        ball = parts[0]
+        vertices = ball.theta["vertices"] + shift * jax.numpy.asarray([1.0, 0.2, 0.3])
+        return drawn([ball.replace(theta={**ball.theta, "vertices": vertices}), *parts[1:]], layers=6)
+
+    image, derivative = pushed(lambda t: drawn([mixed(t)[0], *mixed(0.0)[1:]], layers=6))
+    for f in (scene, jax.jit(scene)):
+        found, pushed_by_jax = jax.jvp(f, (0.0,), (1.0,))
+        np.testing.assert_allclose(np.asarray(found), image, atol=1e-4)
+        np.testing.assert_allclose(np.asarray(pushed_by_jax), derivative, atol=1e-3)
+
+
+def test_layers_that_are_found_are_as_many_as_light_goes():
+    """With layers="auto" all panes are composited; with too few of them a warning says so."""
+    parts = [pane(EVERYWHERE, 3 + i, np.eye(3)[i % 3], 0.3) for i in range(5)]
+    image = drawn(parts, layers="auto")
+    np.testing.assert_allclose(image[12, 12], over(*[(np.eye(3)[i % 3], 0.3) for i in range(5)]), atol=1e-5)
+    with pytest.warns(rts.errors.LayersWarning, match="of the light passes through the last of 2 layers"):
+        drawn(parts, layers=2)
+
+
+def test_of_glass_that_has_no_triangles_the_front_is_drawn_with_a_warning():
+    def outside(theta, points):
+        return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - theta["radius"]
+
+    theta = {"center": np.float32([12, 12, -8]), "radius": np.float32(5), "color": np.float32([1, 0, 0, 0.5])}
+    surface = rts.plugin("surfaces", "sdf")(outside, bounds=((-1, -1, -15), (25, 25, -1)))
+    part = rts.Part(surface, theta, rts.plugin("shaders", "unlit")(opaque=False))
+    with pytest.warns(rts.errors.LayersWarning, match="use splatter='visible'"):
+        drawn([part])

@@ -27,7 +27,7 @@ from rts.contracts.records import Outlines, Splats
 from rts.contracts.splatter import Splatter
 from rts.operations.operation import Operation
 from rts.splatting import edges_weights
-from rts.splatting.edges_stacks import Operands, cells_of, inside
+from rts.splatting.edges_stacks import CELLS, Operands
 from rts.splatting.edges_weights import BORDER
 from rts.splatting.layers import check_rows, nothing, unpack
 
@@ -65,15 +65,14 @@ class Edges(Splatter):
         check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
         own = Operands.of(splats, outlines)
         image = EDGES(own.positions, own.rgba, own.row, *(getattr(own.outlines, name) for name in FIELDS))
-        return image if own.motion is None else image + own.motion
+        return image + own.motion
 
 
 def _without_outlines(splats: Splats) -> Array:
     """The image (H, W, 4) as if all cells showed one surface, or stacks of the same layers."""
     row = splats.row[:1, ...] if splats.opaque else splats.row
-    stacks = cells_of(splats.positions, splats.rgba, row)
-    motion = stacks.motion - stopped(stacks.motion)
-    return stacks.whole + inside(stacks._replace(motion=motion), _all_joined(row[0, ...] >= 0))
+    cells = CELLS(splats.positions, splats.rgba, row, _all_joined(row[0, ...] >= 0))
+    return cells[..., :4] + (cells[..., 4:] - stopped(cells[..., 4:]))
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:

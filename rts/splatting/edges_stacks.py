@@ -16,13 +16,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.arrays.engines import engine_of, namespace, stopped
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Outlines, Splats
+from rts.operations.operation import Arrays, Operation, Some
 from rts.splatting.layers import over, unpack
 
 
@@ -71,46 +73,91 @@ class Operands(NamedTuple):
         rgba: (M, 4), colours of samples; then composites.
         row: (H, W), the composites of cells.
         outlines: whose colours are composites.
-        motion: (H, W, 4), to be added to the image: without value, with the derivative of motions inside; None if
-            there are no derivatives.
+        motion: (H, W, 4), to be added to the image: without value, with the derivative of motions inside.
     """
 
     positions: Array
     rgba: Array
     row: Array
     outlines: Outlines
-    motion: Array | None
+    motion: Array
 
     @classmethod
     def of(cls, splats: Splats, outlines: Outlines) -> Operands:
         """The operands for splats of K layers."""
         positions, rgba, row, stack = splats.positions, splats.rgba, splats.row, outlines.stack
-        xp, engine, (height, width), count = namespace(rgba), engine_of(rgba), row.shape[1:], rgba.shape[0]
-        cells, centres, places = cells_of(positions, rgba, row), _centres(row, rgba), _points_of(outlines)
-        sides = [
-            Stack.of(positions, rgba, xp.permute_dims(stack[:, i, :], (1, 0)), xp.permute_dims(at, (1, 0, 2)))
-            for i, at in enumerate(places)
-        ]
-        breaks, first = outlines.place.shape[0], count + height * width
+        xp, (height, width), count, breaks = namespace(rgba), row.shape[1:], rgba.shape[0], outlines.place.shape[0]
+        cells = CELLS(positions, rgba, row, outlines.joined)
+        whole, motion = cells[..., :4], cells[..., 4:]
+        sides = [_beside(positions, rgba, outlines, i) for i in (0, 1)]
+        first = count + height * width
         inner = [_numbered(stack[:, i, 0], first + i * breaks) for i in (0, 1)]
         rows = [xp.where(outlines.rows[:, i] >= 0, outlines.rows[:, i], inner[i]) for i in (0, 1)]
-        whole = replace(outlines, rows=xp.stack(rows, axis=-1), inner=xp.stack(inner, axis=-1))
-        still = xp.concat([xp.reshape(centres, (-1, 2)), *(_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1))])
-        motion = None
-        if engine.differentiates:
-            motion = inside(cells, outlines.joined) + _beside_breaks(cells, sides, outlines, positions)
+        numbered = replace(outlines, rows=xp.stack(rows, axis=-1), inner=xp.stack(inner, axis=-1))
+        still = [xp.reshape(_centres(row, rgba), (-1, 2))]
+        still = xp.concat([*still, *(_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1))])
+        if engine_of(rgba).differentiates:
+            motion = motion + _beside_breaks(splats, sides, outlines)
         return cls(
             xp.concat([positions, xp.concat([still, xp.zeros_like(still[:, :1])], axis=-1)]),
-            xp.concat([rgba, xp.reshape(cells.whole, (-1, 4)), *(own.whole for own in sides)]),
+            xp.concat([rgba, xp.reshape(whole, (-1, 4)), *(own.whole for own in sides)]),
             xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), count), (height, width)),
-            whole,
+            numbered,
             motion,
         )
 
 
-def cells_of(positions: Array, rgba: Array, row: Array) -> Stack:
-    """The stacks (K, H, W) of cells."""
-    return Stack.of(positions, rgba, row, _centres(row, rgba)[None, ...])
+def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> Array:
+    """Composites (H, W, 4) of cells, and then −Σ D_k · m_k (H, W, 4), without value; (H, W, 8).
+
+    Slopes are means of the differences from and to the next cells of the same layers.
+    """
+    xp, there, cells = namespace(rgba), row >= 0, Stack.of(positions, rgba, row, _centres(row, rgba)[None, ...])
+    color, total, (through, behind) = stopped(cells.color), 0.0, cells.weights()
+    for axis in (0, 1):
+        here = (joined[axis, ...][None, ...] & there & xp.roll(there, -1, axis=2 - axis))[..., None]
+        rise = xp.where(here, xp.roll(color, -1, axis=2 - axis) - color, 0.0)
+        slope = (rise + xp.roll(rise, 1, axis=2 - axis)) / 2
+        change = through * (slope - slope[..., 3:] * behind)
+        total = total - xp.sum(change * cells.motion[..., axis, None], axis=0)
+    return xp.concat([cells.whole, total], axis=-1)
+
+
+def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
+    return *row[1:], 8
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> None:
+    from rts.splatting import edges_stacks_loops as loops
+
+    parallel(loops.cells, len(out), *operands, out, work=10 * out.size)
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    from rts.splatting import edges_stacks_loops as loops
+
+    positions, rgba, row, joined = operands
+    none = read_only(np.empty((0, 3), out.dtype))
+    t_positions, t_rgba = (none if t is None else read_only(t) for t in tangents)
+    parallel(loops.push_cells, len(out), rgba, row, joined, t_positions, t_rgba, out, work=10 * out.size)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    from rts.splatting import edges_stacks_loops as loops
+
+    positions, rgba, row, joined = operands
+    g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
+    loops.pull_cells(rgba, row, joined, read_only(g), g_positions, g_rgba)
+
+
+CELLS = Operation("rts.edges_stacks", _specification, (2, 2, 3, 3), _shape, _forward, _push, _pull, differentiable=2)
+"""(H, W, 8) of positions (N, 3), colours (N, 4), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
+
+
+def _beside(positions: Array, rgba: Array, outlines: Outlines, i: int) -> Stack:
+    """The stacks before breaks (i = 0), or behind."""
+    xp, points = namespace(rgba), _on_gaps(outlines, outlines.stack_points[:, i, :])
+    return Stack.of(positions, rgba, xp.permute_dims(outlines.stack[:, i, :], (1, 0)), xp.permute_dims(points, (1, 0, 2)))
 
 
 def _centres(row: Array, like: Array) -> Array:
@@ -129,61 +176,47 @@ def _numbered(row: Array, first: int) -> Array:
 def _on_gaps(outlines: Outlines, places: Array) -> Array:
     """Points (B, ..., 2) at places (B, ...) along the gaps of breaks."""
     xp, gap = namespace(places), outlines.gap
-    first = xp.astype(xp.stack([gap[:, 1], gap[:, 0]], axis=-1), places.dtype) + 0.5
-    along = xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), places.dtype)
+    first, along = xp.astype(xp.stack([gap[:, 1], gap[:, 0]], axis=-1), places.dtype) + 0.5, _steps(gap, places)
     if places.ndim == 2:
         first, along = first[:, None, :], along[:, None, :]
     return first + places[..., None] * along
 
 
-def _points_of(outlines: Outlines) -> list[Array]:
-    """Points (B, K, 2) of the samples of the stacks before breaks, and of those behind."""
-    return [_on_gaps(outlines, outlines.stack_points[:, i, :]) for i in (0, 1)]
+def _steps(gap: Array, like: Array) -> Array:
+    """Unit steps (B, 2) along gaps."""
+    xp = namespace(gap)
+    return xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), like.dtype)
 
 
-def inside(cells: Stack, joined: Array) -> Array:
-    """−Σ D_k · m_k (H, W, 4): slopes are means of the differences from and to the next cells of the same layers."""
-    xp, color, total = namespace(cells.color), stopped(cells.color), 0.0
-    through, behind = cells.weights()
-    for axis in (0, 1):
-        here = joined[axis][None, ..., None]
-        rise = xp.where(here, xp.roll(color, -1, axis=2 - axis) - color, 0.0)
-        slope = (rise + xp.roll(rise, 1, axis=2 - axis)) / 2
-        change = through * (slope - slope[..., 3:] * behind)
-        total = total - xp.sum(change * cells.motion[..., axis, None], axis=0)
-    return total
-
-
-def _beside_breaks(cells: Stack, sides: Sequence[Stack], outlines: Outlines, positions: Array) -> Array:
+def _beside_breaks(splats: Splats, sides: Sequence[Stack], outlines: Outlines) -> Array:
     """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
 
     As `rts.splatting.edges._beside_breaks` of opaque layers, whose own part of it, of the composites and of the motion
     of breaks, is taken off.
     """
-    xp, engine, (height, width) = namespace(cells.color), engine_of(cells.color), cells.whole.shape[:2]
-    gap, normal, parts, indices = outlines.gap, _normals(outlines), [], []
-    along = xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), positions.dtype)
-    ahead = xp.sum(normal * along, axis=-1)
-    weights = [xp.reshape(x, (x.shape[0], height * width, -1)) for x in (cells.color, cells.motion, *cells.weights())]
-    composite = xp.reshape(stopped(cells.whole), (height * width, -1))
+    positions, rgba, row = splats.positions, splats.rgba, splats.row
+    xp, engine, (layers, height, width), parts, indices = namespace(rgba), engine_of(rgba), row.shape, [], []
+    gap, normal, rows = outlines.gap, _normals(outlines), xp.reshape(row, (layers, -1))
+    ahead = xp.sum(normal * _steps(gap, normal), axis=-1)
     for i, way in enumerate((1, -1)):
         step = xp.where(gap[:, 2] == 1, 1, width)
         cell = gap[:, 0] * width + gap[:, 1] + (step if i == 1 else 0)
-        color, motion, through, behind = (xp.take(x, cell, axis=1) for x in weights)
-        rise = stopped(sides[i].color) - stopped(color)
-        moves = xp.sum((sides[i].motion + motion) / 2 * normal, axis=-1)[..., None]
+        centre = _on_gaps(outlines, xp.full_like(outlines.place, i))
+        own, here = sides[i], Stack.of(positions, rgba, xp.take(rows, cell, axis=1), centre[None, ...])
+        moves = xp.sum((own.motion + here.motion) / 2 * normal, axis=-1)[..., None]
+        rise, (through, behind) = stopped(own.color - here.color), here.weights()
         change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
         # What is added for the composite, as if it moved with the break.
         ending = outlines.rows[:, i]
         at = xp.take(positions, xp.where(ending >= 0, ending, 0), axis=0)[:, :2]
-        own = xp.sum((at - _on_gaps(outlines, outlines.points[:, i])) / 2 * normal, axis=-1)
-        own = xp.where(ending >= 0, own, 0.0)[:, None]
-        change = change - (stopped(sides[i].whole) - xp.take(composite, cell, axis=0)) * own
+        with_break = xp.sum((at - _on_gaps(outlines, outlines.points[:, i])) / 2 * normal, axis=-1)
+        with_break = xp.where(ending >= 0, with_break, 0.0)[:, None]
+        change = change - stopped(own.whole - here.whole) * with_break
         counts = outlines.ends[:, i] & (outlines.stack[:, i, 0] >= 0)
         length = xp.clip(outlines.place if i == 0 else 1 - outlines.place, 0.0, 1.0)
-        share = xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0)
+        share = (xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0))[:, None]
         change = xp.where(counts[:, None], change * (-way * ahead)[:, None], 0.0)
-        parts += [share[:, None] * change, (1 - share)[:, None] * change]
+        parts += [share * change, (1 - share) * change]
         indices += [cell, cell + way * step]
     return xp.reshape(engine.segment_sum(xp.concat(parts), xp.concat(indices), height * width), (height, width, -1))
 
@@ -192,8 +225,7 @@ def _normals(outlines: Outlines) -> Array:
     """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
     xp, ties, place = namespace(outlines.place), outlines.ties, _on_gaps(outlines, outlines.place)
     engine, count = engine_of(place), place.shape[0]
-    gap = xp.astype(outlines.gap[:, 2], place.dtype)
-    step = xp.stack([gap, 1 - gap], axis=-1)
+    step = _steps(outlines.gap, place)
     ends = [xp.take(place, xp.where(ties[:, i] >= 0, ties[:, i], 0), axis=0) for i in (0, 1)]
     way, total = ends[1] - ends[0], step * 1e-6
     normal = xp.stack([way[:, 1], -way[:, 0]], axis=-1)
