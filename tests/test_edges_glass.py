@@ -310,7 +310,7 @@ def test_of_glass_that_has_no_triangles_the_front_is_drawn_with_a_warning():
         return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - theta["radius"]
 
     theta = {"center": np.float32([12, 12, -8]), "radius": np.float32(5), "color": np.float32([1, 0, 0, 0.5])}
-    surface = rts.plugin("surfaces", "sdf")(outside, bounds=((-1, -1, -15), (25, 25, -1)))
+    surface = rts.plugin("surfaces", "sdf")(outside)
     part = rts.Part(surface, theta, rts.plugin("shaders", "unlit")(opaque=False))
     with pytest.warns(rts.errors.LayersWarning, match="use splatter='visible'"):
         drawn([part])

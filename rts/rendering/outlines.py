@@ -303,10 +303,11 @@ class _Points:
 
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
     """What is seen at centres (K, H, W), without what lies behind an opaque layer."""
-    solid = (layers.part >= 0) & opaque[layers.part]
-    hidden = np.cumsum(solid, axis=0) - solid > 0
-    part, triangle = (np.where(hidden, np.int32(-1), x) for x in (layers.part, layers.triangle))
-    return Fronts(part, triangle, np.where(hidden, 0.0, layers.depth))
+    part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
+    for own in part:
+        own[hidden] = -1
+        hidden |= (own >= 0) & opaque[own]
+    return layers._replace(part=part)
 
 
 class _OnTriangles(TriangleSampler):

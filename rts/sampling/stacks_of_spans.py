@@ -82,6 +82,8 @@ def _gaps_to_search(
         own.meet(ends, width, met)
     for layer in range(len(layers.part)):
         front = Fronts(*(np.ascontiguousarray(x[layer]) for x in layers))
+        if layer and not (front.part >= 0).any():
+            break
         joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
         for part, own in enumerate(sheets):
             own.join(part, front, met, joined)

@@ -12,6 +12,9 @@
 
 Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative,
 and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the flux, J are constants.
+
+Where light passes through, C and the colours on both sides of a break are composites of all layers there: see
+`rts.splatting.edges_stacks`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ stacks there. The composites are further rows of the tables of samples; so the r
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -66,13 +65,13 @@ def _from_the_back(color: Array) -> tuple[range, Array]:
 
 
 class Operands(NamedTuple):
-    """What takes the place of stacks in `rts.splatting.edges`.
+    """What takes the place of stacks in `rts.splatting.edges`: a composite for each cell, and for each side of a break.
 
     Attributes:
-        positions: (M, 3), those of samples; then of cells, and of both sides of breaks, which stand still.
-        rgba: (M, 4), colours of samples; then composites.
-        row: (H, W), the composites of cells.
-        outlines: whose colours are composites.
+        positions: (M, 3), those of cells, which stand still, then of both sides of breaks: of the layer that ends there.
+        rgba: (M, 4), the composites.
+        row: (H, W), those of cells.
+        outlines: whose samples are composites.
         motion: (H, W, 4), to be added to the image: without value, with the derivative of motions inside.
     """
 
@@ -85,24 +84,20 @@ class Operands(NamedTuple):
     @classmethod
     def of(cls, splats: Splats, outlines: Outlines) -> Operands:
         """The operands for splats of K layers."""
-        positions, rgba, row, stack = splats.positions, splats.rgba, splats.row, outlines.stack
-        xp, (height, width), count, breaks = namespace(rgba), row.shape[1:], rgba.shape[0], outlines.place.shape[0]
-        cells = CELLS(positions, rgba, row, outlines.joined)
+        positions, rgba, row = splats.positions, splats.rgba, splats.row
+        xp, (height, width), breaks = namespace(rgba), row.shape[1:], outlines.place.shape[0]
+        cells, sides = CELLS(positions, rgba, row, outlines.joined), _Sides.of(splats, outlines)
         whole, motion = cells[..., :4], cells[..., 4:]
-        sides = [_beside(positions, rgba, outlines, i) for i in (0, 1)]
-        first = count + height * width
-        inner = [_numbered(stack[:, i, 0], first + i * breaks) for i in (0, 1)]
-        rows = [xp.where(outlines.rows[:, i] >= 0, outlines.rows[:, i], inner[i]) for i in (0, 1)]
-        numbered = replace(outlines, rows=xp.stack(rows, axis=-1), inner=xp.stack(inner, axis=-1))
-        still = [xp.reshape(_centres(row, rgba), (-1, 2))]
-        still = xp.concat([*still, *(_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1))])
+        numbers = [_numbered(sides.front[i * breaks : (i + 1) * breaks], (height * width) + i * breaks) for i in (0, 1)]
+        rows = xp.stack(numbers, axis=-1)
+        centres = xp.reshape(_centres(row, rgba), (-1, 2))
         if engine_of(rgba).differentiates:
-            motion = motion + _beside_breaks(splats, sides, outlines)
+            motion = motion + sides.motion(splats)
         return cls(
-            xp.concat([positions, xp.concat([still, xp.zeros_like(still[:, :1])], axis=-1)]),
-            xp.concat([rgba, xp.reshape(whole, (-1, 4)), *(own.whole for own in sides)]),
-            xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), count), (height, width)),
-            numbered,
+            xp.concat([xp.concat([centres, xp.zeros_like(centres[:, :1])], axis=-1), sides.ending]),
+            xp.concat([xp.reshape(whole, (-1, 4)), sides.stack.whole]),
+            xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), 0), (height, width)),
+            replace(outlines, rows=rows, inner=rows),
             motion,
         )
 
@@ -154,12 +149,6 @@ CELLS = Operation("rts.edges_stacks", _specification, (2, 2, 3, 3), _shape, _for
 """(H, W, 8) of positions (N, 3), colours (N, 4), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
 
 
-def _beside(positions: Array, rgba: Array, outlines: Outlines, i: int) -> Stack:
-    """The stacks before breaks (i = 0), or behind."""
-    xp, points = namespace(rgba), _on_gaps(outlines, outlines.stack_points[:, i, :])
-    return Stack.of(positions, rgba, xp.permute_dims(outlines.stack[:, i, :], (1, 0)), xp.permute_dims(points, (1, 0, 2)))
-
-
 def _centres(row: Array, like: Array) -> Array:
     """Centres (H, W, 2) of the cells of `row` (K, H, W), of the engine of `like`."""
     height, width = row.shape[1:]
@@ -188,37 +177,64 @@ def _steps(gap: Array, like: Array) -> Array:
     return xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), like.dtype)
 
 
-def _beside_breaks(splats: Splats, sides: Sequence[Stack], outlines: Outlines) -> Array:
-    """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
+class _Sides(NamedTuple):
+    """Both sides of breaks: those before (B), then those behind.
 
-    As `rts.splatting.edges._beside_breaks` of opaque layers, whose own part of it, of the composites and of the motion
-    of breaks, is taken off.
+    Attributes:
+        outlines: of K layers.
+        front: (2 B,), the front of the stack there, or −1.
+        stack: (K, 2 B), the layers.
+        points: (2 B, 2), of the last samples.
+        ending: (2 B, 3), the positions of these samples; the points themselves, at depth 0, where nothing ends.
     """
-    positions, rgba, row = splats.positions, splats.rgba, splats.row
-    xp, engine, (layers, height, width), parts, indices = namespace(rgba), engine_of(rgba), row.shape, [], []
-    gap, normal, rows = outlines.gap, _normals(outlines), xp.reshape(row, (layers, -1))
-    ahead = xp.sum(normal * _steps(gap, normal), axis=-1)
-    for i, way in enumerate((1, -1)):
-        step = xp.where(gap[:, 2] == 1, 1, width)
-        cell = gap[:, 0] * width + gap[:, 1] + (step if i == 1 else 0)
-        centre = _on_gaps(outlines, xp.full_like(outlines.place, i))
-        own, here = sides[i], Stack.of(positions, rgba, xp.take(rows, cell, axis=1), centre[None, ...])
-        moves = xp.sum((own.motion + here.motion) / 2 * normal, axis=-1)[..., None]
+
+    outlines: Outlines
+    front: Array
+    stack: Stack
+    points: Array
+    ending: Array
+
+    @classmethod
+    def of(cls, splats: Splats, outlines: Outlines) -> _Sides:
+        """The sides of breaks."""
+        positions, rgba, xp = splats.positions, splats.rgba, namespace(splats.rgba)
+        rows = xp.reshape(xp.permute_dims(outlines.stack, (2, 1, 0)), (splats.row.shape[0], -1))
+        points = xp.concat([_on_gaps(outlines, outlines.stack_points[:, i, :]) for i in (0, 1)])
+        stack = Stack.of(positions, rgba, rows, xp.permute_dims(points, (1, 0, 2)))
+        ends = xp.concat([outlines.rows[:, i] for i in (0, 1)])
+        points = xp.concat([_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1)])
+        still = xp.concat([points, xp.zeros_like(points[:, :1])], axis=-1)
+        at = xp.take(positions, xp.where(ends >= 0, ends, 0), axis=0)
+        return cls(outlines, rows[0, ...], stack, points, xp.where((ends >= 0)[:, None], at, still))
+
+    def motion(self, splats: Splats) -> Array:
+        """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
+
+        As `rts.splatting.edges._beside_breaks` of opaque layers, whose own part of it, of the composites and of the
+        motion of breaks, is taken off.
+        """
+        outlines, own, row = self.outlines, self.stack, splats.row
+        xp, engine, (layers, height, width) = namespace(own.whole), engine_of(own.whole), row.shape
+        gap, place, unit = outlines.gap, outlines.place, _normals(outlines)
+        along = xp.sum(unit * _steps(gap, unit), axis=-1)
+        normal, ahead = xp.concat([unit, unit]), xp.concat([-along, along])
+        first, step = gap[:, 0] * width + gap[:, 1], xp.where(gap[:, 2] == 1, 1, width)
+        cell, beyond = xp.concat([first, first + step]), xp.concat([first + step, first])
+        centre = xp.concat([_on_gaps(outlines, xp.full_like(place, i)) for i in (0, 1)])
+        rows = xp.take(xp.reshape(row, (layers, -1)), cell, axis=1)
+        here = Stack.of(splats.positions, splats.rgba, rows, centre[None, ...])
         rise, (through, behind) = stopped(own.color - here.color), here.weights()
+        moves = xp.sum((own.motion + here.motion) / 2 * normal, axis=-1)[..., None]
         change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
         # What is added for the composite, as if it moved with the break.
-        ending = outlines.rows[:, i]
-        at = xp.take(positions, xp.where(ending >= 0, ending, 0), axis=0)[:, :2]
-        with_break = xp.sum((at - _on_gaps(outlines, outlines.points[:, i])) / 2 * normal, axis=-1)
-        with_break = xp.where(ending >= 0, with_break, 0.0)[:, None]
-        change = change - stopped(own.whole - here.whole) * with_break
-        counts = outlines.ends[:, i] & (outlines.stack[:, i, 0] >= 0)
-        length = xp.clip(outlines.place if i == 0 else 1 - outlines.place, 0.0, 1.0)
+        with_break = xp.sum((self.ending[:, :2] - self.points) / 2 * normal, axis=-1)[:, None]
+        change = (change - stopped(own.whole - here.whole) * with_break) * ahead[:, None]
+        counts = xp.concat([outlines.ends[:, i] for i in (0, 1)]) & (self.front >= 0)
+        length = xp.clip(xp.concat([place, 1 - place]), 0.0, 1.0)
         share = (xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0))[:, None]
-        change = xp.where(counts[:, None], change * (-way * ahead)[:, None], 0.0)
-        parts += [share * change, (1 - share) * change]
-        indices += [cell, cell + way * step]
-    return xp.reshape(engine.segment_sum(xp.concat(parts), xp.concat(indices), height * width), (height, width, -1))
+        change = xp.where(counts[:, None], change, 0.0)
+        parts, cells = xp.concat([share * change, (1 - share) * change]), xp.concat([cell, beyond])
+        return xp.reshape(engine.segment_sum(parts, cells, height * width), (height, width, -1))
 
 
 def _normals(outlines: Outlines) -> Array:
