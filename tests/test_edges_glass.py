@@ -192,7 +192,9 @@ def test_a_rigid_shift_of_glass_and_a_card_behind_it_sums_to_about_zero(shift):
     corners = turned(SQUARE, 0.3, (12.2, 11.7)) * 0.6 + 5
 
     def scene(t):
-        return drawn([pane(turned(SQUARE, 0.2, (10.2, 12)), 3, RED, 0.4, t, shift), pane(corners, 5, GREEN, 1, t, shift)])
+        return drawn(
+            [pane(turned(SQUARE, 0.2, (10.2, 12)), 3, RED, 0.4, t, shift), pane(corners, 5, GREEN, 1, t, shift)]
+        )
 
     _, derivative = pushed(scene)
     assert np.abs(derivative.sum((0, 1))).max() < 0.01 * np.abs(derivative).sum((0, 1)).max()
@@ -305,12 +307,26 @@ def test_layers_that_are_found_are_as_many_as_light_goes():
         drawn(parts, layers=2)
 
 
-def test_of_glass_that_has_no_triangles_the_front_is_drawn_with_a_warning():
-    def outside(theta, points):
-        return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - theta["radius"]
+def of_field(radius):
+    """A ball without triangles, seen through glass-like colours."""
 
-    theta = {"center": np.float32([12, 12, -8]), "radius": np.float32(5), "color": np.float32([1, 0, 0, 0.5])}
-    surface = rts.plugin("surfaces", "sdf")(outside)
-    part = rts.Part(surface, theta, rts.plugin("shaders", "unlit")(opaque=False))
+    def outside(theta, points):
+        return (points**2).sum(-1) ** 0.5 - theta["radius"]
+
+    def glass(theta, gbuffer, camera):
+        position = gbuffer["position"]
+        return np.concatenate([np.ones_like(position), 0.5 * np.ones_like(position[:, :1])], axis=1)
+
+    part = rts.Part(rts.Sdf(outside), {"radius": np.float32(radius)}, glass)
+    return rts.render(part, rts.Camera.look_at((0, 0, 6), (0, 0, 0)), SIZE, splatter="edges")
+
+
+def test_of_glass_that_has_no_triangles_the_front_is_drawn_with_a_warning():
     with pytest.warns(rts.errors.LayersWarning, match="use splatter='visible'"):
-        drawn([part])
+        image = of_field(0.8)
+    assert image[12, 12, 3] == 0.5
+
+
+@pytest.mark.filterwarnings("ignore::rts.errors.LayersWarning")
+def test_a_field_that_ends_nowhere_in_the_image_is_drawn():
+    np.testing.assert_array_equal(of_field(5.0)[..., 3], 0.5)

@@ -134,7 +134,11 @@ def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree)
 
     layers = sampled.row.shape[0]
     specs = _Found.specs(most, grid.size, _real(scene), layers)
-    rows = [ArraySpec((_columns(layers)[0] * most, *x.shape[1:]), x.dtype, packed=True) for own in owners for x in own.values()]
+    rows = [
+        ArraySpec((_columns(layers)[0] * most, *x.shape[1:]), x.dtype, packed=True)
+        for own in owners
+        for x in own.values()
+    ]
     operands = [x for x in leaves(known) if is_traced(x)]
     results = iter(engine_of(*operands).call_host(host, [*specs, *rows], *operands))
     found = _Found(*(next(results) for _ in specs))
@@ -273,12 +277,17 @@ class _Points:
         else:
             breaks = find_breaks(fronts, Oracle(self._fronts, self._width))
         # For each break the two last samples, and the two that tell colours.
-        parts, points = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
+        parts, points = (
+            np.concatenate([breaks.parts, breaks.parts], 1),
+            np.concatenate([breaks.points, breaks.inner], 1),
+        )
         return breaks, parts, points, breaks.triangles, np.empty((len(parts), 2, 0), np.int32)
 
     def sample(self, part: int, points: np.ndarray, triangles: np.ndarray | None = None) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
+        if sheets is None and not len(points):
+            points = np.full((1, 2), 0.5)  # Surfaces may want a ray at least; nothing names its sample.
         if sheets is not None and triangles is not None and (triangles >= 0).all():
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
         request = Request(points=points, triangles=True, entry=entry)

@@ -53,7 +53,7 @@ class Scene(NamedTuple):
 
     @property
     def fronts_suffice(self) -> bool:
-        """True if fronts are all that outlines are found between: parts are opaque, or samples leave their triangles."""
+        """True if outlines are found between fronts alone: all parts are opaque, or some samples are on no triangles."""
         return all(self.opaque) or not all(map(has_sheets, self.parts, self.chosen()))
 
     @classmethod

@@ -67,9 +67,7 @@ def breaks_of_stacks(
     return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides)
 
 
-def _gaps_to_search(
-    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
-) -> np.ndarray:
+def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray) -> np.ndarray:
     """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer."""
     from rts.sampling import spans_loops
 
