@@ -271,7 +271,7 @@ class _Points:
             parts = np.concatenate([stacks.last, stacks.parts], 1)
             points = np.concatenate([breaks.points, stacks.points], 1)
             return breaks, parts, points, np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1), stacks.sides
-        fronts = layers.at((0,))
+        fronts = Fronts(*(x[0] for x in layers))
         if len(sheets) == len(self._parts):
             breaks = breaks_of_triangles(fronts, sheets, self._width)
         else:

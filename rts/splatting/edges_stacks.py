@@ -177,6 +177,12 @@ def _steps(gap: Array, like: Array) -> Array:
     return xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), like.dtype)
 
 
+def _stack_of(outlines: Outlines) -> tuple[Array, Array]:
+    """`Outlines.stack` and `Outlines.stack_points`, which several layers have."""
+    assert outlines.stack is not None and outlines.stack_points is not None
+    return outlines.stack, outlines.stack_points
+
+
 class _Sides(NamedTuple):
     """Both sides of breaks: those before (B), then those behind.
 
@@ -198,18 +204,19 @@ class _Sides(NamedTuple):
     def of(cls, splats: Splats, outlines: Outlines) -> _Sides:
         """The sides of breaks."""
         positions, rgba, xp = splats.positions, splats.rgba, namespace(splats.rgba)
-        rows = xp.reshape(xp.permute_dims(outlines.stack, (2, 1, 0)), (splats.row.shape[0], -1))
-        points = xp.concat([_on_gaps(outlines, outlines.stack_points[:, i, :]) for i in (0, 1)])
-        stack = Stack.of(positions, rgba, rows, xp.permute_dims(points, (1, 0, 2)))
+        stack, places = _stack_of(outlines)
+        rows = xp.reshape(xp.permute_dims(stack, (2, 1, 0)), (splats.row.shape[0], -1))
+        points = xp.concat([_on_gaps(outlines, places[:, i, :]) for i in (0, 1)])
+        layers = Stack.of(positions, rgba, rows, xp.permute_dims(points, (1, 0, 2)))
         ends = xp.concat([outlines.rows[:, i] for i in (0, 1)])
         points = xp.concat([_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1)])
         still = xp.concat([points, xp.zeros_like(points[:, :1])], axis=-1)
         at = xp.take(positions, xp.where(ends >= 0, ends, 0), axis=0)
-        return cls(outlines, rows[0, ...], stack, points, xp.where((ends >= 0)[:, None], at, still))
+        return cls(outlines, rows[0, ...], layers, points, xp.where((ends >= 0)[:, None], at, still))
 
     def _ends(self) -> Array:
         """(K, 2 B) True for layers that the other side of a break has not."""
-        xp, stack = namespace(self.points), self.outlines.stack
+        xp, (stack, _) = namespace(self.points), _stack_of(self.outlines)
         same = stack[:, 0, :, None] == stack[:, 1, None, :]
         return xp.permute_dims(xp.concat([~xp.any(same, axis=2), ~xp.any(same, axis=1)]), (1, 0))
 
