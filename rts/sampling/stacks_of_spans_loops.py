@@ -183,8 +183,9 @@ def _next_meeting(stack, count, own, spans, place, until):
 
 
 @compiled
-def _record(e, kind, at, partner, place, stack, count, own, spans, names, parts, opaque, result):
+def _record(e, kind, at, partner, place, stack, count, scene, result):
     """Fill in a change of the stack, but for the samples of what ends there; see `changes`."""
+    own, spans, names, parts, opaque = scene
     whole, place_of, samples, places, sides = result
     most, entries = sides.shape[2], samples.shape[1] - 2
     whole[e, 1], place_of[e] = kind, place
@@ -221,153 +222,6 @@ def _record(e, kind, at, partner, place, stack, count, own, spans, names, parts,
         whole[e, 2 + kind] = parts[own[stack[at]]]
         k = sides[e, 1 - kind, at] if at < most else -1
         whole[e, 3 - kind] = samples[e, 2 + k, 0] if k >= 0 else -1
-
-
-@loop
-def changes(
-    first, last, begins, order, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
-    samples, places, sides,
-):  # fmt: skip
-    """Count the changes of stacks along gaps, or fill them in, in order.
-
-    Only those that are seen count: not behind an opaque layer, nor behind the first K.
-
-    Args:
-        first: the first gap.
-        last: the gap after the last.
-        begins: (M + 1,) and
-        order: (N,), the result of `spans_loops.by_gap`.
-        spans: (N, 6), see `spans_loops.spans_of`.
-        names: (N, 2) gap and triangle.
-        parts: (N,) int32.
-        opaque: bool, for each part.
-        seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
-        depth: (M, 2, K) float64, their depths.
-        counts: (M,) int32, numbers of changes; to fill if they are counted.
-        at: (M,) where the changes of each gap begin; used if
-        fill: True to fill in what follows, False to count.
-        inner: distance of the samples that tell colours of what ends.
-        whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
-            and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
-        place_of: (E,) float64 to fill: their places.
-        samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then
-            of the stack there, front to back, with what starts or ends.
-        places: (E, 2 + K + 1) to fill: places of these samples.
-        sides: (E, 2, K) int32 to fill: the stacks before and behind, as indices in that stack, or −1.
-    """
-    most = seen.shape[2]
-    result = whole, place_of, samples, places, sides
-    for g in range(first, last):
-        own = order[begins[g] : begins[g + 1]]
-        n, found = len(own), 0
-        low, high = np.empty(n), np.empty(n)
-        after, before, stack = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
-        inside, live = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-        enders = np.empty((counts[g] if fill else 0, 2), np.int32)
-        for i in range(n):
-            low[i], high[i] = spans[own[i], 0], spans[own[i], 1]
-        _link(own, spans, parts, low, high, after, before)
-        for i in range(n):
-            if before[i] >= 0:
-                continue
-            tail, start = i, low[i]
-            while after[tail] >= 0:
-                tail = after[tail]
-            real = high[tail] - start >= SHORT
-            real = real and _settle(i, tail, own, spans, parts, opaque, seen, depth, g, after, low, high)
-            j = i
-            while j >= 0:
-                live[j] = real
-                j = after[j]
-        knots, k = np.empty(2 * n + 1), 0
-        for i in range(n):
-            for place in (low[i], high[i]):
-                if live[i] and 0 < place < 1:
-                    knots[k], k = place, k + 1
-        knots[k] = 1.0
-        knots = np.sort(knots[: k + 1])
-        count, place = 0, 0.0
-        for i in range(n):
-            if live[i] and low[i] <= 0 < high[i]:
-                _insert(stack, count, i, own, spans, 0.0, min(knots[0], high[i]))
-                inside[i], count = True, count + 1
-        for until in knots:
-            # What passes through one another up to the next knot.
-            for _ in range(n * n):
-                there, m = _next_meeting(stack, count, own, spans, place, until)
-                if m < 0:
-                    break
-                place = max(place, there)
-                if _seen(stack, m, most, own, parts, opaque):
-                    if fill:
-                        _record(
-                            at[g] + found, 2, m, -1, place, stack, count, own, spans, names, parts, opaque,
-                            result,
-                        )  # fmt: skip
-                        enders[found, 0], enders[found, 1] = stack[m], stack[m + 1]
-                    found += 1
-                stack[m], stack[m + 1] = stack[m + 1], stack[m]
-            place = until
-            if place >= 1:
-                break
-            m = 0
-            while m < count:
-                i = stack[m]
-                while high[i] <= place and after[i] >= 0:
-                    i = after[i]
-                    inside[i] = True
-                stack[m] = i
-                if high[i] > place:
-                    m += 1
-                    continue
-                other = _partner(i, own, parts, place, high, after)
-                partner = -1
-                for k in range(count):
-                    partner = k if k != m and other >= 0 and stack[k] == other else partner
-                front = m if partner < 0 else min(m, partner)
-                partner = partner if partner < 0 else max(m, partner)
-                if _seen(stack, front, most, own, parts, opaque):
-                    if fill:
-                        _record(
-                            at[g] + found, 0, front, partner, place, stack, count, own, spans, names, parts, opaque,
-                            result,
-                        )  # fmt: skip
-                        enders[found, 0], enders[found, 1] = stack[front], stack[partner] if partner >= 0 else -1
-                    found += 1
-                if partner >= 0:
-                    _remove(stack, count, partner)
-                    count -= 1
-                _remove(stack, count, front)
-                count -= 1
-                m = 0
-            farther = 1.0
-            for knot in knots:
-                if knot > place:
-                    farther = knot
-                    break
-            for i in range(n):
-                if not live[i] or inside[i] or before[i] >= 0 or low[i] > place or high[i] <= place:
-                    continue
-                front = _insert(stack, count, i, own, spans, low[i], min(farther, high[i]))
-                inside[i], count = True, count + 1
-                other, partner = _partner(i, own, parts, low[i], low, before), -1
-                if other >= 0 and live[other] and not inside[other]:
-                    partner = _insert(stack, count, other, own, spans, low[i], min(farther, high[other]))
-                    inside[other], count = True, count + 1
-                    front, partner = (front, partner) if partner > front else (partner, front + 1)
-                if _seen(stack, front, most, own, parts, opaque):
-                    if fill:
-                        _record(
-                            at[g] + found, 1, front, partner, place, stack, count, own, spans, names, parts, opaque,
-                            result,
-                        )  # fmt: skip
-                        enders[found, 0], enders[found, 1] = stack[front], stack[partner] if partner >= 0 else -1
-                    found += 1
-        if not fill:
-            counts[g] = found
-            continue
-        for f in range(found):
-            _complete(at[g], f, found, g, enders, own, spans, names, parts, after, before, inner, result)
 
 
 @compiled
@@ -407,3 +261,168 @@ def _complete(base, f, found, g, enders, own, spans, names, parts, after, before
             if samples[e, k, 0] == parts[x] and samples[e, k, 1] == names[x, 1]:
                 samples[e, k, 1], places[e, k] = names[own[i], 1], inward
                 break
+
+
+@compiled
+def _note(kind, at, partner, place, stack, count, scene, found, base, enders, result):
+    """Count a change of the stack, if it is seen, and fill it in if there is room in `enders`; returns the number."""
+    own, _, _, parts, opaque = scene
+    if not _seen(stack, at, result[4].shape[2], own, parts, opaque):
+        return found
+    if found < len(enders):
+        _record(base + found, kind, at, partner, place, stack, count, scene, result)
+        other = at + 1 if kind == 2 else partner
+        enders[found, 0], enders[found, 1] = stack[at], stack[other] if other >= 0 else -1
+    return found + 1
+
+
+@compiled
+def _cross(place, until, stack, count, scene, found, base, enders, result):
+    """What passes through one another between two places; returns the number of changes."""
+    own, spans = scene[0], scene[1]
+    for _ in range(count * count):
+        there, m = _next_meeting(stack, count, own, spans, place, until)
+        if m < 0:
+            break
+        place = max(place, there)
+        found = _note(2, m, -1, place, stack, count, scene, found, base, enders, result)
+        stack[m], stack[m + 1] = stack[m + 1], stack[m]
+    return found
+
+
+@compiled
+def _end(place, stack, count, scene, runs, found, base, enders, result):
+    """What ends at a place, or goes on with another span; returns the stack's height and the number of changes."""
+    low, high, after, before, live, inside = runs
+    own, parts, m = scene[0], scene[3], 0
+    while m < count:
+        i = stack[m]
+        while high[i] <= place and after[i] >= 0:
+            i = after[i]
+        stack[m] = i
+        if high[i] > place:
+            m += 1
+            continue
+        other, partner = _partner(i, own, parts, place, high, after), -1
+        for k in range(count):
+            partner = k if k != m and other >= 0 and stack[k] == other else partner
+        front = m if partner < 0 else min(m, partner)
+        partner = max(m, partner) if partner >= 0 else partner
+        found = _note(0, front, partner, place, stack, count, scene, found, base, enders, result)
+        if partner >= 0:
+            _remove(stack, count, partner)
+            count -= 1
+        _remove(stack, count, front)
+        count, m = count - 1, 0
+    return count, found
+
+
+@compiled
+def _start(place, farther, stack, count, scene, runs, found, base, enders, result):
+    """What starts at a place; returns the stack's height and the number of changes."""
+    low, high, after, before, live, inside = runs
+    own, spans, parts = scene[0], scene[1], scene[3]
+    for i in range(len(own)):
+        if not live[i] or inside[i] or before[i] >= 0 or low[i] > place or high[i] <= place:
+            continue
+        front = _insert(stack, count, i, own, spans, low[i], min(farther, high[i]))
+        inside[i], count = True, count + 1
+        other, partner = _partner(i, own, parts, low[i], low, before), -1
+        if other >= 0 and live[other] and not inside[other]:
+            partner = _insert(stack, count, other, own, spans, low[i], min(farther, high[other]))
+            inside[other], count = True, count + 1
+            front, partner = (front, partner) if partner > front else (partner, front + 1)
+        found = _note(1, front, partner, place, stack, count, scene, found, base, enders, result)
+    return count, found
+
+
+@compiled
+def _fill_runs(g, scene, seen, depth, runs, knots):
+    """Fill in the runs of a gap, and the places where spans start and end, in order; returns the number of places."""
+    own, spans, _, parts, opaque = scene
+    low, high, after, before, live, inside = runs
+    for i in range(len(own)):
+        low[i], high[i], live[i], inside[i] = spans[own[i], 0], spans[own[i], 1], False, False
+    _link(own, spans, parts, low, high, after, before)
+    for i in range(len(own)):
+        if before[i] >= 0:
+            continue
+        tail, start, j = i, low[i], i
+        while after[tail] >= 0:
+            tail = after[tail]
+        real = high[tail] - start >= SHORT
+        real = real and _settle(i, tail, own, spans, parts, opaque, seen, depth, g, after, low, high)
+        while j >= 0:
+            live[j] = real
+            j = after[j]
+    count = 0
+    for i in range(len(own)):
+        for place in (low[i], high[i]):
+            if live[i] and 0 < place < 1:
+                knots[count], count = place, count + 1
+    knots[count] = 1.0
+    knots[: count + 1] = np.sort(knots[: count + 1])
+    return count + 1
+
+
+@loop
+def changes(
+    first, last, begins, order, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
+    samples, places, sides,
+):  # fmt: skip
+    """Count the changes of stacks along gaps, or fill them in, in order.
+
+    Only those that are seen count: not behind an opaque layer, nor behind the first K.
+
+    Args:
+        first: the first gap.
+        last: the gap after the last.
+        begins: (M + 1,) and
+        order: (N,), the result of `spans_loops.by_gap`.
+        spans: (N, 6), see `spans_loops.spans_of`.
+        names: (N, 2) gap and triangle.
+        parts: (N,) int32.
+        opaque: bool, for each part.
+        seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
+        depth: (M, 2, K) float64, their depths.
+        counts: (M,) int32, numbers of changes; to fill if they are counted.
+        at: (M,) where the changes of each gap begin; used if
+        fill: True to fill in what follows, False to count.
+        inner: distance of the samples that tell colours of what ends.
+        whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
+            and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
+        place_of: (E,) float64 to fill: their places.
+        samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then
+            of the stack there, front to back, with what starts or ends.
+        places: (E, 2 + K + 1) to fill: places of these samples.
+        sides: (E, 2, K) int32 to fill: the stacks before and behind, as indices in that stack, or −1.
+    """
+    result = whole, place_of, samples, places, sides
+    for g in range(first, last):
+        own = order[begins[g] : begins[g + 1]]
+        n, scene = len(own), (own, spans, names, parts, opaque)
+        low, high, after, before = np.empty(n), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
+        live, inside = np.empty(n, np.bool_), np.empty(n, np.bool_)
+        runs, stack, knots = (low, high, after, before, live, inside), np.empty(n + 1, np.int32), np.empty(2 * n + 1)
+        enders = np.empty((counts[g] if fill else 0, 2), np.int32)
+        known, count, found, place = _fill_runs(g, scene, seen, depth, runs, knots), 0, 0, 0.0
+        for i in range(n):
+            if live[i] and low[i] <= 0 < high[i]:
+                _insert(stack, count, i, own, spans, 0.0, min(knots[0], high[i]))
+                inside[i], count = True, count + 1
+        for k in range(known):
+            found = _cross(place, knots[k], stack, count, scene, found, at[g], enders, result)
+            place = knots[k]
+            if k + 1 < known and place < 1 and (k == 0 or place > knots[k - 1]):
+                count, found = _end(place, stack, count, scene, runs, found, at[g], enders, result)
+                farther = knots[k + 1]
+                for m in range(k + 1, known):
+                    if knots[m] > place:
+                        farther = knots[m]
+                        break
+                count, found = _start(place, farther, stack, count, scene, runs, found, at[g], enders, result)
+        if not fill:
+            counts[g] = found
+            continue
+        for f in range(found):
+            _complete(at[g], f, found, g, enders, own, spans, names, parts, after, before, inner, result)
