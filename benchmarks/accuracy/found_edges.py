@@ -150,7 +150,9 @@ def of_failure(row: Derivative, folder: Path, samples: int) -> Case:
     more: dict[str, Any] = {"dtype": np.float64 if row.double else np.float32}
     if row.reference is not None:
         more["reference"] = row.reference()
-    return of_scene(scene, mode, pixel, 2, samples, folder, **more)
+    parts, _ = scene.at(scene.parameters)
+    glass = any(not getattr(part.shader, "opaque", True) for part in parts)
+    return of_scene(scene, mode, pixel, 6 if glass else 2, samples, folder, **more)
 
 
 def failures(folder: Path) -> Iterator[tuple[str, Callable[[], Case]]]:

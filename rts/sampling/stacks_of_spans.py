@@ -71,11 +71,12 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
     """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer."""
     from rts.sampling import spans_loops
 
-    solid = (layers.part >= 0) & opaque[layers.part]
-    nearest = np.argmax(solid, axis=0)[None]
-    ends = Fronts(*(np.take_along_axis(x, nearest, axis=0)[0] for x in layers))
-    ends = ends._replace(part=np.where(solid.any(0), ends.part, np.int32(-1)))
-    met, marks = np.zeros((2, *ends.part.shape), np.uint8), False
+    size = layers.part.shape[1:]
+    ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
+    for part, _, depth in zip(*layers, strict=True):
+        solid = (part >= 0) & opaque[part]
+        ends.part[solid], ends.depth[solid] = part[solid], depth[solid]
+    met, marks = np.zeros((2, *size), np.uint8), False
     for own in sheets:
         own.meet(ends, width, met)
     for layer in range(len(layers.part)):
