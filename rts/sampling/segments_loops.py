@@ -16,6 +16,12 @@ ASIDE = 0.4
 """Share of a cost that is by how far a segment leads off the direction of an outline at its end; the rest is by its
 length."""
 
+STRAIGHT = 1e-3
+"""Sine of an angle, in which an outline counts as straight: rounding of vertices must not tell where lines meet."""
+
+CLOSE = 1e-4
+"""Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
+
 
 @loop
 def ends_of(gap, place, near, parts, height, width):
@@ -175,12 +181,13 @@ def beyond(ties, count):
 def _meeting(start, ahead, end, back, meeting):
     """Fill `meeting` with where lines from `start` along `ahead` and to `end` along `back` meet; True if between."""
     turn = ahead[0] * back[1] - ahead[1] * back[0]
-    if not abs(turn) > 1e-9:
+    if not abs(turn) > STRAIGHT * np.hypot(ahead[0], ahead[1]) * np.hypot(back[0], back[1]):
         meeting[0], meeting[1] = start[0], start[1]
         return False
     t = ((end[0] - start[0]) * back[1] - (end[1] - start[1]) * back[0]) / turn
     meeting[0], meeting[1] = start[0] + t * ahead[0], start[1] + t * ahead[1]
-    return t >= 0 and (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1] >= 0
+    there = (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1]
+    return t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
 
 
 @compiled

@@ -125,7 +125,7 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
 
 @compiled
 def _mark(axis, ends, nearest, part, depth, width, gaps):
-    """Mark the gaps along an axis that an edge meets, with 1 where both centres show something nearer than all of it."""
+    """Mark the gaps along an axis that an edge meets; see `meet`, whose depths are compared with the edge's nearest."""
     height, across = part.shape
     lines, count = (height, across) if axis == 0 else (across, height)
     k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1
