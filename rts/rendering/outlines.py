@@ -10,7 +10,9 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
+from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.registry import name_of
@@ -42,15 +44,16 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         known.append((part.transform, {name: part.theta[name] for name in part.surface.reads(part.theta)}))
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
-    if any(map(is_traced, leaves(inputs))):
-        found, more = _traced(sampled, scene, grid, max(8 * sum(grid.size), (capacity or 0) // 4), inputs)
+    traced = any(map(is_traced, leaves(inputs)))
+    if traced or all(map(_triangles_tell, scene.parts, scene.chosen())):
+        most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
+        found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
         row, depth, own = map_leaves(_known, inputs[3:])
-        fronts = _at_centres(row, depth, own, sampled.samples)
-        here, more = _Points.of(scene, grid).found(fronts)
-        # Engines that compile eager operations anew for each shape pad them.
+        here, more = _Points.of(scene, grid).found(_at_centres(row, depth, own, sampled.samples))
         specs = _Found.specs(0, grid.size, _real(scene))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
+        # Engines that compile eager operations anew for each shape pad them.
         found = _Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
     for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
@@ -103,14 +106,24 @@ class _Found(NamedTuple):
         return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
 
 
-def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree) -> tuple[_Found, list[Samples]]:
+def _triangles_tell(part: CheckedPart, sampler: Sampler) -> bool:
+    """True for a part whose samples are where its triangles say."""
+    surface = part.surface
+    if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
+        return False
+    return not (surface.refines and surface.refine_moves)
+
+
+def _found_on_host(
+    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, inputs: Tree
+) -> tuple[_Found, list[Samples]]:
     """`_Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
-    known = map_leaves(lambda x: x if is_traced(x) else value_of(x), inputs)
     owners = [_tables(own) for own in sampled.samples]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         given = iter(arrays)
-        of_parts, whole, camera, row, depth, own = map_leaves(lambda x: next(given) if is_traced(x) else x, known)
+        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
+        of_parts, whole, camera, row, depth, own = known
         parts = [replace(p, transform=t, theta=theta) for p, (t, theta) in zip(scene.parts, of_parts, strict=True)]
         points = _Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size))
         found, more = points.found(_at_centres(row, depth, own, sampled.samples), most)
@@ -118,15 +131,16 @@ def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree)
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = part.surface.evaluate(part.theta, replace(samples, asked=None)) if "gbuffer" in kinds else {}
-            filled = [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
-            arrays_of += [np.asarray(x, spec.dtype) for x, spec in zip(filled, tables.values(), strict=True)]
-        return [*(np.asarray(x, spec.dtype) for x, spec in zip(found, specs, strict=False)), *arrays_of]
+            arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
+        return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
 
-    specs = _Found.specs(most, grid.size, _real(scene))
-    rows = [ArraySpec((4 * most, *x.shape[1:]), x.dtype, packed=True) for own in owners for x in own.values()]
-    operands = [x for x in leaves(known) if is_traced(x)]
-    results = iter(engine_of(*operands).call_host(host, [*specs, *rows], *operands))
-    found = _Found(*(next(results) for _ in specs))
+    operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
+    specs = _Found.specs(most or 0, grid.size, _real(scene))
+    for x in (x for own in owners for x in own.values()):
+        dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
+        specs.append(ArraySpec((4 * (most or 0), *x.shape[1:]), dtype, packed=True))
+    results = iter(engine_of(sampled.row).call_host(host, specs, *operands))
+    found = _Found(*(next(results) for _ in _Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
 
 
@@ -198,11 +212,11 @@ class _Points:
         """The points of a grid."""
         parts = []
         for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
-            camera, sheets, surface = grid.camera.within(part.transform), None, part.surface
-            if isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface):
+            camera, sheets = grid.camera.within(part.transform), None
+            if isinstance(sampler, TriangleSampler):
                 host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
                 entry = _entry(part, sampler, entry, host, grid.size)
-                if not (surface.refines and surface.refine_moves):
+                if _triangles_tell(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
