@@ -290,7 +290,7 @@ def test_a_strip_that_hardly_a_centre_sees_has_its_area_and_motion(angle, width)
 
 def test_a_body_that_no_centre_sees_is_found():
     corners = turned(SQUARE * [0.05, 0.05], 0.4, (12.5, 12.0))
-    with pytest.warns(rts.EmptyImageWarning, match="between the centres"):
+    with pytest.warns(rts.errors.EmptyImageWarning, match="between the centres"):
         rts.render(card(flat(corners)), in_pixels(), SIZE, splatter="none")
     image = edges(card(flat(corners)))[..., 3]
     assert image.sum() == pytest.approx(covered(corners, SIZE).sum(), rel=0.5)
