@@ -197,6 +197,14 @@ def _angle(a, b):
 
 
 @compiled
+def _inward(tangent, side, way):
+    """Fill `way` with a direction, turned into a square from one of its sides."""
+    into = (tangent[1], -tangent[0], -tangent[1], tangent[0])[side]
+    sign = 1.0 if into >= 0 else -1.0
+    way[0], way[1] = sign * tangent[0], sign * tangent[1]
+
+
+@compiled
 def _within(point, origin, s):
     """True if a point lies in the square of a segment."""
     x, y = point[0] - origin[s, 1] - 0.5, point[1] - origin[s, 0] - 0.5
@@ -204,30 +212,42 @@ def _within(point, origin, s):
 
 
 @loop
-def corners(first, last, origin, ties, around, place, corner, pull):
+def corners(first, last, origin, ties, side, around, place, tangent, triangle, corner, pull):
     """Fill `corner` (S, 2), from the square's first centre, and `pull` (S, 4) of segments; see `Outlines`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
     at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
-    curve is two thirds as far from the chord as their meeting.
+    curve is two thirds as far from the chord as their meeting. What comes back to the side that it entered by is a tip:
+    there the tangents are those of the triangles' edges; they meet in its corner if both are of one triangle.
 
     Args:
         first: the first segment.
         last: the segment after the last.
         origin: (S, 2), y and x of the first corner of each square.
         ties: (S, 2).
+        side: (S, 2), see `segments_of`.
         around: (S, 4), the result of `beyond`.
         place: (B, 2), x and y of breaks.
+        tangent: (B, 2), see `join`.
+        triangle: (B,) int32, the triangle that ends at each break, or −1.
         corner: to fill.
         pull: to fill.
     """
-    sharp, curve = np.empty(2), np.empty(2)
+    sharp, curve, way = np.empty(2), np.empty(2), np.empty(2)
     for s in range(first, last):
         start, end = place[ties[s, 0]], place[ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0]]
         for a in range(2):
             corner[s, a] = (start[a] + end[a]) / 2
         alone, on, back = 0.0, 0.0, 0.0
-        if around[s, 1] >= 0 and around[s, 2] >= 0:
+        if side[s, 0] == side[s, 1] and ties[s, 1] >= 0:
+            a, b = ties[s, 0], ties[s, 1]
+            _inward(tangent[a], side[s, 0], way)
+            _inward(tangent[b], side[s, 1], sharp)
+            if _meeting(start, way, end, -sharp, curve) and _within(curve, origin, s):
+                share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
+                for i in range(2):
+                    corner[s, i] += share * (curve[i] - corner[s, i])
+        elif around[s, 1] >= 0 and around[s, 2] >= 0:
             before, after = place[around[s, 1]], place[around[s, 2]]
             if _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
                 for a in range(2):
