@@ -170,12 +170,13 @@ def _at_centres(
     row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
 ) -> Fronts:
     """The fronts (H, W) of a sampled scene: its `row` and `depth`, and the triangles of each part's samples."""
-    counts = [own.ids.shape[-2] for own in samples]
-    of_part = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    row, counts = row[0], [own.ids.shape[-2] for own in samples]
     none = [np.full(count, -1, np.int32) for count in counts]
-    triangle = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
-    part, triangle = (np.where(row[0] >= 0, table[row[0]], np.int32(-1)) for table in (of_part, triangle))
-    return Fronts(part, triangle, depth[0].astype(np.float64))
+    of_samples = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
+    part = np.where(row >= 0, np.int32(0), np.int32(-1))
+    for first in np.cumsum(counts)[:-1]:
+        part += row >= first
+    return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth[0].astype(np.float64))
 
 
 def _known(x: Array) -> np.ndarray:

@@ -78,6 +78,7 @@ class Breaks(NamedTuple):
         parts: (B, 2) int32, their parts, or −1.
         joined: (2, H, W) bool: does each cell's front go on to the next one's, along x and along y?
         triangles: (B, 4) int32, the triangles of these samples, in order; −1 where none is known.
+        tangent: (B, 2) float64, the outline's unit direction in the image, either way; 0 where it is unknown.
     """
 
     gap: np.ndarray
@@ -90,6 +91,7 @@ class Breaks(NamedTuple):
     parts: np.ndarray
     joined: np.ndarray
     triangles: np.ndarray
+    tangent: np.ndarray
 
 
 class _Intervals(NamedTuple):
@@ -159,6 +161,7 @@ def find_breaks(fronts: Fronts, oracle: Oracle) -> Breaks:
         np.stack([found.before.part, found.behind.part], 1),
         joined,
         np.full((len(number), 4), -1, np.int32),
+        np.zeros((len(number), 2)),
     )
 
 

@@ -41,7 +41,7 @@ def joined(breaks: Breaks) -> Segments:
     square, ends = square[order], ends[order]
     begins = np.append(np.flatnonzero(np.diff(square, prepend=-1)), len(square))
     partner = np.full(len(square), -1, np.int32)
-    loops.join(begins, ends, breaks.place, partner)
+    loops.join(begins, ends, breaks.place, breaks.tangent, partner)
     origin, ties, side = loops.segments_of(square, ends, partner, width)
     around = loops.beyond(ties, len(breaks.place))
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))

@@ -12,6 +12,17 @@ which may be the two edges of something thin; one between breaks with different 
 outline and a line where surfaces cross."""
 
 
+ASIDE = 0.4
+"""Share of a cost that is by how far a segment leads off the direction of an outline at its end; the rest is by its
+length."""
+
+STRAIGHT = 1e-3
+"""Sine of an angle, in which an outline counts as straight: rounding of vertices must not tell where lines meet."""
+
+CLOSE = 1e-4
+"""Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
+
+
 @loop
 def ends_of(gap, place, near, parts, height, width):
     """The ends of segments: each break in the two squares beside its gap, as far as these have four centres.
@@ -50,7 +61,7 @@ def ends_of(gap, place, near, parts, height, width):
 
 
 @loop
-def join(begins, ends, place, partner):
+def join(begins, ends, place, tangent, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
     Only ends with the same part in front are joined, one that leaves it with one that enters it. The least cost of
@@ -60,12 +71,13 @@ def join(begins, ends, place, partner):
         begins: (Q + 1,) where the ends of each square begin.
         ends: (E, 5), see `ends_of`; clockwise in each square.
         place: (B, 2) x and y of breaks.
+        tangent: (B, 2) unit directions of outlines there, either way; 0 where they are unknown.
         partner: (E,) int32, filled with −1.
     """
     for q in range(len(begins) - 1):
         first, n = begins[q], begins[q + 1] - begins[q]
         if n == 2:
-            if _cost(first, first + 1, ends, place) < 2 * LONE:
+            if _cost(first, first + 1, ends, place, tangent) < 2 * LONE:
                 partner[first], partner[first + 1] = first + 1, first
             continue
         if n < 2:
@@ -76,7 +88,7 @@ def join(begins, ends, place, partner):
             for i in range(n - m + 1):
                 best, choice = LONE + least[i + 1, m - 1], -1
                 for k in range(1, m):
-                    cost = _cost(first + i, first + i + k, ends, place)
+                    cost = _cost(first + i, first + i + k, ends, place, tangent)
                     cost += least[i + 1, k - 1] + least[i + k + 1, m - k - 1]
                     best, choice = (cost, k) if cost < best else (best, choice)
                 least[i, m], chosen[i, m] = best, choice
@@ -84,12 +96,16 @@ def join(begins, ends, place, partner):
 
 
 @compiled
-def _cost(a, b, ends, place):
+def _cost(a, b, ends, place, tangent):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
     if ends[a, 3] != ends[b, 3] or ends[a, 2] * ends[b, 2] > 0:
         return np.inf
     p, q = ends[a, 0], ends[b, 0]
-    cost = np.hypot(place[p, 0] - place[q, 0], place[p, 1] - place[q, 1])
+    dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], 0.0
+    for i in (p, q):
+        tx, ty = tangent[i, 0], tangent[i, 1]
+        aside = abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy)
+        cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
     cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (ends[a, 4] != ends[b, 4])
     return cost + OTHER_KIND * ((ends[a, 2] == 0) != (ends[b, 2] == 0))
 
@@ -165,12 +181,13 @@ def beyond(ties, count):
 def _meeting(start, ahead, end, back, meeting):
     """Fill `meeting` with where lines from `start` along `ahead` and to `end` along `back` meet; True if between."""
     turn = ahead[0] * back[1] - ahead[1] * back[0]
-    if not abs(turn) > 1e-9:
+    if not abs(turn) > STRAIGHT * np.hypot(ahead[0], ahead[1]) * np.hypot(back[0], back[1]):
         meeting[0], meeting[1] = start[0], start[1]
         return False
     t = ((end[0] - start[0]) * back[1] - (end[1] - start[1]) * back[0]) / turn
     meeting[0], meeting[1] = start[0] + t * ahead[0], start[1] + t * ahead[1]
-    return t >= 0 and (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1] >= 0
+    there = (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1]
+    return t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
 
 
 @compiled

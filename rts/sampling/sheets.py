@@ -9,6 +9,7 @@ import numpy as np
 
 from rts.compiling.threads import parallel
 from rts.contracts.records import Fragments, Proxy
+from rts.sampling.gaps import Fronts
 from rts.sampling.points import kept_sign, near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
@@ -72,27 +73,27 @@ class Sheets(NamedTuple):
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
         return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen, sides)
 
-    def join(self, own: int, part: np.ndarray, triangle: np.ndarray, depth: np.ndarray, joined: np.ndarray) -> None:
-        """Mark, in `joined` (2, H, W), the centres whose fronts, of the part `own`, a sheet joins to the next ones'.
+    def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
+        """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.
 
-        `part`, `triangle` and `depth` (H, W) tell what is seen at each centre.
-        """
-        from rts.sampling import sheets_loops
-
-        mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(part)
-        arguments = part, triangle, depth, own, *mesh, self.keep != 0, joined
-        parallel(sheets_loops.seams, height, *arguments, work=20 * part.size)
-
-    def meet(self, part: np.ndarray, depth: np.ndarray, width: np.ndarray, gaps: np.ndarray) -> None:
-        """Mark, in `gaps` (2, H, W), those in which a sheet may end or turn away before what both centres show.
-
-        `part` and `depth` (H, W) tell what is seen at each centre; for `width` see `Oracle`.
+        `fronts` (H, W) are seen at centres; for `width` see `Oracle`.
         """
         from rts.sampling import silhouettes_loops
 
         mesh, count = (self.rows, self.vertices, self.faces), len(self.faces)
         own = self.clip[0], self.keep, self.seen, self.beyond, self.sides
-        parallel(silhouettes_loops.meet, count, *mesh, *own, part, depth, width, gaps, work=10 * count)
+        parallel(silhouettes_loops.meet, count, *mesh, *own, fronts.part, fronts.depth, width, met, work=10 * count)
+
+    def join(self, own: int, fronts: Fronts, met: np.ndarray, joined: np.ndarray) -> None:
+        """Mark, in `joined` (2, H, W), the centres whose fronts, of the part `own`, a sheet joins to the next ones'.
+
+        `fronts` (H, W) are seen at centres; for `met` see `meet`.
+        """
+        from rts.sampling import sheets_loops
+
+        mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
+        arguments = *fronts, own, *mesh, self.keep != 0, met, joined
+        parallel(sheets_loops.seams, height, *arguments, work=20 * joined[0].size)
 
     def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
         """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
@@ -123,6 +124,15 @@ class Sheets(NamedTuple):
         parallel(sheets_loops.on_planes, count, *arguments, work=100 * count)
         weights, depth = weights.astype(np.float32), depth.astype(np.float32)
         return Fragments(triangle[None, None], weights[None, None], depth[None, None]), slopes
+
+    def along(self, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Directions (M, 2), in the image, of the edges of triangles (M,) that are nearest to points (M, 2)."""
+        from rts.sampling import silhouettes_loops
+
+        found = np.empty((len(triangle), 2))
+        arguments = triangle, points, self.rows, self.vertices, self.faces, found
+        parallel(silhouettes_loops.along, len(found), *arguments, work=100 * len(found))
+        return found
 
 
 _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}

@@ -165,7 +165,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, beyond, one_sided, joined):
+def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, beyond, one_sided, met, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
 
     Args:
@@ -181,6 +181,7 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
         faces: (T, 3) of the proxy.
         beyond: (T, 3), the result of `neighbours`.
         one_sided: True if only one side of triangles is seen, so that two which share an edge do not fold there.
+        met: (2, H, W) uint8, 0 in gaps that no silhouette meets; see `silhouettes_loops.meet`.
         joined: (2, H, W) bool to fill: along x, and along y.
     """
     (height, width), corners = part.shape, np.empty((3, 4))
@@ -194,7 +195,9 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
                 end = s
-                if t != s and not (one_sided and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)):
+                next_ = one_sided and (beyond[t, 0] == s or beyond[t, 1] == s or beyond[t, 2] == s)
+                # Around a corner that two triangles have in common the sheet neither ends nor turns away.
+                if t != s and not next_ and (met[axis, y, x] != 0 or not _touch(faces, t, s)):
                     start, at = (x + 0.5, y + 0.5) if axis == 0 else (y + 0.5, x + 0.5)
                     end = _walked(t, s, start, axis, at, seen, faces, beyond)
                 joined[axis, y, x] = end == s

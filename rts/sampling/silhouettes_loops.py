@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.sampling.sheets_loops import corners_of
+from rts.sampling.sheets_loops import corners_of, edge
 
 SLACK = 0.01
 """By how much edges are wider than these, against rounding, in cells."""
@@ -42,7 +42,7 @@ def turns(first, last, rows, vertices, faces, seen, sides):
 
 @loop
 def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sides, part, depth, width, gaps):
-    """Mark, in `gaps` (2, H, W), those that silhouettes meet, unless both centres show something nearer.
+    """Mark, in `gaps` (2, H, W), those that silhouettes meet: 2, or 1 where both centres show something nearer.
 
     Args:
         first: the first triangle.
@@ -58,7 +58,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
-        gaps: (2, H, W) bool.
+        gaps: (2, H, W) uint8.
     """
     ends, deep = np.empty((2, 2)), np.empty(2)
     for t in range(first, last):
@@ -125,7 +125,7 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
 
 @compiled
 def _mark(axis, ends, nearest, part, depth, width, gaps):
-    """Mark the gaps along an axis that an edge meets, unless both centres show something nearer than all of it."""
+    """Mark the gaps along an axis that an edge meets; see `meet`, whose depths are compared with the edge's nearest."""
     height, across = part.shape
     lines, count = (height, across) if axis == 0 else (across, height)
     k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1
@@ -144,5 +144,21 @@ def _mark(axis, ends, nearest, part, depth, width, gaps):
             if part[y0, x0] >= 0 and part[y1, x1] >= 0:
                 far = max(depth[y0, x0], depth[y1, x1])
                 if nearest > far + abs(depth[y1, x1] - depth[y0, x0]) + width[0] + width[1] * far:
+                    gaps[axis, y0, x0] = max(gaps[axis, y0, x0], 1)
                     continue
-            gaps[axis, y0, x0] = True
+            gaps[axis, y0, x0] = 2
+
+
+@loop
+def along(first, last, triangles, points, rows, vertices, faces, found):
+    """Fill `found` (M, 2): the direction in the image of the edge of a triangle that is nearest to a point (M, 2)."""
+    corners = np.empty((3, 4))
+    for m in range(first, last):
+        sign, least = corners_of(triangles[m], rows, vertices, faces, corners), np.inf
+        found[m] = 0.0
+        for k in range(3):
+            ex, ey, e = edge(corners, k, sign)
+            size = np.hypot(ex, ey)
+            if size > 0 and abs(ex * points[m, 0] + ey * points[m, 1] + e) < least * size:
+                least = abs(ex * points[m, 0] + ey * points[m, 1] + e) / size
+                found[m, 0], found[m, 1] = ey, -ex

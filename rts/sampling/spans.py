@@ -27,13 +27,14 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     """
     from rts.sampling import spans_loops
 
-    joined = np.zeros((2, *fronts.part.shape), np.bool_)
-    for part, own in enumerate(sheets):
-        own.join(part, *fronts, joined)
-    gaps = np.empty_like(joined)
-    parallel(spans_loops.apart, len(fronts.part), fronts.part, joined, gaps, work=2 * fronts.part.size)
+    met = np.zeros((2, *fronts.part.shape), np.uint8)
     for own in sheets:
-        own.meet(fronts.part, fronts.depth, width, gaps)
+        own.meet(fronts, width, met)
+    joined = np.zeros(met.shape, np.bool_)
+    for part, own in enumerate(sheets):
+        own.join(part, fronts, met, joined)
+    gaps = np.empty_like(joined)
+    parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, gaps, work=2 * fronts.part.size)
     gap, whole, numbers = _breaks_in(gaps, fronts, sheets)
     # In one surface from centre to centre.
     inside = fronts.part >= 0
@@ -48,7 +49,8 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     triangles = whole[:, [4, 5, 6, 7]]
     triangles[np.tile(whole[:, 2:4] < 0, 2)] = -1
     ends, parts = whole[:, 8:] == 1, whole[:, 2:4]
-    return Breaks(gap, points[:, 0], near, slope, ends, points[:, 1:3], points[:, 3:], parts, joined, triangles)
+    own = points[:, 0], near, slope, ends, points[:, 1:3], points[:, 3:], parts, joined, triangles
+    return Breaks(gap, *own, _tangents(whole, near, slope, points[:, 0], sheets))
 
 
 def _breaks_in(
@@ -94,6 +96,22 @@ def _slopes(whole: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]) -> 
             if len(at):
                 _, slopes[at, side] = own.at(whole[at, 4 + side], points[at])
     return slopes
+
+
+def _tangents(
+    whole: np.ndarray, near: np.ndarray, slope: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]
+) -> np.ndarray:
+    """`Breaks.tangent`: along the edge of the triangle that ends there, or the line where two planes cross."""
+    apart = slope[:, 1] - slope[:, 0]
+    found = np.column_stack([apart[:, 1], -apart[:, 0]])
+    side = np.where(near == 1, 1, 0)
+    index = np.arange(len(whole))
+    part, triangle = whole[index, 2 + side], whole[index, 4 + side]
+    for own, sheet in enumerate(sheets):
+        at = np.flatnonzero((near < 2) & (part == own))
+        found[at] = sheet.along(triangle[at], points[at])
+    length = np.hypot(*found.T)
+    return found / np.where(length > 0, length, 1.0)[:, None]
 
 
 def _crossings(whole: np.ndarray, slope: np.ndarray, fronts: Fronts, gap: np.ndarray, width: np.ndarray) -> np.ndarray:

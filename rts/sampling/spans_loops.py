@@ -38,14 +38,15 @@ SLACK = np.float32(0.01)
 
 
 @loop
-def apart(first, last, part, joined, gaps):
-    """Fill `gaps` (2, H, W) bool: something is seen at one of both centres, and no sheet joins them."""
+def wanted(first, last, part, joined, met, gaps):
+    """Fill `gaps` (2, H, W) bool: something is seen at one of both centres, and no sheet joins them; or `met` is 2."""
     height, width = part.shape
     for y in range(first, last):
         for x in range(width):
             seen = part[y, x] >= 0
-            gaps[0, y, x] = x + 1 < width and (seen or part[y, x + 1] >= 0) and not joined[0, y, x]
-            gaps[1, y, x] = y + 1 < height and (seen or part[y + 1, x] >= 0) and not joined[1, y, x]
+            across = x + 1 < width and (seen or part[y, x + 1] >= 0) and not joined[0, y, x]
+            below = y + 1 < height and (seen or part[y + 1, x] >= 0) and not joined[1, y, x]
+            gaps[0, y, x], gaps[1, y, x] = across or met[0, y, x] == 2, below or met[1, y, x] == 2
 
 
 @loop

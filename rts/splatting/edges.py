@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace, stopped
-from rts.arrays.trees import Array
-from rts.contracts.records import Outlines, Splats
-from rts.contracts.splatter import Splatter
+from rts.arrays.engines import engine_of, floating_bits, namespace, stopped
+from rts.arrays.trees import Array, collected, map_leaves
+from rts.contracts.records import ArraySpec, Outlines, Splats
+from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
 from rts.splatting import edges_weights
 from rts.splatting.edges_weights import BORDER
@@ -35,7 +35,7 @@ CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
 
-class Edges(Splatter):
+class Edges(SummingSplatter):
     """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque."""
 
     layers = 1
@@ -55,6 +55,43 @@ class Edges(Splatter):
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
         check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
         return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, field.name) for field in fields(Outlines)))
+
+    def normal_equations(
+        self,
+        splats: Splats,
+        t_positions: Array,
+        t_rgba: Array | None,
+        target: Array,
+        weights: Array | None = None,
+        background: Array | None = None,
+        loss: Any = None,
+    ) -> tuple[Array, Array, Array] | None:
+        """See `rts.SummingSplatter`; None without outlines, and for arrays that are not on the host."""
+        outlines, engine = splats.outlines, engine_of(splats.positions)
+        own = (
+            splats.positions,
+            splats.rgba,
+            splats.row[0, ...],
+            outlines,
+            t_positions,
+            t_rgba,
+            target,
+            weights,
+            background,
+        )
+        operands = collected(own)
+        if outlines is None or splats.rgba.shape[0] == 0 or not engine.on_host(*operands):
+            return None
+
+        def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+            it = iter(arrays)
+            positions, rgba, row, found, *tangents_and_fields = map_leaves(lambda _: next(it), own)
+            known = positions, rgba, row, *(getattr(found, field.name) for field in fields(Outlines))
+            return edges_weights.normal_equations(known, tuple(tangents_and_fields), splats.border, loss)
+
+        count, dtype = t_positions.shape[0], np.float64 if floating_bits(splats.positions) == 64 else np.float32
+        specs = ArraySpec((), dtype), ArraySpec((count, count), dtype), ArraySpec((count,), dtype)
+        return engine.call_host(host, specs, *operands)
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:

@@ -6,7 +6,7 @@ from outlines alone. They are computed once, for the value, and used again by th
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,6 +144,41 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
         loops.pull_jumps(weights.shown, g_jump, g_rgba)
     sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
     loops.pull_sides(*sides, rgba, g, g_rgba, g_positions)
+
+
+def normal_equations(
+    operands: Arrays, others: Arrays, border: int, loss: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`SummingSplatter.normal_equations` on the host, by an image for each tangent.
+
+    `operands` are those of `forward`; `others` are t_positions, t_rgba, target, weights and background, or None.
+    """
+    t_positions, t_rgba, target, weights, background = others
+    row, dtype = operands[2], operands[1].dtype
+    side, channels = (row.shape[0] - 2 * border) // target.shape[0], target.shape[2]
+
+    def seen(whole: np.ndarray, behind: float) -> np.ndarray:
+        """The channels of pixels that are compared, over the background; `behind` is 0 for tangents."""
+        (height, width), inside = target.shape[:2], slice(border, -border if border else None)
+        image = whole[inside, inside]
+        image = image.reshape(height, side, width, side, -1).mean((1, 3)) if side > 1 else image.copy()
+        if background is not None:
+            image += (behind - image[..., -1:]) * background
+        image = image[..., -1:] if channels == 1 else image[..., :channels]
+        return image if weights is None else image * weights
+
+    image = np.empty((*row.shape, operands[1].shape[1]), dtype)
+    kept = forward(operands, image)
+    r = (seen(image, 1.0) - (target if weights is None else target * weights)).reshape(-1)
+    jacobian = np.empty((len(t_positions), r.size), dtype)
+    for own, tangent in enumerate(t_positions):
+        push(operands, (tangent, None if t_rgba is None else t_rgba[own]), image, kept)
+        jacobian[own] = seen(image, 0.0).reshape(-1)
+    value = np.mean(r * r) if loss is None else loss(r)
+    if loss is not None and loss.robust:
+        w, curvatures = loss.weights(r)
+        return np.asarray(value), (jacobian * curvatures) @ jacobian.T / r.size, jacobian @ (w * r) / r.size
+    return np.asarray(value), jacobian @ jacobian.T / r.size, jacobian @ r / r.size
 
 
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:
