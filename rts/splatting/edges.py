@@ -184,7 +184,9 @@ class _Breaks(NamedTuple):
         moves = xp.where((outlines.near == 0)[:, None], motion[0], motion[1])
         moves = xp.where(crossing[:, None], along[:, None] * apart, moves)
         # A pair lies on the ray of the sample that ends, and its mean moves as the outline.
-        pairs = [xp.take(positions, xp.where(outlines.pair >= 0, outlines.pair, 0)[:, i], axis=0)[:, :2] for i in (0, 1)]
+        pairs = [
+            xp.take(positions, xp.where(outlines.pair >= 0, outlines.pair, 0)[:, i], axis=0)[:, :2] for i in (0, 1)
+        ]
         origin = xp.where((outlines.near == 0)[:, None], points[0], points[1])
         moves = xp.where(outlines.pair[:, :1] >= 0, (pairs[0] + pairs[1]) / 2 - origin, moves)
         return cls(first + outlines.place[:, None] * step, step, color, seen, xp.stack(motion), moves)
