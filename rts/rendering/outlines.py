@@ -61,7 +61,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
         samples.append(in_one_table([own, extra]))
         first += samples[-1].ids.shape[-2]
-    named = {"rows": rows[:, :2], "inner": rows[:, 2:]}
+    named = {"rows": rows[:, :2], "inner": rows[:, 2:4], "pair": rows[:, 4:]}
     outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
     overflow, cells = sampled.overflow + found.left, _renumbered(sampled, samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
@@ -71,8 +71,9 @@ class _Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
-        rows: (B, 4) int32, the two last samples of each break and the two that tell colours, counted in their part.
-        parts: (B, 4) int32, their parts, or −1.
+        rows: (B, 6) int32, for each break the two last samples, the two that tell colours, and the pair, counted in
+            their part.
+        parts: (B, 6) int32, their parts, or −1.
         left: () int32, number of breaks left out for want of room.
     """
 
@@ -97,7 +98,7 @@ class _Found(NamedTuple):
     def specs(most: int, size: tuple[int, int], real: Any) -> list[ArraySpec]:
         """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
         integers, ends = np.int32, 2 * most
-        breaks = [ArraySpec(shape, integers, packed=True) for shape in ((most, 4), (most, 4))]
+        breaks = [ArraySpec((most, 6), integers, packed=True)] * 2
         breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
         breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
         breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
@@ -138,8 +139,8 @@ def _found_on_host(
     specs = _Found.specs(most or 0, grid.size, _real(scene))
     for x in (x for own in owners for x in own.values()):
         dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
-        specs.append(ArraySpec((4 * (most or 0), *x.shape[1:]), dtype, packed=True))
-    results = iter(engine_of(sampled.row).call_host(host, specs, *operands))
+        specs.append(ArraySpec((6 * (most or 0), *x.shape[1:]), dtype, packed=True))
+    results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
     found = _Found(*(next(results) for _ in _Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
 
@@ -227,13 +228,24 @@ class _Points:
         left = 0 if most is None else max(0, len(breaks.gap) - most)
         if left:
             breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-        # For each break the two last samples, and the two that tell colours.
-        parts, every = np.concatenate([breaks.parts, breaks.parts], 1), np.concatenate([breaks.points, breaks.inner], 1)
-        samples, rows = [], np.full(parts.shape, -1, np.int32)
+        # For each break the two last samples, the two that tell colours, and a pair on the ray of one of the first.
+        ending = np.column_stack([breaks.near == 0, breaks.near == 1])
+        pair = np.where(ending.any(1), np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]), -1)
+        parts = np.concatenate([breaks.parts, breaks.parts, pair[:, None], pair[:, None]], axis=1)
+        every, rows = np.concatenate([breaks.points, breaks.inner], 1), np.full(parts.shape, -1, np.int32)
+        samples = []
         for part in range(len(self._parts)):
-            asked = parts == part
-            samples.append(self.sample(part, every[asked], breaks.triangles[asked]))
-            rows[asked] = _known(samples[-1].row)[0, 0]
+            asked, paired = parts[:, :4] == part, np.flatnonzero(pair == part)
+            own = [self.sample(part, every[asked], breaks.triangles[asked])]
+            rows[:, :4][asked], count = _known(own[0].row)[0, 0], own[0].ids.shape[-2]
+            # Triangles have no kinks within.
+            if not isinstance(self._parts[part][0], TriangleSampler):
+                own.append(self.sample(part, breaks.points[paired, breaks.near[paired]], exits=True))
+                exits = own[1].exit
+                if exits is not None and len(exits) == 2:
+                    found = _known(exits)[:, 0].T
+                    rows[paired, 4:] = np.where(found >= 0, found + count, -1)
+            samples.append(in_one_table(own))
         along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
         first = breaks.gap[:, 1::-1] + 0.5
         place = ((breaks.place - first) * along).sum(-1)
@@ -249,12 +261,14 @@ class _Points:
             return breaks_of_triangles(fronts, sheets, self._width)
         return find_breaks(fronts, Oracle(self._fronts, self._width))
 
-    def sample(self, part: int, points: np.ndarray, triangles: np.ndarray | None = None) -> Samples:
+    def sample(
+        self, part: int, points: np.ndarray, triangles: np.ndarray | None = None, exits: bool = False
+    ) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
         if sheets is not None and triangles is not None and (triangles >= 0).all():
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
-        request = Request(points=points, triangles=True, entry=entry)
+        request = Request(points=points, exits=exits, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" not in samples.followed:
             raise InputError(

@@ -7,7 +7,8 @@
     m       the motion of this sample in the image: 0 in value, it has the derivative
     J       the colour on one side of a segment less that on the other, from the last samples beside its two breaks;
             in the shares, on the side of the cell's own surface, the colour C
-    v       the motion of a break, linear between the two: that of the last sample of the surface that ends there
+    v       the motion of a break, linear between the two: that of the last sample of the surface that ends there, or
+            the mean of a pair of samples beside the deepest point of its ray
     n ds    along the part of the segment inside the pixel
 
 Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative,
@@ -52,6 +53,7 @@ class Edges(SummingSplatter):
             return color - _inside(color, motion - stopped(motion), _all_joined(row[0, ...] >= 0))
         check_rows(outlines.rows, rgba.shape[0], "outlines.rows")
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
+        check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
         return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, field.name) for field in fields(Outlines)))
 
     def normal_equations(
@@ -181,6 +183,12 @@ class _Breaks(NamedTuple):
         along = -(still[0] - still[1]) / xp.where(crossing & (square > 0), square, 1.0)
         moves = xp.where((outlines.near == 0)[:, None], motion[0], motion[1])
         moves = xp.where(crossing[:, None], along[:, None] * apart, moves)
+        # A pair lies on the ray of the sample that ends, and its mean moves as the outline.
+        pairs = [
+            xp.take(positions, xp.where(outlines.pair >= 0, outlines.pair, 0)[:, i], axis=0)[:, :2] for i in (0, 1)
+        ]
+        origin = xp.where((outlines.near == 0)[:, None], points[0], points[1])
+        moves = xp.where(outlines.pair[:, :1] >= 0, (pairs[0] + pairs[1]) / 2 - origin, moves)
         return cls(first + outlines.place[:, None] * step, step, color, seen, xp.stack(motion), moves)
 
 
@@ -424,7 +432,7 @@ def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ..
 EDGES = Operation(
     "rts.edges",
     _specification,
-    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
+    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
     shape=_shape,
     forward=edges_weights.forward,
     push=edges_weights.push,

@@ -27,6 +27,8 @@ class _Weights(NamedTuple):
     Attributes:
         shown: (B, 2) int32, the samples that tell colours before and behind breaks, or −1.
         points: (B, 2, 2), x and y of the last samples.
+        movers: (B, 2) int32, the samples that breaks move with, or −1: the last ones, or a pair.
+        origins: (B, 2, 2), x and y of these.
         moves: (B, 2, 3, 2).
         share: (S, 4, 2).
         own: (S, 4, 2) int8.
@@ -37,6 +39,8 @@ class _Weights(NamedTuple):
 
     shown: np.ndarray
     points: np.ndarray
+    movers: np.ndarray
+    origins: np.ndarray
     moves: np.ndarray
     share: np.ndarray
     own: np.ndarray
@@ -57,6 +61,10 @@ class _Weights(NamedTuple):
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
         own = np.empty((segments, 4, 2), np.int8)
         loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
+        paired = np.flatnonzero(outlines.pair[:, 0] >= 0)
+        movers, origins = np.array(outlines.rows), points.copy()
+        movers[paired], origins[paired] = outlines.pair[paired], points[paired, outlines.near[paired]][:, None]
+        moves[paired] = 0.5 * np.eye(3, 2)
         ties = outlines.ties
         known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER, path, share, own, flux
         seen = outlines.rows >= 0
@@ -64,7 +72,7 @@ class _Weights(NamedTuple):
         parallel(loops.weigh_segments, segments, *at, *known, work=400 * segments)
         normal = np.empty((count, 2))
         loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
-        return cls(shown, points, moves, share, own, flux, cells, sides)
+        return cls(shown, points, movers, origins, moves, share, own, flux, cells, sides)
 
 
 def forward(operands: Arrays, out: np.ndarray) -> _Weights:
@@ -76,7 +84,7 @@ def forward(operands: Arrays, out: np.ndarray) -> _Weights:
     parallel(loops.inside, len(row), positions, rgba, row, outlines.joined, out, work=10 * out.size)
     weights = _Weights.of(outlines)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
-    loops.motions(positions, outlines.rows, weights.points, weights.moves, motion)
+    loops.motions(positions, weights.movers, weights.origins, weights.moves, motion)
     _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out)
     return weights
 
@@ -92,7 +100,7 @@ def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | Non
     parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown) if len(t_positions) else 0, 2))
     if len(t_positions):
-        loops.motions(t_positions, outlines.rows, NOWHERE, weights.moves, motion)
+        loops.motions(t_positions, weights.movers, NOWHERE, weights.moves, motion)
     jump = _jumps(t_rgba, weights) if len(t_rgba) else np.empty((0, out.shape[2]))
     _add(outlines, weights, row, (t_rgba, t_positions, NOWHERE), (rgba, jump, steady, motion), out)
 
@@ -131,7 +139,7 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
     g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
     loops.pull_segments(*_segments(outlines, weights, row), steady, g, g_rgba, g_jump, g_motion)
     if len(g_positions):
-        loops.pull_motions(outlines.rows, weights.moves, g_motion, g_positions)
+        loops.pull_motions(weights.movers, weights.moves, g_motion, g_positions)
     if len(g_rgba):
         loops.pull_jumps(weights.shown, g_jump, g_rgba)
     sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
