@@ -217,8 +217,8 @@ def corners(first, last, origin, ties, side, around, place, tangent, triangle, c
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
     at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
-    curve is two thirds as far from the chord as their meeting. What comes back to the side that it entered by is a tip:
-    there the tangents are those of the triangles' edges; they meet in its corner if both are of one triangle.
+    curve is two thirds as far from the chord as their meeting. At a tip, which comes back to the side
+    of the square that it entered by, the tangents are the edges of the triangles there.
 
     Args:
         first: the first segment.
@@ -239,19 +239,20 @@ def corners(first, last, origin, ties, side, around, place, tangent, triangle, c
         for a in range(2):
             corner[s, a] = (start[a] + end[a]) / 2
         alone, on, back = 0.0, 0.0, 0.0
-        if side[s, 0] == side[s, 1] and ties[s, 1] >= 0:
+        tip = ties[s, 1] >= 0 and side[s, 0] == side[s, 1]
+        if tip:
             a, b = ties[s, 0], ties[s, 1]
             _inward(tangent[a], side[s, 0], way)
             _inward(tangent[b], side[s, 1], sharp)
-            if _meeting(start, way, end, -sharp, curve) and _within(curve, origin, s):
-                share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
-                for i in range(2):
-                    corner[s, i] += share * (curve[i] - corner[s, i])
-        elif around[s, 1] >= 0 and around[s, 2] >= 0:
+            tip = _meeting(start, way, end, -sharp, curve) and _within(curve, origin, s)
+            share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
+            for i in range(2):
+                corner[s, i] += share * (curve[i] - corner[s, i]) if tip else 0.0
+        if around[s, 1] >= 0 and around[s, 2] >= 0:
             before, after = place[around[s, 1]], place[around[s, 2]]
-            if _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
-                for a in range(2):
-                    corner[s, a] += 2 / 3 * (curve[a] - corner[s, a])
+            if not tip and _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
+                for i in range(2):
+                    corner[s, i] += 2 / 3 * (curve[i] - corner[s, i])
             ahead, behind = start - before, after - end
             if _meeting(start, ahead, end, behind, sharp) and _within(sharp, origin, s):
                 beside = 0.0
@@ -260,8 +261,8 @@ def corners(first, last, origin, ties, side, around, place, tangent, triangle, c
                 if around[s, 3] >= 0:
                     beside += _angle(behind, place[around[s, 3]] - after)
                 alone = min(max(1 - beside / max(_angle(ahead, behind), 1e-6), 0.0), 1.0)
-            for a in range(2):
-                corner[s, a] += alone * (sharp[a] - corner[s, a]) if alone > 0 else 0.0
+            for i in range(2):
+                corner[s, i] += alone * (sharp[i] - corner[s, i]) if alone > 0 else 0.0
             if alone > 0:
                 on = np.hypot(corner[s, 0] - start[0], corner[s, 1] - start[1]) / np.hypot(ahead[0], ahead[1])
                 back = np.hypot(corner[s, 0] - end[0], corner[s, 1] - end[1]) / np.hypot(behind[0], behind[1])
