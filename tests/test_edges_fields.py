@@ -52,12 +52,14 @@ def pushed(image):
     return torch.func.jvp(image, (torch.tensor(0.7),), (torch.ones(()),))[1].numpy()
 
 
+@pytest.mark.thorough
 def test_an_outline_on_a_kink_moves_as_the_kink():
     """The kinks at x = ±r move by one for each unit of r; either face alone by a half."""
     lines = pushed(alpha(diamond))[10:22].sum(axis=1)
     np.testing.assert_allclose(lines, 2 * FOCAL / DISTANCE, rtol=0.01)
 
 
+@pytest.mark.thorough
 def test_a_field_without_slope_at_its_surface_has_outlines_that_move():
     """The outline of a ball is a circle of focal · r / √(D² − r²) pixels."""
     square = DISTANCE**2 - 0.7**2
@@ -86,6 +88,7 @@ def test_pairs_lie_on_the_rays_of_breaks():
         np.testing.assert_allclose(seen(outlines.pair[:, side]), seen(ending), atol=1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("f", [diamond, ball])
 def test_loops_draw_and_push_what_the_specification_does(f, monkeypatch):
     image = alpha(f, "lambert")
