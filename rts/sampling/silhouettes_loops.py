@@ -37,7 +37,8 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         for axis in range(2):
             wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
             small &= wide <= 1  # False for NaN.
-        sides[t] = ((area > 0) - (area < 0)) * (1 if small else 2)
+        size = 1 if small else 2
+        sides[t] = size if area > 0 else (-size if area < 0 else 0)
 
 
 @loop
