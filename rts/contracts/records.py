@@ -345,7 +345,12 @@ class Outlines:
         corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
         pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
             is the motion of the corner.
-        joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y?
+        joined: (2, H, W) bool: does the front of each cell go on to the next one's, along x and along y? Of several
+            layers, do all that are seen?
+        stack: (B, 2, K) int32, indices of samples of the K layers before and behind each break, front to back, or −1.
+            Then `near` is about the layer that ends there, `rows` has a sample only where it is, or two where layers
+            cross, and `inner` has no meaning. None for one layer.
+        stack_points: (B, 2, K) float64, the places of these samples along the gap; None for one layer.
     """
 
     place: Array
@@ -364,6 +369,8 @@ class Outlines:
     corner: Array
     pull: Array
     joined: Array
+    stack: Array | None = None
+    stack_points: Array | None = None
 
 
 @record(static=("supersample", "apron"))

@@ -98,6 +98,7 @@ def image_over(scene: Scene, size: tuple[int, int], background: Array | None, se
 
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The image (H, W, C + 1) of a checked scene, without a background; for `context` see `splatted`."""
+    settings = settings.of(scene.fronts_suffice)
     if settings.contrast is not None:
         return _of_contrast(scene, size, context, settings)
     bands, reader = settings.bands(size), settings.reader

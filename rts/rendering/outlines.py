@@ -10,24 +10,24 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
-from rts.contracts.sampler import Sampler
-from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
-from rts.rendering.scene import Grid, Scene
+from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
 from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
 from rts.sampling.spans import breaks_of_triangles
+from rts.sampling.stacks_of_spans import breaks_of_stacks
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 
 def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
-    """Samples at cells' centres, of one layer, with `Sampled.outlines` and the samples beside breaks.
+    """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
+
+    Of several layers the outlines are those of all that light reaches; all parts must have `layered` outlines then.
 
     Args:
         sampled: the samples at centres.
@@ -45,13 +45,13 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or all(map(_triangles_tell, scene.parts, scene.chosen())):
+    if traced or all(map(has_sheets, scene.parts, scene.chosen())):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
         row, depth, own = map_leaves(_known, inputs[3:])
         here, more = _Points.of(scene, grid).found(_at_centres(row, depth, own, sampled.samples))
-        specs = _Found.specs(0, grid.size, _real(scene))
+        specs = _Found.specs(0, grid.size, _real(scene), len(row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
         found = _Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
@@ -62,6 +62,9 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         samples.append(in_one_table([own, extra]))
         first += samples[-1].ids.shape[-2]
     named = {"rows": rows[:, :2], "inner": rows[:, 2:4], "pair": rows[:, 4:]}
+    if sampled.row.shape[0] > 1:
+        none = 0 * rows[:, :2] - 1
+        named = {"rows": rows[:, :2], "inner": rows[:, :2], "pair": none, **_stacks(found, rows[:, 2:])}
     outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
     overflow, cells = sampled.overflow + found.left, _renumbered(sampled, samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
@@ -72,13 +75,17 @@ class _Found(NamedTuple):
 
     Attributes:
         rows: (B, 6) int32, for each break the two last samples, the two that tell colours, and the pair, counted in
-            their part.
-        parts: (B, 6) int32, their parts, or −1.
+            their part. Of K layers (B, 2 + K + 1): the two last samples, and those of the stack there.
+        parts: of the shape of `rows`, int32, their parts, or −1.
+        sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
+        places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.
         left: () int32, number of breaks left out for want of room.
     """
 
     rows: Array
     parts: Array
+    sides: Array
+    places: Array
     place: Array
     gap: Array
     points: Array
@@ -95,24 +102,17 @@ class _Found(NamedTuple):
     left: Array
 
     @staticmethod
-    def specs(most: int, size: tuple[int, int], real: Any) -> list[ArraySpec]:
+    def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
         """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
-        integers, ends = np.int32, 2 * most
-        breaks = [ArraySpec((most, 6), integers, packed=True)] * 2
+        integers, ends, (columns, entries, of_sides) = np.int32, 2 * most, _columns(layers)
+        breaks = [ArraySpec((most, columns), integers, packed=True)] * 2
+        breaks += [ArraySpec((most, 2, of_sides), integers, packed=True), ArraySpec((most, entries), real, packed=True)]
         breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
         breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
         breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
         segments = [ArraySpec((ends, 2), integers, packed=True)] * 4
         segments += [ArraySpec((ends, 2), real, packed=True), ArraySpec((ends, 4), real, packed=True)]
         return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
-
-
-def _triangles_tell(part: CheckedPart, sampler: Sampler) -> bool:
-    """True for a part whose samples are where its triangles say."""
-    surface = part.surface
-    if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
-        return False
-    return not (surface.refines and surface.refine_moves)
 
 
 def _found_on_host(
@@ -135,14 +135,29 @@ def _found_on_host(
             arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
         return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
 
+    layers = sampled.row.shape[0]
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
-    specs = _Found.specs(most or 0, grid.size, _real(scene))
+    specs = _Found.specs(most or 0, grid.size, _real(scene), layers)
     for x in (x for own in owners for x in own.values()):
         dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
-        specs.append(ArraySpec((6 * (most or 0), *x.shape[1:]), dtype, packed=True))
+        specs.append(ArraySpec((_columns(layers)[0] * (most or 0), *x.shape[1:]), dtype, packed=True))
     results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
     found = _Found(*(next(results) for _ in _Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
+
+
+def _columns(layers: int) -> tuple[int, int, int]:
+    """The numbers of samples of a break, of those of its stack, and of layers on each side; see `_Found`."""
+    return (6, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)
+
+
+def _stacks(found: _Found, rows: Array) -> dict[str, Array]:
+    """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
+    xp, shape, there = namespace(rows), found.sides.shape, found.sides >= 0
+    first = engine_of(rows).constant(np.arange(shape[0], dtype=np.int32) * rows.shape[1], rows)[:, None, None]
+    at = xp.reshape(xp.where(there, first + found.sides, 0), (-1,))
+    stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, found.places))
+    return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
 
 
 def _real(scene: Scene) -> Any:
@@ -183,14 +198,14 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
 def _at_centres(
     row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
 ) -> Fronts:
-    """The fronts (H, W) of a sampled scene: its `row` and `depth`, and the triangles of each part's samples."""
-    row, counts = row[0], [own.ids.shape[-2] for own in samples]
+    """What is seen at centres (K, H, W): the `row` and `depth` of a scene, and the triangles of its parts' samples."""
+    counts = [own.ids.shape[-2] for own in samples]
     none = [np.full(count, -1, np.int32) for count in counts]
     of_samples = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
     part = np.where(row >= 0, np.int32(0), np.int32(-1))
     for first in np.cumsum(counts)[:-1]:
         part += row >= first
-    return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth[0].astype(np.float64))
+    return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth.astype(np.float64))
 
 
 def _known(x: Array) -> np.ndarray:
@@ -217,49 +232,78 @@ class _Points:
             if isinstance(sampler, TriangleSampler):
                 host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
                 entry = _entry(part, sampler, entry, host, grid.size)
-                if _triangles_tell(part, sampler):
+                if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
 
-    def found(self, fronts: Fronts, most: int | None = None) -> tuple[_Found, list[Samples]]:
-        """Outlines between the fronts (H, W) at centres, of at most `most` breaks; each part's samples beside them."""
-        breaks = self.breaks(fronts)
+    def found(self, layers: Fronts, most: int | None = None) -> tuple[_Found, list[Samples]]:
+        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; each part's samples there."""
+        breaks, parts, points, triangles, sides = self.breaks(layers)
         left = 0 if most is None else max(0, len(breaks.gap) - most)
         if left:
             breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-        # For each break the two last samples, the two that tell colours, and a pair on the ray of one of the first.
-        ending = np.column_stack([breaks.near == 0, breaks.near == 1])
-        pair = np.where(ending.any(1), np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]), -1)
-        parts = np.concatenate([breaks.parts, breaks.parts, pair[:, None], pair[:, None]], axis=1)
-        every, rows = np.concatenate([breaks.points, breaks.inner], 1), np.full(parts.shape, -1, np.int32)
-        samples = []
+            parts, points, triangles, sides = (x[:most] for x in (parts, points, triangles, sides))
+        samples, rows = [], np.full(parts.shape, -1, np.int32)
         for part in range(len(self._parts)):
-            asked, paired = parts[:, :4] == part, np.flatnonzero(pair == part)
-            own = [self.sample(part, every[asked], breaks.triangles[asked])]
-            rows[:, :4][asked], count = _known(own[0].row)[0, 0], own[0].ids.shape[-2]
-            # Triangles have no kinks within.
-            if not isinstance(self._parts[part][0], TriangleSampler):
-                own.append(self.sample(part, breaks.points[paired, breaks.near[paired]], exits=True))
-                exits = own[1].exit
-                if exits is not None and len(exits) == 2:
-                    found = _known(exits)[:, 0].T
-                    rows[paired, 4:] = np.where(found >= 0, found + count, -1)
-            samples.append(in_one_table(own))
+            asked = parts == part
+            samples.append(self.sample(part, points[asked], triangles[asked]))
+            rows[asked] = _known(samples[-1].row)[0, 0]
+        if len(layers.part) == 1:
+            pairs, of_pairs = self._pairs(breaks, samples)
+            rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
         along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
         first = breaks.gap[:, 1::-1] + 0.5
         place = ((breaks.place - first) * along).sum(-1)
-        points = ((breaks.points - first[:, None]) * along[:, None]).sum(-1)
-        own = breaks.gap, points, breaks.near, breaks.slope, breaks.ends
-        found = _Found(rows, parts, place, *own, *joined(breaks), breaks.joined, np.int32(left))
+        places = ((points - first[:, None]) * along[:, None]).sum(-1)
+        entries = places[:, 2:] if len(layers.part) > 1 else places[:, :0]
+        own = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
+        segments = joined(breaks, len(layers.part) > 1)
+        found = _Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
         return found, samples
 
-    def breaks(self, fronts: Fronts) -> Breaks:
-        """The breaks between the fronts (H, W) at centres."""
+    def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
+
+        They are added to the samples of parts. Triangles have no kinks within, and no pairs.
+        """
+        part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
+        rows = np.full((len(part), 2), -1, np.int32)
+        for own, known in enumerate(self._parts):
+            at = np.flatnonzero(part == own)
+            if isinstance(known[0], TriangleSampler):
+                continue
+            more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
+            if more.exit is not None and len(more.exit) == 2:
+                found = _known(more.exit)[:, 0].T
+                rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
+            samples[own] = in_one_table([samples[own], more])
+        return rows, np.column_stack([part, part]).astype(np.int32)
+
+    def breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The breaks between what is seen at centres (K, H, W), and the samples that they need.
+
+        Returns:
+            Breaks; parts (B, R), points (B, R, 2) and triangles (B, R) of samples, and `_Found.sides`.
+        """
         sheets = [own for *_, own in self._parts if own is not None]
+        if len(layers.part) > 1:
+            opaque = np.array(self._scene.opaque)
+            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
+            parts = np.concatenate([stacks.last, stacks.parts], 1)
+            points = np.concatenate([breaks.points, stacks.points], 1)
+            return breaks, parts, points, np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1), stacks.sides
+        fronts = Fronts(*(x[0] for x in layers))
         if len(sheets) == len(self._parts):
-            return breaks_of_triangles(fronts, sheets, self._width)
-        return find_breaks(fronts, Oracle(self._fronts, self._width))
+            breaks = breaks_of_triangles(fronts, sheets, self._width)
+        else:
+            breaks = find_breaks(fronts, Oracle(self._fronts, self._width))
+        # For each break the two last samples, and the two that tell colours.
+        parts, points = (
+            np.concatenate([breaks.parts, breaks.parts], 1),
+            np.concatenate([breaks.points, breaks.inner], 1),
+        )
+        return breaks, parts, points, breaks.triangles, np.empty((len(parts), 2, 0), np.int32)
 
     def sample(
         self, part: int, points: np.ndarray, triangles: np.ndarray | None = None, exits: bool = False
@@ -286,6 +330,15 @@ class _Points:
             nearer = seen & (z < depth)
             part[nearer], depth[nearer] = index, z[nearer]
         return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
+
+
+def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
+    """What is seen at centres (K, H, W), without what lies behind an opaque layer."""
+    part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
+    for own in part:
+        own[hidden] = -1
+        hidden |= (own >= 0) & opaque[own]
+    return layers._replace(part=part)
 
 
 class _OnTriangles(TriangleSampler):

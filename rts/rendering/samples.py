@@ -92,6 +92,7 @@ def sampled_scene(
 
     See `sample`. With `settles`, samples of cells whose colour cannot change may be left out.
     """
+    settings = settings.of(scene.fronts_suffice)
     hidden, side = scene.hidden_by(settings.splatter, settles), settings.side
     if side is not None:
         return _on_one_grid(scene, camera, size, settings, side, hidden)

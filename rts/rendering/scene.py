@@ -11,9 +11,11 @@ from rts.arrays.trees import Tree
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
 from rts.contracts.splatter import Splatter
+from rts.contracts.surface import TriangleSurface
 from rts.sampling.auto import Auto
 from rts.sampling.hidden import HiddenRule, hidden_by
 from rts.sampling.prepared import Prepared
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.sampling.winding import warn_of_winding
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -48,6 +50,11 @@ class Scene(NamedTuple):
     def opaque(self) -> list[bool]:
         """For each part, whether its shader promises to be opaque."""
         return [bool(part.shader.opaque) for part in self.parts]
+
+    @property
+    def fronts_suffice(self) -> bool:
+        """True if outlines are found between fronts alone: parts are opaque, or samples leave their triangles."""
+        return all(self.opaque) or not all(map(has_sheets, self.parts, self.chosen()))
 
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | Prepared, camera: Camera, sampler: Any, engine: str | None) -> Scene:
@@ -85,6 +92,14 @@ class Scene(NamedTuple):
         """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""
         context = context_of_scene(self.parts, self.camera, *others)
         return context if context.engine.differentiates else self.context
+
+
+def has_sheets(part: CheckedPart, sampler: Sampler) -> bool:
+    """True if all samples of a part lie on triangles, which tell where its outlines are."""
+    surface = part.surface
+    if not (isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface)):
+        return False
+    return not (surface.refines and surface.refine_moves)
 
 
 class Grid(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from rts.contracts.checks import check_size, check_splatter
@@ -61,9 +61,18 @@ class RenderSettings:
                 f"supersample is {supersample!r}, and splatter {name_of('rts.splatters', splatter)!r} finds outlines "
                 f"without further samples; give 1, or a number of samples along each side of a pixel"
             )
-        if splatter.layers is not None:  # More would not be read.
-            layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))
-        return size, cls(splatter, layers if layers == "auto" else int(layers), supersample, capacity)
+        settings = cls(splatter, layers if layers == "auto" else int(layers), supersample, capacity)
+        return size, settings._of_most(splatter.layers)
+
+    def of(self, fronts_suffice: bool) -> RenderSettings:
+        """The settings for a scene; `fronts_suffice` is `Scene.fronts_suffice`."""
+        return self._of_most(self.splatter.opaque_layers) if self.splatter and fronts_suffice else self
+
+    def _of_most(self, most: int | None) -> RenderSettings:
+        """The settings with no more layers than are read; None for all."""
+        if most is None:
+            return self
+        return replace(self, layers=most if self.layers == "auto" else min(most, int(self.layers)))
 
     @property
     def side(self) -> int | None:

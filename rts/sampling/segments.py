@@ -30,16 +30,20 @@ class Segments(NamedTuple):
     pull: np.ndarray
 
 
-def joined(breaks: Breaks) -> Segments:
-    """The segments between breaks on the sides of squares of four centres."""
+def joined(breaks: Breaks, layered: bool = False) -> Segments:
+    """The segments between breaks on the sides of squares of four centres.
+
+    Outlines of one part do not cross. With `layered`, those of different parts may, since light passes through them.
+    """
     from rts.sampling import segments_loops as loops
 
     height, width = breaks.joined.shape[1:]
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, height, width)
-    # By squares; in each of them clockwise.
-    order = np.lexsort((along, square))
+    # By squares; in each of them clockwise, part by part if outlines may cross.
+    group = square * (1 + breaks.parts.max(initial=0)) + ends[:, 3] if layered else square
+    order = np.lexsort((along, group))
     square, ends = square[order], ends[order]
-    begins = np.append(np.flatnonzero(np.diff(square, prepend=-1)), len(square))
+    begins = np.append(np.flatnonzero(np.diff(group[order], prepend=-1)), len(square))
     partner = np.full(len(square), -1, np.int32)
     loops.join(begins, ends, breaks.place, breaks.tangent, partner)
     origin, ties, side = loops.segments_of(square, ends, partner, width)

@@ -43,14 +43,14 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along = np.column_stack([gap[:, 2], 1 - gap[:, 2]])[:, None, :]
     points = gap[:, None, 1::-1] + 0.5 + numbers[:, :, None] * along
-    slope = _slopes(whole, points[:, 0], sheets)
-    near = _crossings(whole, slope, fronts, gap, width)
+    slope = slopes_at(whole[:, 1], whole[:, 2:4], whole[:, 4:6], points[:, 0], sheets)
+    near = flat_apart(whole[:, 1], slope, fronts.depth, gap, width)
     slope[near < 2] = 0
     triangles = whole[:, [4, 5, 6, 7]]
     triangles[np.tile(whole[:, 2:4] < 0, 2)] = -1
     ends, parts = whole[:, 8:] == 1, whole[:, 2:4]
     own = points[:, 0], near, slope, ends, points[:, 1:3], points[:, 3:], parts, joined, triangles
-    return Breaks(gap, *own, _tangents(whole, near, slope, points[:, 0], sheets))
+    return Breaks(gap, *own, tangents(near, slope, parts, whole[:, 4:6], points[:, 0], sheets))
 
 
 def _breaks_in(
@@ -61,7 +61,7 @@ def _breaks_in(
 
     gaps = Gaps.of(marks)
     gap, count = gaps.gap, len(gaps.gap)
-    names, spans, parts = _spans(gaps, sheets)
+    names, spans, parts = spans_on(gaps, sheets)
     ends, depth = np.empty((count, 2, 2), np.int32), np.empty((count, 2))
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
@@ -79,7 +79,7 @@ def _breaks_in(
     return gap[whole[:, 0]], whole, numbers[found]
 
 
-def _spans(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spans of all parts on gaps, and their parts (N,) int32; see `Sheets.spans`."""
     several = [own.spans(gaps) for own in sheets]
     parts = np.repeat(np.arange(len(several), dtype=np.int32), [len(names) for names, _ in several])
@@ -87,26 +87,39 @@ def _spans(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray
     return names, spans, parts
 
 
-def _slopes(whole: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]) -> np.ndarray:
-    """(B, 2, 2) slopes of depth of the surfaces that cross at breaks; 0 elsewhere."""
-    slopes = np.zeros((len(whole), 2, 2))
+def slopes_at(
+    near: np.ndarray, parts: np.ndarray, triangles: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]
+) -> np.ndarray:
+    """(B, 2, 2) slopes of depth of the surfaces that cross at breaks; 0 elsewhere.
+
+    `near` (B,) is 2 where surfaces cross; `parts` and `triangles` (B, 2) are before and behind; `points` (B, 2).
+    """
+    slopes = np.zeros((len(near), 2, 2))
     for part, own in enumerate(sheets):
         for side in (0, 1):
-            at = np.flatnonzero((whole[:, 1] == 2) & (whole[:, 2 + side] == part))
+            at = np.flatnonzero((near == 2) & (parts[:, side] == part))
             if len(at):
-                _, slopes[at, side] = own.at(whole[at, 4 + side], points[at])
+                _, slopes[at, side] = own.at(triangles[at, side], points[at])
     return slopes
 
 
-def _tangents(
-    whole: np.ndarray, near: np.ndarray, slope: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]
+def tangents(
+    near: np.ndarray,
+    slope: np.ndarray,
+    parts: np.ndarray,
+    triangles: np.ndarray,
+    points: np.ndarray,
+    sheets: Sequence[Sheets],
 ) -> np.ndarray:
-    """`Breaks.tangent`: along the edge of the triangle that ends there, or the line where two planes cross."""
+    """`Breaks.tangent`: along the edge of the triangle that ends there, or the line where two planes cross.
+
+    Arguments as of `slopes_at`.
+    """
     apart = slope[:, 1] - slope[:, 0]
     found = np.column_stack([apart[:, 1], -apart[:, 0]])
     side = np.where(near == 1, 1, 0)
-    index = np.arange(len(whole))
-    part, triangle = whole[index, 2 + side], whole[index, 4 + side]
+    index = np.arange(len(near))
+    part, triangle = parts[index, side], triangles[index, side]
     for own, sheet in enumerate(sheets):
         at = np.flatnonzero((near < 2) & (part == own))
         found[at] = sheet.along(triangle[at], points[at])
@@ -114,8 +127,18 @@ def _tangents(
     return found / np.where(length > 0, length, 1.0)[:, None]
 
 
-def _crossings(whole: np.ndarray, slope: np.ndarray, fronts: Fronts, gap: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """`Breaks.near`, where surfaces that hardly differ in slope are not said to cross."""
-    cell = width[0] + width[1] * fronts.depth[gap[:, 0], gap[:, 1]]
+def flat_apart(
+    near: np.ndarray, slope: np.ndarray, depth: np.ndarray, gap: np.ndarray, width: np.ndarray
+) -> np.ndarray:
+    """`Breaks.near`, where surfaces that hardly differ in slope are not said to cross.
+
+    Args:
+        near: (B,) int32.
+        slope: (B, 2, 2).
+        depth: (H, W), of the fronts at centres.
+        gap: (B, 3).
+        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+    """
+    cell = width[0] + width[1] * depth[gap[:, 0], gap[:, 1]]
     flat = ~(np.abs(slope[:, 1] - slope[:, 0]).sum(-1) > 1e-4 * cell)
-    return np.where((whole[:, 1] == 2) & flat, 0, whole[:, 1]).astype(np.int32)
+    return np.where((near == 2) & flat, 0, near).astype(np.int32)

@@ -53,7 +53,8 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
     alpha, row = value_of(splats.rgba[:, -1]), value_of(splats.row)
     if alpha is None or row is None or not len(alpha):
         return
-    if not promised(splatter, "translucent"):
+    fronts_alone = splats.outlines is not None and row.shape[0] == 1
+    if fronts_alone or not promised(splatter, "translucent"):
         if alpha.min() < 1 - LOST:
             warn(
                 f"samples are translucent, and {splatter!r} leaves out some of the light that passes through them; "

@@ -13,11 +13,14 @@
 
 Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative,
 and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the flux, J are constants.
+
+Where light passes through, C and the colours on both sides of a break are composites of all layers there: see
+`rts.splatting.edges_stacks`.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,18 +31,27 @@ from rts.contracts.records import ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
 from rts.splatting import edges_weights
+from rts.splatting.edges_stacks import CELLS, Operands
 from rts.splatting.edges_weights import BORDER
 from rts.splatting.layers import check_rows, nothing, unpack
+
+FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
+"""The fields of outlines that the operation takes: those of one layer."""
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
 
 class Edges(SummingSplatter):
-    """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque."""
+    """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque.
 
-    layers = 1
+    Where light passes through, layers are composited, and each outline that is seen moves with its own layer; see
+    `rts.splatting.edges_stacks`.
+    """
+
+    opaque_layers = 1
     reads = frozenset({"outlines"})
+    translucent = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
@@ -49,12 +61,16 @@ class Edges(SummingSplatter):
         check_rows(row, rgba.shape[0])
         outlines = splats.outlines
         if outlines is None:
-            color, motion = _on_cells(positions, rgba, row[0, ...])
-            return color - _inside(color, motion - stopped(motion), _all_joined(row[0, ...] >= 0))
+            return _without_outlines(splats)
         check_rows(outlines.rows, rgba.shape[0], "outlines.rows")
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
         check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
-        return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, field.name) for field in fields(Outlines)))
+        if outlines.stack is None:
+            return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, name) for name in FIELDS))
+        check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
+        own = Operands.of(splats, outlines)
+        image = EDGES(own.positions, own.rgba, own.row, *(getattr(own.outlines, name) for name in FIELDS))
+        return image + own.motion
 
     def normal_equations(
         self,
@@ -66,7 +82,7 @@ class Edges(SummingSplatter):
         background: Array | None = None,
         loss: Any = None,
     ) -> tuple[Array, Array, Array] | None:
-        """See `rts.SummingSplatter`; None without outlines, and for arrays that are not on the host."""
+        """See `rts.SummingSplatter`; None without outlines, where light passes through, and off the host."""
         outlines, engine = splats.outlines, engine_of(splats.positions)
         own = (
             splats.positions,
@@ -80,18 +96,25 @@ class Edges(SummingSplatter):
             background,
         )
         operands = collected(own)
-        if outlines is None or splats.rgba.shape[0] == 0 or not engine.on_host(*operands):
+        if outlines is None or outlines.stack is not None or splats.rgba.shape[0] == 0 or not engine.on_host(*operands):
             return None
 
         def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(arrays)
             positions, rgba, row, found, *tangents_and_fields = map_leaves(lambda _: next(it), own)
-            known = positions, rgba, row, *(getattr(found, field.name) for field in fields(Outlines))
+            known = positions, rgba, row, *(getattr(found, name) for name in FIELDS)
             return edges_weights.normal_equations(known, tuple(tangents_and_fields), splats.border, loss)
 
         count, dtype = t_positions.shape[0], np.float64 if floating_bits(splats.positions) == 64 else np.float32
         specs = ArraySpec((), dtype), ArraySpec((count, count), dtype), ArraySpec((count,), dtype)
         return engine.call_host(host, specs, *operands)
+
+
+def _without_outlines(splats: Splats) -> Array:
+    """The image (H, W, 4) as if all cells showed one surface, or stacks of the same layers."""
+    row = splats.row[:1, ...] if splats.opaque else splats.row
+    cells = CELLS(splats.positions, splats.rgba, row, _all_joined(row[0, ...] >= 0))
+    return cells[..., :4] + (cells[..., 4:] - stopped(cells[..., 4:]))
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:

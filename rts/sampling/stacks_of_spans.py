@@ -1,0 +1,120 @@
+"""Breaks between stacks of layers that let light through: where a layer that is seen ends, or two cross.
+
+As `rts.sampling.spans`, of all layers that are seen in place of the fronts alone. Each change of the stack along a gap
+is a break of its own, which moves with the one layer that ends there, or with the two that cross.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.compiling.threads import parallel
+from rts.sampling.gaps import INNER, Breaks, Fronts
+from rts.sampling.sheets import Gaps, Sheets
+from rts.sampling.spans import flat_apart, slopes_at, spans_on, tangents
+
+
+class Stacks(NamedTuple):
+    """The stacks beside breaks. Host arrays.
+
+    Attributes:
+        last: (B, 2) int32, the parts of the last samples before and behind each break; −1 on sides that do not move it.
+        parts: (B, K + 1) int32, the parts of the layers at each break, front to back, or −1.
+        triangles: (B, K + 1) int32, their triangles.
+        points: (B, K + 1, 2) float64, x and y of their samples.
+        sides: (B, 2, K) int32, the stacks before and behind each break, as indices of these samples, or −1.
+    """
+
+    last: np.ndarray
+    parts: np.ndarray
+    triangles: np.ndarray
+    points: np.ndarray
+    sides: np.ndarray
+
+
+def breaks_of_stacks(
+    layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray
+) -> tuple[Breaks, Stacks]:
+    """The breaks between the stacks at the centres of all cells, and the layers there.
+
+    Args:
+        layers: what is seen at centres, arrays (K, H, W), front to back; nothing behind an opaque layer.
+        opaque: (P,) bool, the parts that let no light through.
+        sheets: the triangles of each part.
+        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
+    """
+    gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
+    whole, place, samples, places, sides = _changes(gaps, layers, opaque, sheets)
+    gap, near = gaps.gap[whole[:, 0]], whole[:, 1]
+    joined = np.zeros((2, *layers.part.shape[1:]), np.bool_)
+    inside, part = layers.part[0] >= 0, layers.part
+    joined[0, :, :-1] = inside[:, 1:] & (part[:, :, 1:] == part[:, :, :-1]).all(0)
+    joined[1, :-1] = inside[1:] & (part[:, 1:] == part[:, :-1]).all(0)
+    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
+    along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
+    at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
+    slope = slopes_at(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets)
+    near = flat_apart(near, slope, layers.depth[0], gap, width)
+    slope[near < 2] = 0
+    tangent = tangents(near, slope, samples[:, :2, 0], samples[:, :2, 1], at, sheets)
+    last, stack = samples[:, :2], samples[:, 2:]
+    triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
+    ends, own = whole[:, 4:] == 1, (points[:, :2], points[:, :2], whole[:, 2:4])
+    breaks = Breaks(gap, at, near, slope, ends, *own, joined, triangles, tangent)
+    return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides)
+
+
+def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray) -> np.ndarray:
+    """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer."""
+    from rts.sampling import spans_loops
+
+    solid = (layers.part >= 0) & opaque[layers.part]
+    nearest = np.argmax(solid, axis=0)[None]
+    ends = Fronts(*(np.take_along_axis(x, nearest, axis=0)[0] for x in layers))
+    ends = ends._replace(part=np.where(solid.any(0), ends.part, np.int32(-1)))
+    met, marks = np.zeros((2, *ends.part.shape), np.uint8), False
+    for own in sheets:
+        own.meet(ends, width, met)
+    for layer in range(len(layers.part)):
+        front = Fronts(*(np.ascontiguousarray(x[layer]) for x in layers))
+        if layer and not (front.part >= 0).any():
+            break
+        joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
+        for part, own in enumerate(sheets):
+            own.join(part, front, met, joined)
+        parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=2 * front.part.size)
+        marks = marks | wanted
+    return np.asarray(marks)
+
+
+def _changes(
+    gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The changes of stacks along gaps; see `stacks_of_spans_loops.changes`."""
+    from rts.sampling import spans_loops
+    from rts.sampling import stacks_of_spans_loops as loops
+
+    gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
+    names, spans, parts = spans_on(gaps, sheets)
+    seen, depth = np.empty((count, 2, most), np.int32), np.empty((count, 2, most))
+    for k in (0, 1):
+        y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
+        seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
+    begins, order = spans_loops.by_gap(names[:, 0], count)
+    counts, at = np.zeros(count, np.int32), np.zeros(count, np.int64)
+
+    def filled(total: int) -> tuple[np.ndarray, ...]:
+        size = most + 3
+        numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
+        return np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
+
+    known = begins, order, spans, names, parts, opaque, seen, depth, counts
+    parallel(loops.changes, count, *known, at, False, INNER, *filled(0), work=300 * count)
+    at = np.cumsum(counts) - counts
+    result = filled(int(counts.sum()))
+    parallel(loops.changes, count, *known, at, True, INNER, *result, work=300 * count)
+    whole, place, samples, places, sides = result
+    return whole, place, samples, places, sides

@@ -1,0 +1,409 @@
+"""The stacks of layers along gaps, from spans, and the places where they change. Compiled.
+
+A *run* is a surface along a gap: spans that follow one another, end to start. A sheet that turns away ends there, as
+the back does that it turns into. The stack at a place is the runs there, front to back. It changes where a run starts
+or ends, and where two runs pass through one another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+from rts.sampling.spans_loops import ALIKE, LAST, MARGIN, SHORT, TINY, TOUCH
+
+CLOSE = 1e-5
+"""Distance from a centre, in cells, within which the sample there decides on which side of it a run ends."""
+
+SAME = 1e-4
+"""Share of the depth by which a sample at a centre may differ from the run that it lies on."""
+
+
+@compiled
+def _z(spans, i, place):
+    return (spans[i, 2] + spans[i, 3] * place) / (spans[i, 4] + spans[i, 5] * place)
+
+
+@compiled
+def _alike(spans, i, j, place):
+    """True if two spans have about one depth at a place."""
+    z = _z(spans, i, place)
+    return abs(_z(spans, j, place) - z) <= ALIKE * abs(z)
+
+
+@compiled
+def _link(own, spans, parts, low, high, after, before):
+    """Fill `after` and `before` (n,), in the order of `own`: the span that each one goes on with, or −1."""
+    n = len(own)
+    after[:n], before[:n] = -1, -1
+    for i in range(n):
+        for j in range(n):
+            if i == j or before[j] >= 0 or parts[own[i]] != parts[own[j]] or not high[j] > high[i]:
+                continue
+            if abs(low[j] - high[i]) <= TOUCH and _alike(spans, own[i], own[j], high[i]):
+                after[i], before[j] = j, i
+                break
+
+
+@compiled
+def _listed(part, z, seen, depth, g, k):
+    """1 if the samples at a centre hold one of a part at a depth; −1 if they hide it; else 0."""
+    for layer in range(seen.shape[2]):
+        if seen[g, k, layer] < 0:
+            return 0
+        if seen[g, k, layer] == part and abs(depth[g, k, layer] - z) <= SAME * abs(z):
+            return 1
+    # Behind all that is listed, where the list is full.
+    return -1 if z > depth[g, k, seen.shape[2] - 1] else 0
+
+
+@compiled
+def _hides(opaque, z, seen, depth, g, k):
+    """True if a sample at a centre hides what lies at a depth."""
+    for layer in range(seen.shape[2]):
+        if seen[g, k, layer] >= 0 and opaque[seen[g, k, layer]] and depth[g, k, layer] < z:
+            return True
+    return False
+
+
+@compiled
+def _settle(head, tail, own, spans, parts, opaque, seen, depth, g, after, low, high):
+    """Move the ends of a run that lie at a centre to the side that the samples there say; True if the run is real.
+
+    A run that covers a centre with no sample there touches the line with an edge alone.
+    """
+    part = parts[own[head]]
+    for k in range(2):
+        centre = float(k)
+        start, end = low[head], high[tail]
+        if start > centre + CLOSE or end < centre - CLOSE:
+            continue
+        i = head
+        while high[i] < centre and after[i] >= 0:
+            i = after[i]
+        z = _z(spans, own[i], centre)
+        found = _listed(part, z, seen, depth, g, k)
+        if start < centre - CLOSE and end > centre + CLOSE:
+            if found == 0 and not _hides(opaque, z, seen, depth, g, k):
+                return False
+            continue
+        if abs(start - centre) <= CLOSE:
+            if k == 0:
+                low[head] = -1.0 if found != 0 else max(start, TINY)
+            else:
+                low[head] = min(start, 1 - TINY) if found != 0 else 2.0
+        if abs(end - centre) <= CLOSE:
+            if k == 0:
+                high[tail] = max(end, TINY) if found != 0 else -1.0
+            else:
+                high[tail] = 2.0 if found != 0 else min(end, 1 - TINY)
+    return True
+
+
+@compiled
+def _before(spans, i, j, place, until):
+    """True if a span lies before another at a place; if they meet there, farther on."""
+    a, b = _z(spans, i, place), _z(spans, j, place)
+    if abs(a - b) > ALIKE * abs(a):
+        return a < b
+    return _z(spans, i, until) < _z(spans, j, until)
+
+
+@compiled
+def _insert(stack, count, i, own, spans, place, until):
+    """Insert a span into a stack by depth; returns its index."""
+    at = count
+    while at > 0 and _before(spans, own[i], own[stack[at - 1]], place, until):
+        stack[at] = stack[at - 1]
+        at -= 1
+    stack[at] = i
+    return at
+
+
+@compiled
+def _remove(stack, count, at):
+    """Remove an entry of a stack."""
+    for m in range(at, count - 1):
+        stack[m] = stack[m + 1]
+
+
+@compiled
+def _seen(stack, at, most, own, parts, opaque):
+    """True if an entry of a stack is among the first, and nothing opaque is before it."""
+    if at >= most:
+        return False
+    for m in range(at):
+        if opaque[parts[own[stack[m]]]]:
+            return False
+    return True
+
+
+@compiled
+def _partner(i, own, parts, place, ends, neighbour):
+    """Another run of the same part that ends (or starts) where one does: a sheet turns away there; or −1.
+
+    Their depths differ where triangles in between are seen from the side.
+
+    Args:
+        i: the span with which the run ends.
+        own: the gap's spans.
+        parts: (N,).
+        place: where it ends.
+        ends: (n,), where spans end (or start).
+        neighbour: (n,), what they go on with there, or −1.
+    """
+    for j in range(len(own)):
+        if j != i and neighbour[j] < 0 and parts[own[j]] == parts[own[i]] and abs(ends[j] - place) <= TOUCH:
+            return j
+    return -1
+
+
+@compiled
+def _meeting(spans, i, j, low, high):
+    """Where two spans have one depth, between two places at which their order differs."""
+    wide = (spans[i, 4] + spans[i, 5] * low) * (spans[j, 4] + spans[j, 5] * low)
+    far = (spans[i, 4] + spans[i, 5] * high) * (spans[j, 4] + spans[j, 5] * high)
+    before = max(_z(spans, j, low) - _z(spans, i, low), 0.0) * wide
+    after = min(_z(spans, j, high) - _z(spans, i, high), 0.0) * far
+    return low + (high - low) * before / (before - after) if before - after > 0 else low
+
+
+@compiled
+def _next_meeting(stack, count, own, spans, place, until):
+    """The next place at which two neighbours in a stack pass through one another, and the first's index; or −1."""
+    best, at = np.inf, -1
+    for m in range(count - 1):
+        i, j = own[stack[m]], own[stack[m + 1]]
+        z = _z(spans, i, until)
+        if _z(spans, j, until) < z - MARGIN * abs(z):
+            there = _meeting(spans, i, j, place, until)
+            if there < best:
+                best, at = there, m
+    return best, at
+
+
+@compiled
+def _record(e, kind, at, partner, place, stack, count, own, spans, names, parts, opaque, result):
+    """Fill in a change of the stack, but for the samples of what ends there; see `changes`."""
+    whole, place_of, samples, places, sides = result
+    most, entries = sides.shape[2], samples.shape[1] - 2
+    whole[e, 1], place_of[e] = kind, place
+    samples[e], sides[e] = -1, -1
+    places[e] = place
+    n = 0
+    for m in range(count):
+        i = stack[m]
+        if n == entries:
+            break
+        samples[e, 2 + n, 0], samples[e, 2 + n, 1] = parts[own[i]], names[own[i], 1]
+        places[e, 2 + n] = min(max(place, spans[own[i], 0]), spans[own[i], 1])
+        n += 1
+        if opaque[parts[own[i]]] and not (kind < 2 and (m == at or m == partner)) and m > (at if kind == 2 else -1):
+            break
+    for side in range(2):
+        k, whole[e, 2 + side] = 0, -1
+        for m in range(n):
+            here = m
+            if kind == 2 and side == 1 and (m == at or m == at + 1) and at + 1 < n:
+                here = 2 * at + 1 - m
+            if kind == 1 - side and (m == at or m == partner):
+                continue
+            if k == most:
+                break
+            sides[e, side, k] = here
+            k += 1
+            if opaque[samples[e, 2 + here, 0]]:
+                break
+    # The surface that changes, and what is behind it: parts before and behind the break.
+    if kind == 2:
+        whole[e, 2], whole[e, 3] = parts[own[stack[at]]], parts[own[stack[at + 1]]]
+    else:
+        whole[e, 2 + kind] = parts[own[stack[at]]]
+        k = sides[e, 1 - kind, at] if at < most else -1
+        whole[e, 3 - kind] = samples[e, 2 + k, 0] if k >= 0 else -1
+
+
+@loop
+def changes(
+    first, last, begins, order, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
+    samples, places, sides,
+):  # fmt: skip
+    """Count the changes of stacks along gaps, or fill them in, in order.
+
+    Only those that are seen count: not behind an opaque layer, nor behind the first K.
+
+    Args:
+        first: the first gap.
+        last: the gap after the last.
+        begins: (M + 1,) and
+        order: (N,), the result of `spans_loops.by_gap`.
+        spans: (N, 6), see `spans_loops.spans_of`.
+        names: (N, 2) gap and triangle.
+        parts: (N,) int32.
+        opaque: bool, for each part.
+        seen: (M, 2, K) int32, the parts of the samples at both centres; −1 where there are no more.
+        depth: (M, 2, K) float64, their depths.
+        counts: (M,) int32, numbers of changes; to fill if they are counted.
+        at: (M,) where the changes of each gap begin; used if
+        fill: True to fill in what follows, False to count.
+        inner: distance of the samples that tell colours of what ends.
+        whole: (E, 6) int32 to fill: gap; 0 or 1 where the surface before or behind ends, 2 where two cross; its part,
+            and the part behind it, or those that cross, as before and behind; 1 for the gap's first, and its last.
+        place_of: (E,) float64 to fill: their places.
+        samples: (E, 2 + K + 1, 2) int32 to fill: part and triangle of the last samples before and behind, or −1; then
+            of the stack there, front to back, with what starts or ends.
+        places: (E, 2 + K + 1) to fill: places of these samples.
+        sides: (E, 2, K) int32 to fill: the stacks before and behind, as indices in that stack, or −1.
+    """
+    most = seen.shape[2]
+    result = whole, place_of, samples, places, sides
+    for g in range(first, last):
+        own = order[begins[g] : begins[g + 1]]
+        n, found = len(own), 0
+        low, high = np.empty(n), np.empty(n)
+        after, before, stack = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
+        inside, live = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        enders = np.empty((counts[g] if fill else 0, 2), np.int32)
+        for i in range(n):
+            low[i], high[i] = spans[own[i], 0], spans[own[i], 1]
+        _link(own, spans, parts, low, high, after, before)
+        for i in range(n):
+            if before[i] >= 0:
+                continue
+            tail, start = i, low[i]
+            while after[tail] >= 0:
+                tail = after[tail]
+            real = high[tail] - start >= SHORT
+            real = real and _settle(i, tail, own, spans, parts, opaque, seen, depth, g, after, low, high)
+            j = i
+            while j >= 0:
+                live[j] = real
+                j = after[j]
+        knots, k = np.empty(2 * n + 1), 0
+        for i in range(n):
+            for place in (low[i], high[i]):
+                if live[i] and 0 < place < 1:
+                    knots[k], k = place, k + 1
+        knots[k] = 1.0
+        knots = np.sort(knots[: k + 1])
+        count, place = 0, 0.0
+        for i in range(n):
+            if live[i] and low[i] <= 0 < high[i]:
+                _insert(stack, count, i, own, spans, 0.0, min(knots[0], high[i]))
+                inside[i], count = True, count + 1
+        for until in knots:
+            # What passes through one another up to the next knot.
+            for _ in range(n * n):
+                there, m = _next_meeting(stack, count, own, spans, place, until)
+                if m < 0:
+                    break
+                place = max(place, there)
+                if _seen(stack, m, most, own, parts, opaque):
+                    if fill:
+                        _record(
+                            at[g] + found, 2, m, -1, place, stack, count, own, spans, names, parts, opaque,
+                            result,
+                        )  # fmt: skip
+                        enders[found, 0], enders[found, 1] = stack[m], stack[m + 1]
+                    found += 1
+                stack[m], stack[m + 1] = stack[m + 1], stack[m]
+            place = until
+            if place >= 1:
+                break
+            m = 0
+            while m < count:
+                i = stack[m]
+                while high[i] <= place and after[i] >= 0:
+                    i = after[i]
+                    inside[i] = True
+                stack[m] = i
+                if high[i] > place:
+                    m += 1
+                    continue
+                other = _partner(i, own, parts, place, high, after)
+                partner = -1
+                for k in range(count):
+                    partner = k if k != m and other >= 0 and stack[k] == other else partner
+                front = m if partner < 0 else min(m, partner)
+                partner = partner if partner < 0 else max(m, partner)
+                if _seen(stack, front, most, own, parts, opaque):
+                    if fill:
+                        _record(
+                            at[g] + found, 0, front, partner, place, stack, count, own, spans, names, parts, opaque,
+                            result,
+                        )  # fmt: skip
+                        enders[found, 0], enders[found, 1] = stack[front], stack[partner] if partner >= 0 else -1
+                    found += 1
+                if partner >= 0:
+                    _remove(stack, count, partner)
+                    count -= 1
+                _remove(stack, count, front)
+                count -= 1
+                m = 0
+            farther = 1.0
+            for knot in knots:
+                if knot > place:
+                    farther = knot
+                    break
+            for i in range(n):
+                if not live[i] or inside[i] or before[i] >= 0 or low[i] > place or high[i] <= place:
+                    continue
+                front = _insert(stack, count, i, own, spans, low[i], min(farther, high[i]))
+                inside[i], count = True, count + 1
+                other, partner = _partner(i, own, parts, low[i], low, before), -1
+                if other >= 0 and live[other] and not inside[other]:
+                    partner = _insert(stack, count, other, own, spans, low[i], min(farther, high[other]))
+                    inside[other], count = True, count + 1
+                    front, partner = (front, partner) if partner > front else (partner, front + 1)
+                if _seen(stack, front, most, own, parts, opaque):
+                    if fill:
+                        _record(
+                            at[g] + found, 1, front, partner, place, stack, count, own, spans, names, parts, opaque,
+                            result,
+                        )  # fmt: skip
+                        enders[found, 0], enders[found, 1] = stack[front], stack[partner] if partner >= 0 else -1
+                    found += 1
+        if not fill:
+            counts[g] = found
+            continue
+        for f in range(found):
+            _complete(at[g], f, found, g, enders, own, spans, names, parts, after, before, inner, result)
+
+
+@compiled
+def _complete(base, f, found, g, enders, own, spans, names, parts, after, before, inner, result):
+    """Fill in the samples of what ends at a change: the last ones, and those that tell colours."""
+    whole, place_of, samples, places, sides = result
+    e, kind = base + f, whole[base + f, 1]
+    whole[e, 0], whole[e, 4], whole[e, 5] = g, f == 0, f == found - 1
+    place = place_of[e]
+    if kind == 2:
+        for side in range(2):
+            i = own[enders[f, side]]
+            samples[e, side, 0], samples[e, side, 1], places[e, side] = parts[i], names[i, 1], place
+        return
+    for n in range(2):
+        i = enders[f, n]
+        if i < 0:
+            continue
+        x = own[i]
+        if kind == 0:
+            end = min(max(place - LAST, spans[x, 0], 0.0), place)
+            beside = place_of[e - 1] if f > 0 else 0.0
+            inward = end - min(inner, max(end - beside, 0.0) / 2)
+            while spans[own[i], 0] > inward and before[i] >= 0:
+                i = before[i]
+            inward = max(inward, min(spans[own[i], 0], end))
+        else:
+            end = max(min(place + LAST, spans[x, 1], 1.0), place)
+            beside = place_of[e + 1] if f + 1 < found else 1.0
+            inward = end + min(inner, max(beside - end, 0.0) / 2)
+            while spans[own[i], 1] < inward and after[i] >= 0:
+                i = after[i]
+            inward = min(inward, max(spans[own[i], 1], end))
+        if n == 0:
+            samples[e, kind, 0], samples[e, kind, 1], places[e, kind] = parts[x], names[x, 1], end
+        for k in range(2, samples.shape[1]):
+            if samples[e, k, 0] == parts[x] and samples[e, k, 1] == names[x, 1]:
+                samples[e, k, 1], places[e, k] = names[own[i], 1], inward
+                break

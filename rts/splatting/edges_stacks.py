@@ -1,0 +1,255 @@
+"""Stacks of layers that light passes through, for the splatter of found edges.
+
+    image of a pixel  =  C − Σ_k D_k · m_k  +  what segments add, as for opaque layers
+
+    C       the composite of the cell's K layers, front to back
+    D_k     its slope where layer k alone shifts: T_k (∇c_k − ∇α_k B_k), of colour and alpha of the layer, the light T_k
+            that passes to it, and the composite B_k behind it
+    m_k     the motion of the layer's sample: 0 in value, it has the derivative
+
+At a break the one layer that ends there moves it, or the two that cross. The colours on its sides are composites of the
+stacks there. The composites are further rows of the tables of samples; so the rest is that of opaque layers.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, namespace, stopped
+from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
+from rts.contracts.records import Outlines, Splats
+from rts.operations.operation import Arrays, Operation, Some
+from rts.splatting.layers import over, unpack
+
+
+class Stack(NamedTuple):
+    """Layers front to back, in cells or beside breaks.
+
+    Attributes:
+        color: (K, ..., 4), premultiplied; 0 where there is no layer.
+        motion: (K, ..., 2), of the layers' samples; 0 where there is no layer.
+        whole: (..., 4), the composite.
+    """
+
+    color: Array
+    motion: Array
+    whole: Array
+
+    @classmethod
+    def of(cls, positions: Array, rgba: Array, rows: Array, points: Array) -> Stack:
+        """The stack of samples `rows` (K, ...), −1 for none, which were at `points` (K or 1, ..., 2)."""
+        xp, there = namespace(rgba), (rows >= 0)[..., None]
+        color = xp.where(there, unpack(rgba, rows), 0.0)
+        motion = xp.where(there, unpack(positions, rows)[..., :2] - points, 0.0)
+        return cls(color, motion, functools.reduce(lambda back, k: over(color[k, ...], back), *_from_the_back(color)))
+
+    def weights(self) -> tuple[Array, Array]:
+        """The light (K, ..., 1) that passes to each layer, and the composite (K, ..., 4) behind it; constants."""
+        color = stopped(self.color)
+        xp, count = namespace(color), color.shape[0]
+        through, behind = [xp.ones_like(color[0, ..., 3:])], [xp.zeros_like(color[0, ...])]
+        for k in range(count - 1):
+            through.append(through[-1] * (1 - color[k, ..., 3:]))
+            behind.append(over(color[count - 1 - k, ...], behind[-1]))
+        return xp.stack(through), xp.stack(behind[::-1])
+
+
+def _from_the_back(color: Array) -> tuple[range, Array]:
+    """The indices of layers (K, ..., 4) before the last, back to front, and the last."""
+    return range(color.shape[0] - 2, -1, -1), color[-1, ...]
+
+
+class Operands(NamedTuple):
+    """What takes the place of stacks in `rts.splatting.edges`: a composite for each cell, and for each side of a break.
+
+    Attributes:
+        positions: (M, 3), those of cells, which stand still, then of both sides of breaks: of the layer that ends.
+        rgba: (M, 4), the composites.
+        row: (H, W), those of cells.
+        outlines: whose samples are composites.
+        motion: (H, W, 4), to be added to the image: without value, with the derivative of motions inside.
+    """
+
+    positions: Array
+    rgba: Array
+    row: Array
+    outlines: Outlines
+    motion: Array
+
+    @classmethod
+    def of(cls, splats: Splats, outlines: Outlines) -> Operands:
+        """The operands for splats of K layers."""
+        positions, rgba, row = splats.positions, splats.rgba, splats.row
+        xp, (height, width), breaks = namespace(rgba), row.shape[1:], outlines.place.shape[0]
+        cells, sides = CELLS(positions, rgba, row, outlines.joined), _Sides.of(splats, outlines)
+        whole, motion = cells[..., :4], cells[..., 4:]
+        numbers = [_numbered(sides.front[i * breaks : (i + 1) * breaks], (height * width) + i * breaks) for i in (0, 1)]
+        rows = xp.stack(numbers, axis=-1)
+        centres = xp.reshape(_centres(row, rgba), (-1, 2))
+        if engine_of(rgba).differentiates:
+            motion = motion + sides.motion(splats)
+        return cls(
+            xp.concat([xp.concat([centres, xp.zeros_like(centres[:, :1])], axis=-1), sides.ending]),
+            xp.concat([xp.reshape(whole, (-1, 4)), sides.stack.whole]),
+            xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), 0), (height, width)),
+            replace(outlines, rows=rows, inner=rows),
+            motion,
+        )
+
+
+def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> Array:
+    """Composites (H, W, 4) of cells, and then −Σ D_k · m_k (H, W, 4), without value; (H, W, 8).
+
+    Slopes are means of the differences from and to the next cells of the same layers.
+    """
+    xp, there, cells = namespace(rgba), row >= 0, Stack.of(positions, rgba, row, _centres(row, rgba)[None, ...])
+    color, total, (through, behind) = stopped(cells.color), 0.0, cells.weights()
+    for axis in (0, 1):
+        here = (joined[axis, ...][None, ...] & there & xp.roll(there, -1, axis=2 - axis))[..., None]
+        rise = xp.where(here, xp.roll(color, -1, axis=2 - axis) - color, 0.0)
+        slope = (rise + xp.roll(rise, 1, axis=2 - axis)) / 2
+        change = through * (slope - slope[..., 3:] * behind)
+        total = total - xp.sum(change * cells.motion[..., axis, None], axis=0)
+    return xp.concat([cells.whole, total], axis=-1)
+
+
+def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
+    return *row[1:], 8
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> None:
+    from rts.splatting import edges_stacks_loops as loops
+
+    parallel(loops.cells, len(out), *operands, out, work=10 * out.size)
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    from rts.splatting import edges_stacks_loops as loops
+
+    positions, rgba, row, joined = operands
+    none = read_only(np.empty((0, 3), out.dtype))
+    t_positions, t_rgba = (none if t is None else read_only(t) for t in tangents)
+    parallel(loops.push_cells, len(out), rgba, row, joined, t_positions, t_rgba, out, work=10 * out.size)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    from rts.splatting import edges_stacks_loops as loops
+
+    positions, rgba, row, joined = operands
+    g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
+    loops.pull_cells(rgba, row, joined, read_only(g), g_positions, g_rgba)
+
+
+CELLS = Operation("rts.edges_stacks", _specification, (2, 2, 3, 3), _shape, _forward, _push, _pull, differentiable=2)
+"""(H, W, 8) of positions (N, 3), colours (N, 4), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
+
+
+def _centres(row: Array, like: Array) -> Array:
+    """Centres (H, W, 2) of the cells of `row` (K, H, W), of the engine of `like`."""
+    height, width = row.shape[1:]
+    across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return engine_of(like).constant(np.stack([across, down], axis=-1), like)
+
+
+def _numbered(row: Array, first: int) -> Array:
+    """Indices (M,) of the composites of stacks, whose fronts are `row`; −1 for none."""
+    numbers = engine_of(row).constant(np.arange(first, first + row.shape[0], dtype=np.int32), row)
+    return namespace(row).where(row >= 0, numbers, -1)
+
+
+def _on_gaps(outlines: Outlines, places: Array) -> Array:
+    """Points (B, ..., 2) at places (B, ...) along the gaps of breaks."""
+    xp, gap = namespace(places), outlines.gap
+    first, along = xp.astype(xp.stack([gap[:, 1], gap[:, 0]], axis=-1), places.dtype) + 0.5, _steps(gap, places)
+    if places.ndim == 2:
+        first, along = first[:, None, :], along[:, None, :]
+    return first + places[..., None] * along
+
+
+def _steps(gap: Array, like: Array) -> Array:
+    """Unit steps (B, 2) along gaps."""
+    xp = namespace(gap)
+    return xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), like.dtype)
+
+
+class _Sides(NamedTuple):
+    """Both sides of breaks: those before (B), then those behind.
+
+    Attributes:
+        outlines: of K layers.
+        front: (2 B,), the front of the stack there, or −1.
+        stack: (K, 2 B), the layers.
+        points: (2 B, 2), of the last samples.
+        ending: (2 B, 3), the positions of these samples; the points themselves, at depth 0, where nothing ends.
+    """
+
+    outlines: Outlines
+    front: Array
+    stack: Stack
+    points: Array
+    ending: Array
+
+    @classmethod
+    def of(cls, splats: Splats, outlines: Outlines) -> _Sides:
+        """The sides of breaks."""
+        positions, rgba, xp = splats.positions, splats.rgba, namespace(splats.rgba)
+        rows = xp.reshape(xp.permute_dims(outlines.stack, (2, 1, 0)), (splats.row.shape[0], -1))
+        points = xp.concat([_on_gaps(outlines, outlines.stack_points[:, i, :]) for i in (0, 1)])
+        stack = Stack.of(positions, rgba, rows, xp.permute_dims(points, (1, 0, 2)))
+        ends = xp.concat([outlines.rows[:, i] for i in (0, 1)])
+        points = xp.concat([_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1)])
+        still = xp.concat([points, xp.zeros_like(points[:, :1])], axis=-1)
+        at = xp.take(positions, xp.where(ends >= 0, ends, 0), axis=0)
+        return cls(outlines, rows[0, ...], stack, points, xp.where((ends >= 0)[:, None], at, still))
+
+    def motion(self, splats: Splats) -> Array:
+        """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
+
+        As `rts.splatting.edges._beside_breaks` of opaque layers, whose own part of it, of the composites and of the
+        motion of breaks, is taken off.
+        """
+        outlines, own, row = self.outlines, self.stack, splats.row
+        xp, engine, (layers, height, width) = namespace(own.whole), engine_of(own.whole), row.shape
+        gap, place, unit = outlines.gap, outlines.place, _normals(outlines)
+        along = xp.sum(unit * _steps(gap, unit), axis=-1)
+        normal, ahead = xp.concat([unit, unit]), xp.concat([-along, along])
+        first, step = gap[:, 0] * width + gap[:, 1], xp.where(gap[:, 2] == 1, 1, width)
+        cell, beyond = xp.concat([first, first + step]), xp.concat([first + step, first])
+        centre = xp.concat([_on_gaps(outlines, xp.full_like(place, i)) for i in (0, 1)])
+        rows = xp.take(xp.reshape(row, (layers, -1)), cell, axis=1)
+        here = Stack.of(splats.positions, splats.rgba, rows, centre[None, ...])
+        rise, (through, behind) = stopped(own.color - here.color), here.weights()
+        moves = xp.sum((own.motion + here.motion) / 2 * normal, axis=-1)[..., None]
+        change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
+        # What is added for the composite, as if it moved with the break.
+        with_break = xp.sum((self.ending[:, :2] - self.points) / 2 * normal, axis=-1)[:, None]
+        change = (change - stopped(own.whole - here.whole) * with_break) * ahead[:, None]
+        counts = xp.concat([outlines.ends[:, i] for i in (0, 1)]) & (self.front >= 0)
+        length = xp.clip(xp.concat([place, 1 - place]), 0.0, 1.0)
+        share = (xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0))[:, None]
+        change = xp.where(counts[:, None], change, 0.0)
+        parts, cells = xp.concat([share * change, (1 - share) * change]), xp.concat([cell, beyond])
+        return xp.reshape(engine.segment_sum(parts, cells, height * width), (height, width, -1))
+
+
+def _normals(outlines: Outlines) -> Array:
+    """Unit normals (B, 2) of outlines at breaks: the mean of their segments'; along the gap for a lone break."""
+    xp, ties, place = namespace(outlines.place), outlines.ties, _on_gaps(outlines, outlines.place)
+    engine, count = engine_of(place), place.shape[0]
+    step = _steps(outlines.gap, place)
+    ends = [xp.take(place, xp.where(ties[:, i] >= 0, ties[:, i], 0), axis=0) for i in (0, 1)]
+    way, total = ends[1] - ends[0], step * 1e-6
+    normal = xp.stack([way[:, 1], -way[:, 0]], axis=-1)
+    counts = (ties[:, 1] >= 0) & (ties[:, 0] != ties[:, 1])
+    for i in (0, 1):
+        at = xp.where(counts, ties[:, i], 0)
+        # Two segments at a line of crossing may run in opposite directions.
+        forward = xp.sum(normal * xp.take(step, at, axis=0), axis=-1) >= 0
+        turned = xp.where(counts[:, None], xp.where(forward[:, None], normal, -normal), 0.0)
+        total = total + engine.segment_sum(turned, at, count)
+    return total / xp.sqrt(xp.sum(total * total, axis=-1, keepdims=True))
