@@ -271,7 +271,7 @@ class _Points:
         rows = np.full((len(part), 2), -1, np.int32)
         for own, known in enumerate(self._parts):
             at = np.flatnonzero(part == own)
-            if isinstance(known[0], TriangleSampler):
+            if isinstance(known[0], TriangleSampler) or not len(at):
                 continue
             more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
             if more.exit is not None and len(more.exit) == 2:
