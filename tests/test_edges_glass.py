@@ -311,8 +311,9 @@ def test_of_glass_that_has_no_triangles_the_front_is_drawn_with_a_warning():
     def outside(theta, points):
         return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - theta["radius"]
 
-    theta = {"center": np.float32([12, 12, -8]), "radius": np.float32(5), "color": np.float32([1, 0, 0, 0.5])}
-    surface = rts.plugin("surfaces", "sdf")(outside)
-    part = rts.Part(surface, theta, rts.plugin("shaders", "unlit")(opaque=False))
+    theta = {"center": np.zeros(3, np.float32), "radius": np.float32(0.8), "color": np.float32([1, 0, 0, 0.5])}
+    part = rts.Part(rts.Sdf(outside), theta, rts.plugin("shaders", "unlit")(opaque=False))
+    camera = rts.Camera.look_at((0, 0, 4), (0, 0, 0))
     with pytest.warns(rts.errors.LayersWarning, match="use splatter='visible'"):
-        drawn([part])
+        image = rts.render(part, camera, SIZE, splatter="edges", layers=4)
+    assert image[12, 12, 3] == 0.5
