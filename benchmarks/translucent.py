@@ -35,7 +35,7 @@ SIZE, LAYERS, AREA = (128, 128), 6, 16
 """AREA² samples a pixel make the truth."""
 PIXEL = 3.2 / SIZE[0]
 UNLIT = rts.plugin("shaders", "unlit")
-METHODS = tuple((name, s) for name in ("visible", "multi", "none") for s in (1, 2))
+METHODS = tuple((name, s) for name in ("visible", "edges", "multi", "none") for s in (1, 2))
 MODES = "position", "colour", "alpha"
 
 
@@ -148,6 +148,26 @@ def derivative_rows() -> Iterator[list[str]]:
             change = Change(parts(), index, mode)
             true = change.truth()
             yield [name, mode, *(score(change.derivative(*method), true) for method in METHODS)]
+
+
+def edges_rows() -> Iterator[list[str]]:
+    """As parts move, the error of the derivative low-passed, that in each pixel, and of the image, root mean square.
+
+    Truth is of ±0.25 pixels: `Change.truth` of ±0.5 is itself blurred.
+    """
+    for name, (parts, index) in SCENES.items():
+        change = Change(parts(), index, "position")
+        area = [
+            change.image(torch.tensor(s), splatter="none", supersample=AREA)[..., :3].numpy() for s in (-0.25, 0, 0.25)
+        ]
+        true, cells = (area[2] - area[0]) / 0.5, []
+        for splatter in ("visible", "edges"):
+            found = change.derivative(splatter, 1)
+            image = change.image(torch.zeros(()), splatter=splatter)[..., :3].numpy()
+            apart = np.linalg.norm(found - true) / np.linalg.norm(true)
+            low = np.linalg.norm(low_pass(found) - low_pass(true)) / np.linalg.norm(low_pass(true))
+            cells.append(f"{low:.3f} / {apart:.3f} / {np.sqrt(np.mean((image - area[1]) ** 2)):.4f}")
+        yield [name, *cells]
 
 
 def by_mitsuba(change: Change, samples: int, seed: int) -> np.ndarray:
@@ -330,7 +350,7 @@ def off(task: Task, numbers: torch.Tensor) -> str:
 def fit_rows(steps: int) -> Iterator[list[str]]:
     for name, task in tasks().items():
         yield [name, "at first", off(task, task.start)]
-        for splatter in ("visible", "multi", "none"):
+        for splatter in ("visible", "edges", "multi", "none"):
             yield [name, splatter, off(task, task.found(splatter, steps))]
 
 
@@ -377,7 +397,7 @@ def fit_pictures(folder: Path, steps: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=["derivatives", "peers", "time", "fits", "pictures"])
+    parser.add_argument("--only", nargs="+", choices=["derivatives", "edges", "peers", "time", "fits", "pictures"])
     parser.add_argument("--rounds", type=int, default=15, help="turns of each call that is timed")
     parser.add_argument("--steps", type=int, default=300, help="of each fit")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/translucent"))
@@ -386,6 +406,7 @@ def main() -> None:
     warnings.simplefilter("ignore", rts.errors.LayersWarning)  # Of `multi`, which is measured on purpose.
     sections = {
         "derivatives": (["scene", "changes", *(f"{name}, {s} × {s}" for name, s in METHODS)], derivative_rows()),
+        "edges": (["what moves", "visible", "edges"], edges_rows()),
         "peers": (["scene", "Mitsuba, prb_projective, 64 spp"], peer_rows()),
         "time": (["K", "", "opaque, ms", "translucent, ms", "ratio"], time_rows(args.rounds)),
         "fits": (["fit", "splatter", "result"], fit_rows(args.steps)),

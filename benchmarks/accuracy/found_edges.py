@@ -1,9 +1,9 @@
 """Found edges beside `visible` on the scenes of other measurements: errors of derivatives in each pixel and low-passed.
 
 The scenes are those of `accuracy.run`, `accuracy.crossings`, `accuracy.other_motions`, `thin`, the derivative images of
-`rts_compare.stability`, and those of `benchmarks.edges`. `visible` has as many layers as its scene asks for, `edges`
-one. Truths are closed forms, or differences over ±0.15 pixels of area-sampled renders. Rows are kept in a file, from
-which a run that is interrupted goes on, and of which the summary is made:
+`rts_compare.stability`, and those of `benchmarks.edges`. All have as many layers as a scene asks for, `edges` one where
+all is opaque. Truths are closed forms, or differences over ±0.15 pixels of area-sampled renders. Rows are kept in a
+file, from which a run that is interrupted goes on, and of which the summary is made:
 
     python -m benchmarks.accuracy.found_edges -o out/found_edges
     python -m benchmarks.accuracy.found_edges --suites thin crossings
@@ -81,8 +81,8 @@ def measured(suite: str, name: str, case: Case) -> Row:
 
 
 def options(layers: int) -> dict[str, dict[str, Any]]:
-    """Options of `rts.render` by method; `layers` are those of `visible`."""
-    return {name: {"layers": 1 if name == "edges" else layers, **given} for name, given in METHODS.items()}
+    """Options of `rts.render` by method, with a number of layers."""
+    return {name: {"layers": layers, **given} for name, given in METHODS.items()}
 
 
 def of_scene(scene: Scene, mode: str, pixel: float, layers: int, samples: int, folder: Path, **more: Any) -> Case:

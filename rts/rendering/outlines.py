@@ -310,6 +310,8 @@ class _Points:
     ) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
+        if sheets is None and not len(points):
+            points = np.full((1, 2), 0.5)  # Surfaces may want a ray at least; nothing names its sample.
         if sheets is not None and triangles is not None and (triangles >= 0).all():
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
         request = Request(points=points, exits=exits, triangles=True, entry=entry)

@@ -53,7 +53,7 @@ class Scene(NamedTuple):
 
     @property
     def fronts_suffice(self) -> bool:
-        """True if outlines are found between fronts alone: parts are opaque, or samples leave their triangles."""
+        """True if outlines are found between fronts alone: all is opaque, or some samples lie on no triangles."""
         return all(self.opaque) or not all(map(has_sheets, self.parts, self.chosen()))
 
     @classmethod

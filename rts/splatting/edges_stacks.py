@@ -68,7 +68,7 @@ class Operands(NamedTuple):
     """What takes the place of stacks in `rts.splatting.edges`: a composite for each cell, and for each side of a break.
 
     Attributes:
-        positions: (M, 3), those of cells, which stand still, then of both sides of breaks: of the layer that ends.
+        positions: (M, 3), of cells, which stand still; then of both sides of breaks, of the layer that ends there.
         rgba: (M, 4), the composites.
         row: (H, W), those of cells.
         outlines: whose samples are composites.
@@ -177,6 +177,12 @@ def _steps(gap: Array, like: Array) -> Array:
     return xp.astype(xp.stack([gap[:, 2], 1 - gap[:, 2]], axis=-1), like.dtype)
 
 
+def _stack_of(outlines: Outlines) -> tuple[Array, Array]:
+    """`Outlines.stack` and `Outlines.stack_points`, which several layers have."""
+    assert outlines.stack is not None and outlines.stack_points is not None
+    return outlines.stack, outlines.stack_points
+
+
 class _Sides(NamedTuple):
     """Both sides of breaks: those before (B), then those behind.
 
@@ -198,14 +204,21 @@ class _Sides(NamedTuple):
     def of(cls, splats: Splats, outlines: Outlines) -> _Sides:
         """The sides of breaks."""
         positions, rgba, xp = splats.positions, splats.rgba, namespace(splats.rgba)
-        rows = xp.reshape(xp.permute_dims(outlines.stack, (2, 1, 0)), (splats.row.shape[0], -1))
-        points = xp.concat([_on_gaps(outlines, outlines.stack_points[:, i, :]) for i in (0, 1)])
-        stack = Stack.of(positions, rgba, rows, xp.permute_dims(points, (1, 0, 2)))
+        stack, places = _stack_of(outlines)
+        rows = xp.reshape(xp.permute_dims(stack, (2, 1, 0)), (splats.row.shape[0], -1))
+        points = xp.concat([_on_gaps(outlines, places[:, i, :]) for i in (0, 1)])
+        layers = Stack.of(positions, rgba, rows, xp.permute_dims(points, (1, 0, 2)))
         ends = xp.concat([outlines.rows[:, i] for i in (0, 1)])
         points = xp.concat([_on_gaps(outlines, outlines.points[:, i]) for i in (0, 1)])
         still = xp.concat([points, xp.zeros_like(points[:, :1])], axis=-1)
         at = xp.take(positions, xp.where(ends >= 0, ends, 0), axis=0)
-        return cls(outlines, rows[0, ...], stack, points, xp.where((ends >= 0)[:, None], at, still))
+        return cls(outlines, rows[0, ...], layers, points, xp.where((ends >= 0)[:, None], at, still))
+
+    def _ends(self) -> Array:
+        """(K, 2 B) True for layers that the other side of a break has not."""
+        xp, (stack, _) = namespace(self.points), _stack_of(self.outlines)
+        same = stack[:, 0, :, None] == stack[:, 1, None, :]
+        return xp.permute_dims(xp.concat([~xp.any(same, axis=2), ~xp.any(same, axis=1)]), (1, 0))
 
     def motion(self, splats: Splats) -> Array:
         """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
@@ -216,19 +229,22 @@ class _Sides(NamedTuple):
         outlines, own, row = self.outlines, self.stack, splats.row
         xp, engine, (layers, height, width) = namespace(own.whole), engine_of(own.whole), row.shape
         gap, place, unit = outlines.gap, outlines.place, _normals(outlines)
-        along = xp.sum(unit * _steps(gap, unit), axis=-1)
-        normal, ahead = xp.concat([unit, unit]), xp.concat([-along, along])
-        first, step = gap[:, 0] * width + gap[:, 1], xp.where(gap[:, 2] == 1, 1, width)
-        cell, beyond = xp.concat([first, first + step]), xp.concat([first + step, first])
+        along = _steps(gap, unit)
+        normal, way = xp.concat([unit, unit]), xp.concat([-along, along])
+        first, next_ = gap[:, 0] * width + gap[:, 1], xp.where(gap[:, 2] == 1, 1, width)
+        cell, beyond = xp.concat([first, first + next_]), xp.concat([first + next_, first])
         centre = xp.concat([_on_gaps(outlines, xp.full_like(place, i)) for i in (0, 1)])
         rows = xp.take(xp.reshape(row, (layers, -1)), cell, axis=1)
         here = Stack.of(splats.positions, splats.rgba, rows, centre[None, ...])
         rise, (through, behind) = stopped(own.color - here.color), here.weights()
-        moves = xp.sum((own.motion + here.motion) / 2 * normal, axis=-1)[..., None]
+        # What ends there moves along the normal of its outline; other layers know nothing of this.
+        across = xp.sum(normal * way, axis=-1)
+        moves, ends = (own.motion + here.motion) / 2, self._ends()
+        moves = xp.where(ends, xp.sum(moves * normal, axis=-1) * across, xp.sum(moves * way, axis=-1))[..., None]
         change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
         # What is added for the composite, as if it moved with the break.
-        with_break = xp.sum((self.ending[:, :2] - self.points) / 2 * normal, axis=-1)[:, None]
-        change = (change - stopped(own.whole - here.whole) * with_break) * ahead[:, None]
+        with_break = xp.sum((self.ending[:, :2] - self.points) / 2 * normal, axis=-1) * across
+        change = change - stopped(own.whole - here.whole) * with_break[:, None]
         counts = xp.concat([outlines.ends[:, i] for i in (0, 1)]) & (self.front >= 0)
         length = xp.clip(xp.concat([place, 1 - place]), 0.0, 1.0)
         share = (xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0))[:, None]
