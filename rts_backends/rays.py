@@ -89,6 +89,8 @@ class Rays(Sampler):
         begins = xp.reshape(hits.entering, hit.shape)[0, ...] & (row[0, ...] >= 0)
         reach = REACH * xp.reshape(width, (-1,))
         cells = None if request.cells is None else constants(request.cells, engine, like)
+        if request.points is not None:
+            view = None
         return _with_deepest(samples, surface, theta, begins, (start, directions, reach), capacity, cells, view)
 
 
@@ -100,7 +102,7 @@ def _with_deepest(
     rays: tuple[Array, ...],
     capacity: int | None,
     listed: Array | None,
-    view: tuple[int, int],
+    view: tuple[int, int] | None,
 ) -> Samples:
     """Samples with two further rows for cells at outlines, beside the deepest points of their rays; see `Cells.exit`.
 
@@ -114,13 +116,13 @@ def _with_deepest(
         capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none. None
             for as much room as there are cells.
         listed: (L, C), `Request.cells`; None for all cells of the grid.
-        view: (height, width) of the grid.
+        view: (height, width) of the grid; None for points, all of which count as cells at outlines.
     """
     engine, xp, rows = engine_of(samples.ids, begins), namespace(begins), samples.ids.shape[0]
     room = begins.shape[0] * begins.shape[1] if capacity is None else -(-capacity // ROOM)
 
     def find(row: np.ndarray, depth: np.ndarray, begins: np.ndarray, *own: np.ndarray) -> tuple[np.ndarray, ...]:
-        cells = outline_cells(row >= 0, depth, *own, size=view)
+        cells = np.flatnonzero(row[0] >= 0) if view is None else outline_cells(row >= 0, depth, *own, size=view)
         cells = cells[begins.reshape(-1)[cells]][:room]
         number = np.full(begins.shape, -1, np.int32)
         number.reshape(-1)[cells] = np.arange(len(cells), dtype=np.int32)

@@ -272,6 +272,30 @@ def test_no_colour_leaves_the_range_of_those_that_are_seen():
     assert (image[..., :3] - image[..., 3:]).max() < 1e-6
 
 
+@pytest.mark.parametrize("angle", [0.05, 0.3, 0.62])
+@pytest.mark.parametrize("width", [0.1, 0.3, 0.6])
+def test_a_strip_that_hardly_a_centre_sees_has_its_area_and_motion(angle, width):
+    """Its ends between lines of centres are cut off; so areas lack up to a third of a pixel's length."""
+    corners = turned(SQUARE * [1, width / 12], angle, (12.1, 12.2))
+    velocity = np.column_stack([np.tile([-np.sin(angle), np.cos(angle)], (4, 1)), np.zeros(4)])
+    image, derivative = pushed(lambda t: edges(card(moved(flat(corners), velocity)(t))))
+    step, shares = 1e-5, covered(corners, SIZE)
+    truth = [covered(corners + sign * step * velocity[:, :2], SIZE) for sign in (1, -1)]
+    truth = (truth[0] - truth[1]) / (2 * step)
+    assert image[..., 3].sum() == pytest.approx(shares.sum(), abs=2 / 3 * width)
+    assert np.abs(image[..., 3] - shares).max() < 0.6 * width
+    gain = (derivative[..., 3] * truth).sum() / (truth**2).sum()
+    assert gain == pytest.approx(1, abs=0.15)
+
+
+def test_a_needle_reaches_to_its_tip():
+    corners = np.array([[3.5, 11.7], [19.9, 12.3], [3.5, 12.6]])
+    shares = covered(corners, SIZE)
+    image = edges(card(flat(corners), faces=np.array([[0, 1, 2]])))[..., 3]
+    assert shares[12, 19] > 0.01
+    np.testing.assert_allclose(image[:, 5:], shares[:, 5:], atol=2e-3)
+
+
 def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over():
     """A triangle through the camera plane may meet a line of centres farther away than integers reach."""
     from rts.sampling.sheets import Gaps, Sheets

@@ -134,6 +134,29 @@ def test_normal_equations_are_those_of_the_jacobian(kind, channels, layers, targ
 
 
 @pytest.mark.parametrize(
+    ("channels", "supersample", "loss", "target"),
+    [
+        (1, 1, "linear", "torch-cpu"),
+        (3, 2, "linear", "torch-cpu"),
+        (4, 1, "huber", "torch-cpu"),
+        (4, 2, "linear", "jax"),
+    ],
+)
+def test_normal_equations_of_found_edges_are_those_of_the_jacobian(channels, supersample, loss, target, monkeypatch):
+    from rts.splatting import edges_weights
+
+    sweeps, whole = [], edges_weights.normal_equations
+    monkeypatch.setattr(edges_weights, "normal_equations", lambda *own: sweeps.append(own) or whole(*own))
+    goal, weights = fields(channels)
+    with precision(target, np.float64):
+        background = None if channels == 1 else np.random.default_rng(4).random(3)
+        options = {"weights": weights, "background": background, "loss": loss}
+        residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, splatter="edges", supersample=supersample, **options)
+        check(residuals, start(target, np.float64), 1e-8, compiling=False)
+    assert len(sweeps) == 1
+
+
+@pytest.mark.parametrize(
     ("background", "channels", "target"),
     [
         ("color", 1, "torch-cpu"),

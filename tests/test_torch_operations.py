@@ -136,6 +136,20 @@ def test_batches_of_ids():
         torch.testing.assert_close(one, expected)
 
 
+@pytest.mark.parametrize("in_dims", [(0, 0), (0, None), (None, 0)])
+def test_rows_are_taken_by_indices_of_32_bits_in_batches(in_dims):
+    rows, index = torch.rand(2, 5, 3), torch.tensor([[4, 0, -1], [2, 2, 1]], dtype=torch.int32)
+    xp = rts.namespace(rows)
+
+    def gradient(rows, index):
+        return torch.func.grad(lambda rows: xp.take(rows, index, axis=0).square().sum())(rows)
+
+    args = [x if dim == 0 else x[0] for x, dim in zip((rows, index), in_dims, strict=True)]
+    found = torch.vmap(gradient, in_dims)(*args)
+    expected = [gradient(*(x[i] if d == 0 else x for x, d in zip(args, in_dims, strict=True))) for i in range(2)]
+    torch.testing.assert_close(found, torch.stack(expected))
+
+
 def test_points_without_an_image_are_finite_with_finite_gradients():
     rows, points = maps()
     points[0] = 0

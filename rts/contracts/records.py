@@ -258,7 +258,8 @@ class Request:
             of the centres of cells. Cells of the samples are then (K, 1, M). None for centres.
         hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
-        exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them.
+        exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them; of `points`
+            at all of them, and then for fields alone.
         between: whether to compute `Cells.between`, of all cells of the grid.
         triangles: whether to record `Samples.triangle`.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
@@ -329,6 +330,9 @@ class Outlines:
         points: (B, 2) float64, the places of these samples along the gap.
         inner: (B, 2) int32, indices of samples of the same surfaces a little farther from the break, or −1. They tell
             colours: in the last hair before an outline normals may turn away, and colours with them.
+        pair: (B, 2) int32, indices of two samples on the ray of the last sample of the surface that ends, beside its
+            deepest point, or −1: the break moves as their mean (`RaySurface.deepest`). A single sample does not tell
+            how a kink of a field moves.
         near: (B,) int32, 0 if the surface before the break ends there, 1 if the one behind it does, 2 where two
             surfaces pass through one another.
         slope: (B, 2, 2) float64, slopes of depth along x and y of both samples, where `near` is 2; else 0.
@@ -354,6 +358,7 @@ class Outlines:
     rows: Array
     points: Array
     inner: Array
+    pair: Array
     near: Array
     slope: Array
     ends: Array

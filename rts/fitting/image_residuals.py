@@ -364,6 +364,7 @@ class ImageResiduals(Residuals):
 
         part = None if sampled.one_part else sampled.part
         known = Splats(None, None, replace(sampled.cells, depth=None), part, one_part=sampled.one_part, opaque=opaque)
+        known = replace(known, outlines=sampled.outlines)
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, replace(known, border=sampled.apron))
         # A pixel counts on one of the grids alone.

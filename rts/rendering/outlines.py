@@ -11,7 +11,6 @@ import numpy as np
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
-from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
@@ -45,14 +44,16 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         known.append((part.transform, {name: part.theta[name] for name in part.surface.reads(part.theta)}))
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
-    if any(map(is_traced, leaves(inputs))):
-        found, more = _traced(sampled, scene, grid, max(8 * sum(grid.size), (capacity or 0) // 4), inputs)
+    traced = any(map(is_traced, leaves(inputs)))
+    if traced or all(map(has_sheets, scene.parts, scene.chosen())):
+        most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
+        found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
         row, depth, own = map_leaves(_known, inputs[3:])
         here, more = _Points.of(scene, grid).found(_at_centres(row, depth, own, sampled.samples))
-        # Engines that compile eager operations anew for each shape pad them.
         specs = _Found.specs(0, grid.size, _real(scene), len(row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
+        # Engines that compile eager operations anew for each shape pad them.
         found = _Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
     for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
@@ -60,9 +61,10 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
         samples.append(in_one_table([own, extra]))
         first += samples[-1].ids.shape[-2]
-    named = {"rows": rows[:, :2], "inner": rows[:, 2:4]}
+    named = {"rows": rows[:, :2], "inner": rows[:, 2:4], "pair": rows[:, 4:]}
     if sampled.row.shape[0] > 1:
-        named = {"rows": rows[:, :2], "inner": rows[:, :2], **_stacks(found, rows[:, 2:])}
+        none = 0 * rows[:, :2] - 1
+        named = {"rows": rows[:, :2], "inner": rows[:, :2], "pair": none, **_stacks(found, rows[:, 2:])}
     outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
     overflow, cells = sampled.overflow + found.left, _renumbered(sampled, samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
@@ -72,8 +74,8 @@ class _Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
-        rows: (B, 4) int32, the two last samples of each break and the two that tell colours, counted in their part. Of
-            K layers (B, 2 + K + 1): the two last samples, and those of the stack there.
+        rows: (B, 6) int32, for each break the two last samples, the two that tell colours, and the pair, counted in
+            their part. Of K layers (B, 2 + K + 1): the two last samples, and those of the stack there.
         parts: of the shape of `rows`, int32, their parts, or −1.
         sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
         places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.
@@ -113,14 +115,16 @@ class _Found(NamedTuple):
         return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
 
 
-def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree) -> tuple[_Found, list[Samples]]:
+def _found_on_host(
+    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, inputs: Tree
+) -> tuple[_Found, list[Samples]]:
     """`_Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
-    known = map_leaves(lambda x: x if is_traced(x) else value_of(x), inputs)
     owners = [_tables(own) for own in sampled.samples]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         given = iter(arrays)
-        of_parts, whole, camera, row, depth, own = map_leaves(lambda x: next(given) if is_traced(x) else x, known)
+        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
+        of_parts, whole, camera, row, depth, own = known
         parts = [replace(p, transform=t, theta=theta) for p, (t, theta) in zip(scene.parts, of_parts, strict=True)]
         points = _Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size))
         found, more = points.found(_at_centres(row, depth, own, sampled.samples), most)
@@ -128,26 +132,23 @@ def _traced(sampled: Sampled, scene: Scene, grid: Grid, most: int, inputs: Tree)
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
             gbuffer = part.surface.evaluate(part.theta, replace(samples, asked=None)) if "gbuffer" in kinds else {}
-            filled = [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
-            arrays_of += [np.asarray(x, spec.dtype) for x, spec in zip(filled, tables.values(), strict=True)]
-        return [*(np.asarray(x, spec.dtype) for x, spec in zip(found, specs, strict=False)), *arrays_of]
+            arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
+        return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
 
     layers = sampled.row.shape[0]
-    specs = _Found.specs(most, grid.size, _real(scene), layers)
-    rows = [
-        ArraySpec((_columns(layers)[0] * most, *x.shape[1:]), x.dtype, packed=True)
-        for own in owners
-        for x in own.values()
-    ]
-    operands = [x for x in leaves(known) if is_traced(x)]
-    results = iter(engine_of(*operands).call_host(host, [*specs, *rows], *operands))
-    found = _Found(*(next(results) for _ in specs))
+    operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
+    specs = _Found.specs(most or 0, grid.size, _real(scene), layers)
+    for x in (x for own in owners for x in own.values()):
+        dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
+        specs.append(ArraySpec((_columns(layers)[0] * (most or 0), *x.shape[1:]), dtype, packed=True))
+    results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
+    found = _Found(*(next(results) for _ in _Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
 
 
 def _columns(layers: int) -> tuple[int, int, int]:
     """The numbers of samples of a break, of those of its stack, and of layers on each side; see `_Found`."""
-    return (4, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)
+    return (6, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)
 
 
 def _stacks(found: _Found, rows: Array) -> dict[str, Array]:
@@ -227,8 +228,8 @@ class _Points:
         """The points of a grid."""
         parts = []
         for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
-            camera, sheets, surface = grid.camera.within(part.transform), None, part.surface
-            if isinstance(sampler, TriangleSampler) and isinstance(surface, TriangleSurface):
+            camera, sheets = grid.camera.within(part.transform), None
+            if isinstance(sampler, TriangleSampler):
                 host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
                 entry = _entry(part, sampler, entry, host, grid.size)
                 if has_sheets(part, sampler):
@@ -248,6 +249,9 @@ class _Points:
             asked = parts == part
             samples.append(self.sample(part, points[asked], triangles[asked]))
             rows[asked] = _known(samples[-1].row)[0, 0]
+        if len(layers.part) == 1:
+            pairs, of_pairs = self._pairs(breaks, samples)
+            rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
         along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
         first = breaks.gap[:, 1::-1] + 0.5
         place = ((breaks.place - first) * along).sum(-1)
@@ -257,6 +261,24 @@ class _Points:
         segments = joined(breaks, len(layers.part) > 1)
         found = _Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
         return found, samples
+
+    def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
+
+        They are added to the samples of parts. Triangles have no kinks within, and no pairs.
+        """
+        part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
+        rows = np.full((len(part), 2), -1, np.int32)
+        for own, known in enumerate(self._parts):
+            at = np.flatnonzero(part == own)
+            if isinstance(known[0], TriangleSampler) or not len(at):
+                continue
+            more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
+            if more.exit is not None and len(more.exit) == 2:
+                found = _known(more.exit)[:, 0].T
+                rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
+            samples[own] = in_one_table([samples[own], more])
+        return rows, np.column_stack([part, part]).astype(np.int32)
 
     def breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The breaks between what is seen at centres (K, H, W), and the samples that they need.
@@ -283,14 +305,16 @@ class _Points:
         )
         return breaks, parts, points, breaks.triangles, np.empty((len(parts), 2, 0), np.int32)
 
-    def sample(self, part: int, points: np.ndarray, triangles: np.ndarray | None = None) -> Samples:
+    def sample(
+        self, part: int, points: np.ndarray, triangles: np.ndarray | None = None, exits: bool = False
+    ) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
         if sheets is None and not len(points):
             points = np.full((1, 2), 0.5)  # Surfaces may want a ray at least; nothing names its sample.
         if sheets is not None and triangles is not None and (triangles >= 0).all():
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
-        request = Request(points=points, triangles=True, entry=entry)
+        request = Request(points=points, exits=exits, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" not in samples.followed:
             raise InputError(

@@ -210,8 +210,8 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
         # Within one part the half in which the depth changes more has the break.
         alike = (found.before.part == told.part) & (told.part == found.behind.part)
         changes = [np.abs(half.before.depth - half.behind.depth) for half in halves]
-        drop = [np.where(alike, changes[0] < changes[1], _one_surface(halves[0], oracle))]
-        drop.append(np.where(alike, changes[1] <= changes[0], _one_surface(halves[1], oracle)))
+        drop = [_one_surface(half, oracle) for half in halves]
+        drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
         found = _Intervals.of([half.at(np.flatnonzero(~d)) for half, d in zip(halves, drop, strict=True)])
     return _Intervals.of(finished)
 

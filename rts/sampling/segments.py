@@ -49,5 +49,7 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     origin, ties, side = loops.segments_of(square, ends, partner, width)
     around = loops.beyond(ties, len(breaks.place))
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
-    parallel(loops.corners, len(ties), origin, ties, around, breaks.place, corner, pull, work=300 * len(ties))
+    index = np.arange(len(breaks.near))
+    own = breaks.place, breaks.tangent, breaks.triangles[index, np.where(breaks.near == 1, 1, 0)]
+    parallel(loops.corners, len(ties), origin, ties, side, around, *own, corner, pull, work=300 * len(ties))
     return Segments(origin, ties, side, np.ascontiguousarray(around[:, 1:3]), corner, pull)

@@ -16,6 +16,12 @@ ASIDE = 0.4
 """Share of a cost that is by how far a segment leads off the direction of an outline at its end; the rest is by its
 length."""
 
+STRAIGHT = 1e-3
+"""Sine of an angle, in which an outline counts as straight: rounding of vertices must not tell where lines meet."""
+
+CLOSE = 1e-4
+"""Least distance, in cells, of a corner from the ends of its segment: an outline that turns at an end has none."""
+
 
 @loop
 def ends_of(gap, place, near, parts, height, width):
@@ -175,18 +181,27 @@ def beyond(ties, count):
 def _meeting(start, ahead, end, back, meeting):
     """Fill `meeting` with where lines from `start` along `ahead` and to `end` along `back` meet; True if between."""
     turn = ahead[0] * back[1] - ahead[1] * back[0]
-    if not abs(turn) > 1e-9:
+    if not abs(turn) > STRAIGHT * np.hypot(ahead[0], ahead[1]) * np.hypot(back[0], back[1]):
         meeting[0], meeting[1] = start[0], start[1]
         return False
     t = ((end[0] - start[0]) * back[1] - (end[1] - start[1]) * back[0]) / turn
     meeting[0], meeting[1] = start[0] + t * ahead[0], start[1] + t * ahead[1]
-    return t >= 0 and (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1] >= 0
+    there = (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1]
+    return t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
 
 
 @compiled
 def _angle(a, b):
     """The angle between two vectors, 0 to π."""
     return abs(np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
+
+
+@compiled
+def _inward(tangent, side, way):
+    """Fill `way` with a direction, turned into a square from one of its sides."""
+    into = (tangent[1], -tangent[0], -tangent[1], tangent[0])[side]
+    sign = 1.0 if into >= 0 else -1.0
+    way[0], way[1] = sign * tangent[0], sign * tangent[1]
 
 
 @compiled
@@ -197,34 +212,47 @@ def _within(point, origin, s):
 
 
 @loop
-def corners(first, last, origin, ties, around, place, corner, pull):
+def corners(first, last, origin, ties, side, around, place, tangent, triangle, corner, pull):
     """Fill `corner` (S, 2), from the square's first centre, and `pull` (S, 4) of segments; see `Outlines`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
     at its neighbours, it is a curve. Its tangents at the ends run as from the break before each to the one after; the
-    curve is two thirds as far from the chord as their meeting.
+    curve is two thirds as far from the chord as their meeting. At a tip, which comes back to the side
+    of the square that it entered by, the tangents are the edges of the triangles there.
 
     Args:
         first: the first segment.
         last: the segment after the last.
         origin: (S, 2), y and x of the first corner of each square.
         ties: (S, 2).
+        side: (S, 2), see `segments_of`.
         around: (S, 4), the result of `beyond`.
         place: (B, 2), x and y of breaks.
+        tangent: (B, 2), see `join`.
+        triangle: (B,) int32, the triangle that ends at each break, or −1.
         corner: to fill.
         pull: to fill.
     """
-    sharp, curve = np.empty(2), np.empty(2)
+    sharp, curve, way = np.empty(2), np.empty(2), np.empty(2)
     for s in range(first, last):
         start, end = place[ties[s, 0]], place[ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0]]
         for a in range(2):
             corner[s, a] = (start[a] + end[a]) / 2
         alone, on, back = 0.0, 0.0, 0.0
+        tip = ties[s, 1] >= 0 and side[s, 0] == side[s, 1]
+        if tip:
+            a, b = ties[s, 0], ties[s, 1]
+            _inward(tangent[a], side[s, 0], way)
+            _inward(tangent[b], side[s, 1], sharp)
+            tip = _meeting(start, way, end, -sharp, curve) and _within(curve, origin, s)
+            share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
+            for i in range(2):
+                corner[s, i] += share * (curve[i] - corner[s, i]) if tip else 0.0
         if around[s, 1] >= 0 and around[s, 2] >= 0:
             before, after = place[around[s, 1]], place[around[s, 2]]
-            if _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
-                for a in range(2):
-                    corner[s, a] += 2 / 3 * (curve[a] - corner[s, a])
+            if not tip and _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
+                for i in range(2):
+                    corner[s, i] += 2 / 3 * (curve[i] - corner[s, i])
             ahead, behind = start - before, after - end
             if _meeting(start, ahead, end, behind, sharp) and _within(sharp, origin, s):
                 beside = 0.0
@@ -233,8 +261,8 @@ def corners(first, last, origin, ties, around, place, corner, pull):
                 if around[s, 3] >= 0:
                     beside += _angle(behind, place[around[s, 3]] - after)
                 alone = min(max(1 - beside / max(_angle(ahead, behind), 1e-6), 0.0), 1.0)
-            for a in range(2):
-                corner[s, a] += alone * (sharp[a] - corner[s, a]) if alone > 0 else 0.0
+            for i in range(2):
+                corner[s, i] += alone * (sharp[i] - corner[s, i]) if alone > 0 else 0.0
             if alone > 0:
                 on = np.hypot(corner[s, 0] - start[0], corner[s, 1] - start[1]) / np.hypot(ahead[0], ahead[1])
                 back = np.hypot(corner[s, 0] - end[0], corner[s, 1] - end[1]) / np.hypot(behind[0], behind[1])

@@ -37,7 +37,8 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         for axis in range(2):
             wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
             small &= wide <= 1  # False for NaN.
-        sides[t] = ((area > 0) - (area < 0)) * (1 if small else 2)
+        size = 1 if small else 2
+        sides[t] = size if area > 0 else (-size if area < 0 else 0)
 
 
 @loop
@@ -125,7 +126,7 @@ def _ends(a, b, rows, vertices, near_plane, seen, ends, deep):
 
 @compiled
 def _mark(axis, ends, nearest, part, depth, width, gaps):
-    """Mark the gaps along an axis that an edge meets, with 1 where both centres show something nearer than all of it."""
+    """Mark the gaps along an axis that an edge meets; see `meet`, whose depths are compared with the edge's nearest."""
     height, across = part.shape
     lines, count = (height, across) if axis == 0 else (across, height)
     k = 0 if ends[0, 1 - axis] <= ends[1, 1 - axis] else 1

@@ -7,7 +7,8 @@
     m       the motion of this sample in the image: 0 in value, it has the derivative
     J       the colour on one side of a segment less that on the other, from the last samples beside its two breaks;
             in the shares, on the side of the cell's own surface, the colour C
-    v       the motion of a break, linear between the two: that of the last sample of the surface that ends there
+    v       the motion of a break, linear between the two: that of the last sample of the surface that ends there, or
+            the mean of a pair of samples beside the deepest point of its ray
     n ds    along the part of the segment inside the pixel
 
 Beside breaks the colour inside also changes as far as the outline, see `_beside_breaks`. Shares have no derivative,
@@ -24,10 +25,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace, stopped
-from rts.arrays.trees import Array
-from rts.contracts.records import Outlines, Splats
-from rts.contracts.splatter import Splatter
+from rts.arrays.engines import engine_of, floating_bits, namespace, stopped
+from rts.arrays.trees import Array, collected, map_leaves
+from rts.contracts.records import ArraySpec, Outlines, Splats
+from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
 from rts.splatting import edges_weights
 from rts.splatting.edges_stacks import CELLS, Operands
@@ -41,7 +42,7 @@ CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
 
-class Edges(Splatter):
+class Edges(SummingSplatter):
     """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque.
 
     Where light passes through, layers are composited, and each outline that is seen moves with its own layer; see
@@ -63,12 +64,50 @@ class Edges(Splatter):
             return _without_outlines(splats)
         check_rows(outlines.rows, rgba.shape[0], "outlines.rows")
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
+        check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
         if outlines.stack is None:
             return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, name) for name in FIELDS))
         check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
         own = Operands.of(splats, outlines)
         image = EDGES(own.positions, own.rgba, own.row, *(getattr(own.outlines, name) for name in FIELDS))
         return image + own.motion
+
+    def normal_equations(
+        self,
+        splats: Splats,
+        t_positions: Array,
+        t_rgba: Array | None,
+        target: Array,
+        weights: Array | None = None,
+        background: Array | None = None,
+        loss: Any = None,
+    ) -> tuple[Array, Array, Array] | None:
+        """See `rts.SummingSplatter`; None without outlines, where light passes through, and off the host."""
+        outlines, engine = splats.outlines, engine_of(splats.positions)
+        own = (
+            splats.positions,
+            splats.rgba,
+            splats.row[0, ...],
+            outlines,
+            t_positions,
+            t_rgba,
+            target,
+            weights,
+            background,
+        )
+        operands = collected(own)
+        if outlines is None or outlines.stack is not None or splats.rgba.shape[0] == 0 or not engine.on_host(*operands):
+            return None
+
+        def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+            it = iter(arrays)
+            positions, rgba, row, found, *tangents_and_fields = map_leaves(lambda _: next(it), own)
+            known = positions, rgba, row, *(getattr(found, name) for name in FIELDS)
+            return edges_weights.normal_equations(known, tuple(tangents_and_fields), splats.border, loss)
+
+        count, dtype = t_positions.shape[0], np.float64 if floating_bits(splats.positions) == 64 else np.float32
+        specs = ArraySpec((), dtype), ArraySpec((count, count), dtype), ArraySpec((count,), dtype)
+        return engine.call_host(host, specs, *operands)
 
 
 def _without_outlines(splats: Splats) -> Array:
@@ -167,6 +206,12 @@ class _Breaks(NamedTuple):
         along = -(still[0] - still[1]) / xp.where(crossing & (square > 0), square, 1.0)
         moves = xp.where((outlines.near == 0)[:, None], motion[0], motion[1])
         moves = xp.where(crossing[:, None], along[:, None] * apart, moves)
+        # A pair lies on the ray of the sample that ends, and its mean moves as the outline.
+        pairs = [
+            xp.take(positions, xp.where(outlines.pair >= 0, outlines.pair, 0)[:, i], axis=0)[:, :2] for i in (0, 1)
+        ]
+        origin = xp.where((outlines.near == 0)[:, None], points[0], points[1])
+        moves = xp.where(outlines.pair[:, :1] >= 0, (pairs[0] + pairs[1]) / 2 - origin, moves)
         return cls(first + outlines.place[:, None] * step, step, color, seen, xp.stack(motion), moves)
 
 
@@ -410,7 +455,7 @@ def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ..
 EDGES = Operation(
     "rts.edges",
     _specification,
-    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
+    ranks=(2, 2, 2, 1, 2, 2, 2, 2, 2, 1, 3, 2, 2, 2, 2, 2, 2, 2, 3),
     shape=_shape,
     forward=edges_weights.forward,
     push=edges_weights.push,

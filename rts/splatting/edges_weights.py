@@ -6,7 +6,7 @@ from outlines alone. They are computed once, for the value, and used again by th
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,8 @@ class _Weights(NamedTuple):
     Attributes:
         shown: (B, 2) int32, the samples that tell colours before and behind breaks, or −1.
         points: (B, 2, 2), x and y of the last samples.
+        movers: (B, 2) int32, the samples that breaks move with, or −1: the last ones, or a pair.
+        origins: (B, 2, 2), x and y of these.
         moves: (B, 2, 3, 2).
         share: (S, 4, 2).
         own: (S, 4, 2) int8.
@@ -37,6 +39,8 @@ class _Weights(NamedTuple):
 
     shown: np.ndarray
     points: np.ndarray
+    movers: np.ndarray
+    origins: np.ndarray
     moves: np.ndarray
     share: np.ndarray
     own: np.ndarray
@@ -57,6 +61,10 @@ class _Weights(NamedTuple):
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
         own = np.empty((segments, 4, 2), np.int8)
         loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
+        paired = np.flatnonzero(outlines.pair[:, 0] >= 0)
+        movers, origins = np.array(outlines.rows), points.copy()
+        movers[paired], origins[paired] = outlines.pair[paired], points[paired, outlines.near[paired]][:, None]
+        moves[paired] = 0.5 * np.eye(3, 2)
         ties = outlines.ties
         known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER, path, share, own, flux
         seen = outlines.rows >= 0
@@ -64,7 +72,7 @@ class _Weights(NamedTuple):
         parallel(loops.weigh_segments, segments, *at, *known, work=400 * segments)
         normal = np.empty((count, 2))
         loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
-        return cls(shown, points, moves, share, own, flux, cells, sides)
+        return cls(shown, points, movers, origins, moves, share, own, flux, cells, sides)
 
 
 def forward(operands: Arrays, out: np.ndarray) -> _Weights:
@@ -76,7 +84,7 @@ def forward(operands: Arrays, out: np.ndarray) -> _Weights:
     parallel(loops.inside, len(row), positions, rgba, row, outlines.joined, out, work=10 * out.size)
     weights = _Weights.of(outlines)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
-    loops.motions(positions, outlines.rows, weights.points, weights.moves, motion)
+    loops.motions(positions, weights.movers, weights.origins, weights.moves, motion)
     _add(outlines, weights, row, (rgba, positions, weights.points), (rgba, steady, steady, motion), out)
     return weights
 
@@ -92,7 +100,7 @@ def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | Non
     parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown) if len(t_positions) else 0, 2))
     if len(t_positions):
-        loops.motions(t_positions, outlines.rows, NOWHERE, weights.moves, motion)
+        loops.motions(t_positions, weights.movers, NOWHERE, weights.moves, motion)
     jump = _jumps(t_rgba, weights) if len(t_rgba) else np.empty((0, out.shape[2]))
     _add(outlines, weights, row, (t_rgba, t_positions, NOWHERE), (rgba, jump, steady, motion), out)
 
@@ -131,11 +139,46 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
     g_jump, g_motion = np.zeros((count if len(g_rgba) else 0, g.shape[2])), np.zeros((len(g_positions) and count, 2))
     loops.pull_segments(*_segments(outlines, weights, row), steady, g, g_rgba, g_jump, g_motion)
     if len(g_positions):
-        loops.pull_motions(outlines.rows, weights.moves, g_motion, g_positions)
+        loops.pull_motions(weights.movers, weights.moves, g_motion, g_positions)
     if len(g_rgba):
         loops.pull_jumps(weights.shown, g_jump, g_rgba)
     sides = row, outlines.rows, weights.shown, weights.cells, weights.sides
     loops.pull_sides(*sides, rgba, g, g_rgba, g_positions)
+
+
+def normal_equations(
+    operands: Arrays, others: Arrays, border: int, loss: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`SummingSplatter.normal_equations` on the host, by an image for each tangent.
+
+    `operands` are those of `forward`; `others` are t_positions, t_rgba, target, weights and background, or None.
+    """
+    t_positions, t_rgba, target, weights, background = others
+    row, dtype = operands[2], operands[1].dtype
+    side, channels = (row.shape[0] - 2 * border) // target.shape[0], target.shape[2]
+
+    def seen(whole: np.ndarray, behind: float) -> np.ndarray:
+        """The channels of pixels that are compared, over the background; `behind` is 0 for tangents."""
+        (height, width), inside = target.shape[:2], slice(border, -border if border else None)
+        image = whole[inside, inside]
+        image = image.reshape(height, side, width, side, -1).mean((1, 3)) if side > 1 else image.copy()
+        if background is not None:
+            image += (behind - image[..., -1:]) * background
+        image = image[..., -1:] if channels == 1 else image[..., :channels]
+        return image if weights is None else image * weights
+
+    image = np.empty((*row.shape, operands[1].shape[1]), dtype)
+    kept = forward(operands, image)
+    r = (seen(image, 1.0) - (target if weights is None else target * weights)).reshape(-1)
+    jacobian = np.empty((len(t_positions), r.size), dtype)
+    for own, tangent in enumerate(t_positions):
+        push(operands, (tangent, None if t_rgba is None else t_rgba[own]), image, kept)
+        jacobian[own] = seen(image, 0.0).reshape(-1)
+    value = np.mean(r * r) if loss is None else loss(r)
+    if loss is not None and loss.robust:
+        w, curvatures = loss.weights(r)
+        return np.asarray(value), (jacobian * curvatures) @ jacobian.T / r.size, jacobian @ (w * r) / r.size
+    return np.asarray(value), jacobian @ jacobian.T / r.size, jacobian @ r / r.size
 
 
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:

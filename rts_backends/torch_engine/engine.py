@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.utils.checkpoint
-from array_api_compat import torch as array_api
 from torch.utils import _pytree
 
 from rts import Engine, InputError
@@ -17,7 +16,7 @@ from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
-from rts_backends.torch_engine import operations, torch_internals
+from rts_backends.torch_engine import array_api, operations, torch_internals
 from rts_backends.torch_engine.functions import foreign, quiet_forward_mode, tangent_alike, transformed
 
 for _cls, _split, _join in Engine.records():

@@ -223,14 +223,16 @@ def deepest(
         falls = xp.sum(slope_at(middle) * along, axis=-1) < 0
         return {"low": xp.where(falls, middle, state["low"]), "high": xp.where(falls, state["high"], middle)}
 
-    zero = xp.zeros_like(reach)
-    state = {"low": zero, "high": zero, "before": zero, "t": zero, "step": FIRST * reach, "value": value_at(points)}
+    zero, first = xp.zeros_like(reach), FIRST * reach
+    # The root of a bracket with a kink may lie behind the deepest point, where the field rises: then before it, too.
+    begin = xp.where(xp.sum(slope_at(zero) * along, axis=-1) > 0, -first, zero)
+    state = {"low": zero, "high": zero, "before": begin, "t": zero, "step": first, "value": value_at(points)}
     state = engine.repeat(march, lambda state: xp.any(state["high"] == 0), state, MARCH)
     passed = state["high"] > 0
     state = {"low": state["low"], "high": state["high"]}
     state = engine.repeat(halve, lambda state: xp.any(state["high"] > state["low"]), state, HALVINGS)
     apart = APART * reach + 4 * xp.finfo(points.dtype).eps * xp.max(xp.abs(points), axis=-1)
-    sides = xp.clip(state["low"] - apart, 0.0, None), state["high"] + apart
+    sides = xp.maximum(state["low"] - apart, begin), state["high"] + apart
     slopes, levels = [slope_at(t) for t in sides], [value_at(at(t)) for t in sides]
     # Squares of small slopes are no numbers of single precision.
     largest = xp.max(xp.abs(xp.concat(slopes, axis=-1)), axis=-1)

@@ -7,6 +7,7 @@ decide only the place of a corner on its edge.
 from __future__ import annotations
 
 import functools
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +66,10 @@ def cases() -> tuple[np.ndarray, np.ndarray]:
         cell = np.zeros((2, 2, 2))
         for i, corner in enumerate(CORNERS):
             cell[tuple(corner)] = 0.5 if case >> i & 1 else -0.5
-        vertices, triangles = mcubes.marching_cubes(cell, 0.0)
+        with warnings.catch_warnings():
+            # PyMCubes 0.1.6 sets shapes of arrays, which NumPy 2.5 warns of.
+            warnings.filterwarnings("ignore", "Setting the shape", DeprecationWarning)
+            vertices, triangles = mcubes.marching_cubes(cell, 0.0)
         counts[case] = len(triangles)
         for t, triangle in enumerate(np.asarray(triangles, np.int64)):
             edges[case, t] = [middles[tuple(np.rint(2 * vertices[v]).astype(int))] for v in triangle]
