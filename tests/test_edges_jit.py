@@ -10,7 +10,8 @@ import rts
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
 
-pytestmark = [pytest.mark.splatting, pytest.mark.thorough]
+pytestmark = pytest.mark.splatting
+thorough = pytest.mark.thorough
 
 SIZE = 24, 28
 POSE = np.array([0.1, -0.2, 0.05, 0.03, 0.02, -0.04], np.float32)
@@ -40,6 +41,7 @@ def loss(pose):
     return (picture * jnp.asarray(np.random.default_rng(0).normal(size=picture.shape), picture.dtype)).mean()
 
 
+@thorough
 def test_jit_changes_neither_image_nor_derivatives():
     pose = jnp.asarray(POSE)
     np.testing.assert_allclose(jax.jit(image)(pose), image(pose), atol=2e-5)
@@ -48,6 +50,7 @@ def test_jit_changes_neither_image_nor_derivatives():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(loss))(pose), gradient, atol=1e-6)
 
 
+@thorough
 def test_forward_over_reverse_is_the_same_in_a_program():
     pose, way = jnp.asarray(POSE), jnp.ones(6, jnp.float32)
 
@@ -59,6 +62,7 @@ def test_forward_over_reverse_is_the_same_in_a_program():
     np.testing.assert_allclose(jax.jit(twice)(pose), found, atol=1e-5)
 
 
+@thorough
 def test_vmap_is_a_loop():
     poses = jnp.asarray(np.stack([POSE, 0.5 * POSE, -POSE]))
     np.testing.assert_allclose(jax.vmap(image)(poses), np.stack([image(p) for p in poses]), atol=2e-5)
@@ -67,6 +71,7 @@ def test_vmap_is_a_loop():
 
 
 # Rays are cast by jax outside of a program, by NumPy in it: a step of depth at a limb may be a break in one of the two.
+@thorough
 @pytest.mark.parametrize(
     ("surface", "most"), [("mesh", 1e-4), ("bezier", 1e-4), ("isosurface", 1e-4), ("field", 0.01), ("ellipsoid", 0.03)]
 )
@@ -80,6 +85,7 @@ def test_every_kind_of_surface_is_found_in_a_program(surface, most):
     np.testing.assert_allclose(jax.jit(drawn)(pose), drawn(pose), atol=most)
 
 
+@thorough
 def test_constant_surfaces_are_evaluated_beside_outlines_in_a_program():
     """A surface of NumPy arrays is evaluated on the host, where it is sampled; only the camera is traced."""
     parts = [part.replace(transform=None) for part in two_parts(POSE)]
@@ -92,6 +98,7 @@ def test_constant_surfaces_are_evaluated_beside_outlines_in_a_program():
     np.testing.assert_allclose(jax.jit(drawn)(shift), drawn(shift), atol=2e-5)
 
 
+@thorough
 def test_breaks_beyond_the_room_are_counted():
     """Needles whose outlines have more breaks than a program has room for, unless it is given more."""
     count = 90

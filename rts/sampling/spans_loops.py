@@ -193,14 +193,21 @@ def spans_of(
                     continue
                 _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
                 least, most = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
-                for g in range(table[n, low], table[n, high]):
-                    m = gap[g, 1 - axis]
-                    start, end = least - 0.5 - m, most - 0.5 - m
-                    if min(end, 1.0) - max(start, 0.0) <= TINY:
-                        continue
-                    names[count, 0], names[count, 1] = g, t
-                    _fill(spans[count], start, end, line, corners, m + 0.5)
-                    count += 1
+                gaps = table[n, low], table[n, high]
+                count = _add(t, gaps, least, most, gap[:, 1 - axis], line, corners, names, spans, count)
+
+
+@compiled
+def _add(t, gaps, least, most, centres, line, corners, names, spans, count):
+    """Add the spans of a triangle on some gaps of a line, where it is seen from `least` to `most`; returns `count`."""
+    for g in range(gaps[0], gaps[1]):
+        start, end = least - 0.5 - centres[g], most - 0.5 - centres[g]
+        if min(end, 1.0) - max(start, 0.0) <= TINY:
+            continue
+        names[count, 0], names[count, 1] = g, t
+        _fill(spans[count], start, end, line, corners, centres[g] + 0.5)
+        count += 1
+    return count
 
 
 @compiled

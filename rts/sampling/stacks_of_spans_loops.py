@@ -365,6 +365,15 @@ def _fill_runs(g, scene, seen, depth, runs, knots):
     return count + 1
 
 
+@compiled
+def _next_knot(knots, k, known):
+    """The first of sorted knots that is greater than number k; the one after it if there is none."""
+    for m in range(k + 1, known):
+        if knots[m] > knots[k]:
+            return knots[m]
+    return knots[k + 1]
+
+
 @loop
 def changes(
     first, last, begins, order, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
@@ -415,11 +424,7 @@ def changes(
             place = knots[k]
             if k + 1 < known and place < 1 and (k == 0 or place > knots[k - 1]):
                 count, found = _end(place, stack, count, scene, runs, found, at[g], enders, result)
-                farther = knots[k + 1]
-                for m in range(k + 1, known):
-                    if knots[m] > place:
-                        farther = knots[m]
-                        break
+                farther = _next_knot(knots, k, known)
                 count, found = _start(place, farther, stack, count, scene, runs, found, at[g], enders, result)
         if not fill:
             counts[g] = found

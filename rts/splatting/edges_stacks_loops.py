@@ -30,78 +30,74 @@ def _weigh(rgba, row, y, x, through, behind):
 
 
 @compiled
-def _fill_slope(rgba, row, joined, k, y, x, axis, slope):
-    """Fill `slope` (4,): the mean of the differences of a layer's colour from and to the next cells, if joined."""
+def _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change):
+    """Fill `change` (4,): by how much a composite changes along an axis as its layer k alone shifts.
+
+    The layer's slope is the mean of the differences of its colour from and to the next cells, if joined.
+    """
     n, dy, dx = row[k, y, x], axis, 1 - axis
     after, before = n, n
     if joined[axis, y, x] and row[k, y + dy, x + dx] >= 0:
         after = row[k, y + dy, x + dx]
     if y - dy >= 0 and x - dx >= 0 and joined[axis, y - dy, x - dx] and row[k, y - dy, x - dx] >= 0:
         before = row[k, y - dy, x - dx]
+    opacity = (rgba[after, 3] - rgba[before, 3]) / 2
     for c in range(4):
-        slope[c] = (rgba[after, c] - rgba[before, c]) / 2
+        change[c] = through[k] * ((rgba[after, c] - rgba[before, c]) / 2 - opacity * behind[k, c])
 
 
 @loop
 def cells(first, last, positions, rgba, row, joined, out):
     """Fill lines `first` to `last` of `out` (H, W, 8): composites, and what moves along their slopes."""
-    most = len(row)
-    through, behind, slope = np.empty(most), np.empty((most, 4)), np.empty(4)
-    for y in range(first, last):
-        for x in range(row.shape[2]):
-            count = _weigh(rgba, row, y, x, through, behind)
-            out[y, x] = 0.0
-            for k in range(count):
-                n = row[k, y, x]
+    (most, _, width), at = row.shape, np.empty(2, np.int64)
+    through, behind, change = np.empty(most), np.empty((most, 4)), np.empty(4)
+    for i in range(first * width, last * width):
+        y, x = i // width, i % width
+        at[0], at[1], out[y, x] = x, y, 0.0
+        for k in range(_weigh(rgba, row, y, x, through, behind)):
+            n = row[k, y, x]
+            for c in range(4):
+                out[y, x, c] += through[k] * rgba[n, c]
+            for axis in range(2):
+                moved = positions[n, axis] - (at[axis] + 0.5)
+                _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change)
                 for c in range(4):
-                    out[y, x, c] += through[k] * rgba[n, c]
-                for axis in range(2):
-                    moved = positions[n, axis] - ((x if axis == 0 else y) + 0.5)
-                    _fill_slope(rgba, row, joined, k, y, x, axis, slope)
-                    for c in range(4):
-                        out[y, x, 4 + c] -= through[k] * (slope[c] - slope[3] * behind[k, c]) * moved
+                    out[y, x, 4 + c] -= change[c] * moved
 
 
 @loop
 def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
     """Fill lines of `out` (H, W, 8) with the derivative of `cells` along tangents; empty ones are zeros."""
-    most = len(row)
-    through, behind, slope = np.empty(most), np.empty((most, 4)), np.empty(4)
-    for y in range(first, last):
-        for x in range(row.shape[2]):
-            count = _weigh(rgba, row, y, x, through, behind)
-            out[y, x] = 0.0
-            for k in range(count):
-                n = row[k, y, x]
-                if len(t_rgba):
-                    for c in range(4):
-                        out[y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, 3] * behind[k, c])
-                if len(t_positions):
-                    for axis in range(2):
-                        _fill_slope(rgba, row, joined, k, y, x, axis, slope)
-                        for c in range(4):
-                            change = through[k] * (slope[c] - slope[3] * behind[k, c])
-                            out[y, x, 4 + c] -= change * t_positions[n, axis]
+    most, _, width = row.shape
+    through, behind, change = np.empty(most), np.empty((most, 4)), np.empty(4)
+    colors, axes = 4 if len(t_rgba) else 0, 2 if len(t_positions) else 0
+    for i in range(first * width, last * width):
+        y, x = i // width, i % width
+        out[y, x] = 0.0
+        for k in range(_weigh(rgba, row, y, x, through, behind)):
+            n = row[k, y, x]
+            for c in range(colors):
+                out[y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, 3] * behind[k, c])
+            for axis in range(axes):
+                _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change)
+                for c in range(4):
+                    out[y, x, 4 + c] -= change[c] * t_positions[n, axis]
 
 
 @loop
 def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     """Add to gradients of samples those of `cells`; empty ones are not wanted."""
-    most = len(row)
-    through, behind, slope = np.empty(most), np.empty((most, 4)), np.empty(4)
-    for y in range(row.shape[1]):
-        for x in range(row.shape[2]):
-            count = _weigh(rgba, row, y, x, through, behind)
-            for k in range(count):
-                n = row[k, y, x]
-                if len(g_rgba):
-                    for c in range(4):
-                        g_rgba[n, c] += through[k] * g[y, x, c]
-                        g_rgba[n, 3] -= through[k] * behind[k, c] * g[y, x, c]
-                if len(g_positions):
-                    for axis in range(2):
-                        _fill_slope(rgba, row, joined, k, y, x, axis, slope)
-                        total = 0.0
-                        for c in range(4):
-                            total += (slope[c] - slope[3] * behind[k, c]) * g[y, x, 4 + c]
-                        g_positions[n, axis] -= through[k] * total
+    most, height, width = row.shape
+    through, behind, change = np.empty(most), np.empty((most, 4)), np.empty(4)
+    colors, axes = 4 if len(g_rgba) else 0, 2 if len(g_positions) else 0
+    for i in range(height * width):
+        y, x = i // width, i % width
+        for k in range(_weigh(rgba, row, y, x, through, behind)):
+            n = row[k, y, x]
+            for c in range(colors):
+                g_rgba[n, c] += through[k] * g[y, x, c]
+                g_rgba[n, 3] -= through[k] * behind[k, c] * g[y, x, c]
+            for axis in range(axes):
+                _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change)
+                for c in range(4):
+                    g_positions[n, axis] -= change[c] * g[y, x, 4 + c]
