@@ -19,8 +19,8 @@ class Splatter(Plugin):
     """The step from shaded samples to an image that has derivatives at occlusion boundaries.
 
     Attributes:
-        layers: the number of layers it reads, from the front; None for all.
-        opaque_layers: the same where all parts are opaque; None for `layers`.
+        layers: the number of layers it reads, from the front; None for all. A `translucent` splatter reads all layers
+            where light passes through some part.
         reach: the largest distance, in cells along either axis, at which a sample has an effect; at least 1.
         reads: the fields that it reads, out of `Cells.facing` and `Cells.exit` (samplers compute no others) and
             `Splats.outlines`, by name.
@@ -34,7 +34,6 @@ class Splatter(Plugin):
     """
 
     layers: int | None = None
-    opaque_layers: int | None = None
     reach: int = 1
     reads: frozenset[str] = frozenset()
     fills_interiors: bool = False

@@ -198,7 +198,7 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
 def _at_centres(
     row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
 ) -> Fronts:
-    """What is seen at centres (K, H, W): the `row` and `depth` of a scene, and the triangles of its parts' samples."""
+    """Surfaces seen at centres (K, H, W), from the `row` and `depth` of a scene, and its parts' triangles."""
     counts = [own.ids.shape[-2] for own in samples]
     none = [np.full(count, -1, np.int32) for count in counts]
     of_samples = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
@@ -335,7 +335,7 @@ class _Points:
 
 
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
-    """What is seen at centres (K, H, W), without what lies behind an opaque layer."""
+    """The surfaces seen at centres (K, H, W), without what lies behind an opaque layer."""
     part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
     for own in part:
         own[hidden] = -1

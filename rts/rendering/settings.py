@@ -10,6 +10,7 @@ from typing import Any, Literal
 from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
 from rts.errors import InputError
+from rts.plugin_base import promised
 from rts.registry import name_of
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned
@@ -62,11 +63,11 @@ class RenderSettings:
                 f"without further samples; give 1, or a number of samples along each side of a pixel"
             )
         settings = cls(splatter, layers if layers == "auto" else int(layers), supersample, capacity)
-        return size, settings._of_most(splatter.layers)
+        return size, settings._of_most(None if promised(splatter, "translucent") else splatter.layers)
 
     def of(self, fronts_suffice: bool) -> RenderSettings:
         """The settings for a scene; `fronts_suffice` is `Scene.fronts_suffice`."""
-        return self._of_most(self.splatter.opaque_layers) if self.splatter and fronts_suffice else self
+        return self._of_most(self.splatter.layers) if self.splatter and fronts_suffice else self
 
     def _of_most(self, most: int | None) -> RenderSettings:
         """The settings with no more layers than are read; None for all."""

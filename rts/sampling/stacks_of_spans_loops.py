@@ -278,7 +278,7 @@ def _note(kind, at, partner, place, stack, count, scene, found, base, enders, re
 
 @compiled
 def _cross(place, until, stack, count, scene, found, base, enders, result):
-    """What passes through one another between two places; returns the number of changes."""
+    """Record runs that pass through one another between two places; returns the number of changes."""
     own, spans = scene[0], scene[1]
     for _ in range(count * count):
         there, m = _next_meeting(stack, count, own, spans, place, until)
@@ -292,7 +292,7 @@ def _cross(place, until, stack, count, scene, found, base, enders, result):
 
 @compiled
 def _end(place, stack, count, scene, runs, found, base, enders, result):
-    """What ends at a place, or goes on with another span; returns the stack's height and the number of changes."""
+    """Take out runs that end, or go on with another span; returns the stack's height and the number of changes."""
     low, high, after, before, live, inside = runs
     own, parts, m = scene[0], scene[3], 0
     while m < count:
@@ -319,7 +319,7 @@ def _end(place, stack, count, scene, runs, found, base, enders, result):
 
 @compiled
 def _start(place, farther, stack, count, scene, runs, found, base, enders, result):
-    """What starts at a place; returns the stack's height and the number of changes."""
+    """Put in the runs that start at a place; returns the stack's height and the number of changes."""
     low, high, after, before, live, inside = runs
     own, spans, parts = scene[0], scene[1], scene[3]
     for i in range(len(own)):

@@ -49,7 +49,7 @@ class Edges(SummingSplatter):
     `rts.splatting.edges_stacks`.
     """
 
-    opaque_layers = 1
+    layers = 1
     reads = frozenset({"outlines"})
     translucent = True
 

@@ -65,7 +65,7 @@ def _from_the_back(color: Array) -> tuple[range, Array]:
 
 
 class Operands(NamedTuple):
-    """What takes the place of stacks in `rts.splatting.edges`: a composite for each cell, and for each side of a break.
+    """Composites in place of stacks, for `rts.splatting.edges`: one for each cell, and for each side of a break.
 
     Attributes:
         positions: (M, 3), of cells, which stand still; then of both sides of breaks, of the layer that ends there.
