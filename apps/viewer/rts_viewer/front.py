@@ -89,14 +89,30 @@ class Front:
 
     async def _serve(self, host: str, port: int, started: Future[None]) -> None:
         self._loop, self._over = asyncio.get_running_loop(), asyncio.Event()
+        self._open: set[asyncio.StreamWriter] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
         try:
-            server = await asyncio.start_server(self._connected, host, port, limit=HEAD)
+            server = await asyncio.start_server(self._accepted, host, port, limit=HEAD)
         except OSError as error:
             started.set_exception(error)
             return
         started.set_result(None)
         await self._over.wait()
+        for listening in server.sockets:
+            self._loop.remove_reader(listening.fileno())
+        for _ in range(10):  # Connections just accepted must be open before they can be closed, and `close` would fail.
+            for writer in self._open:
+                writer.transport.abort()
+            if not (tasks := asyncio.all_tasks() - {asyncio.current_task()}):
+                break
+            await asyncio.wait(tasks, timeout=0.1)
         server.close()
+
+    def _accepted(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._open.add(writer)
+        task = asyncio.create_task(self._connected(reader, writer))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Look at the head of the only request of a connection: viser's server, too, takes one for each."""
@@ -110,9 +126,12 @@ class Front:
                     await writer.drain()
             finally:
                 writer.close()
+                await writer.wait_closed()
+                self._open.discard(writer)
 
     async def _hand_on(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         answers, requests = await asyncio.open_connection(*self._behind)
+        self._open.add(requests)
         requests.write(head)
         upwards = asyncio.create_task(_pump(reader, requests))
         try:
@@ -120,6 +139,7 @@ class Front:
         finally:
             upwards.cancel()
             requests.close()
+            self._open.discard(requests)
 
 
 async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:

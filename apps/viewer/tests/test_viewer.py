@@ -1,11 +1,12 @@
 """The page that shows a fit: where it is served, its controls, and what a browser sees."""
 
+import gc
 import http.client
 import socket
 import sys
 import threading
 import urllib.request
-from contextlib import closing
+from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 import viser
 from browser import Browser, program, until
 from helpers import GREEN, RED, ball, free_port, view, watching
+from rts_viewer.front import Front
 from rts_viewer.history import History, State
 from rts_viewer.pictures import loss_curve, small
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -118,6 +120,18 @@ def test_an_end_with_open_connections_is_quiet_and_ends_them(capfd):
     assert not watch._page._front._thread.is_alive()
     out = capfd.readouterr()
     assert not out.out and not out.err
+
+
+def test_connections_that_come_as_it_ends_are_closed():
+    for _ in range(20):
+        port = free_port()
+        front = Front("127.0.0.1", port, ("127.0.0.1", free_port()))
+        with ExitStack() as opened:
+            for _ in range(5):
+                opened.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10)).sendall(b"GET")
+            front.close()
+            assert not front._thread.is_alive()
+        gc.collect()  # A socket that was left open would warn here.
 
 
 def test_only_this_machine_sees_the_page():
