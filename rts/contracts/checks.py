@@ -208,6 +208,16 @@ def check_splatter(chosen: Any) -> Splatter:
     return splatter
 
 
+def splatter_of(chosen: Any, outlines: bool) -> Splatter:
+    """A usable splatter, as `check_splatter`; of samples with outlines between them, or without, if "auto" is given."""
+    return check_splatter("visible" if is_auto(chosen) and not outlines else chosen)
+
+
+def is_auto(chosen: Any) -> bool:
+    """True for the name "auto"."""
+    return isinstance(chosen, str) and chosen == "auto"
+
+
 def check_shader(chosen: Any, what: str) -> Shader:
     """A usable shader from a name, a class, an object or a function; `what` names it."""
     shader = registry.instance("rts.shaders", chosen)
@@ -275,7 +285,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     Also allowed are `layers="auto"` and a capacity of None.
     """
     height, width = check_pixels(size)
-    if not (isinstance(layers, str) and layers == "auto") and not is_count(layers):
+    if not is_auto(layers) and not is_count(layers):
         raise InputError(f'layers is {quoted(layers)}; expected an integer of at least 1, or "auto"')
     if capacity is not None and not is_count(capacity):
         raise InputError(f"capacity is {quoted(capacity)}; expected an integer of at least 1, or None")

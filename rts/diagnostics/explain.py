@@ -35,7 +35,7 @@ def explain(
     size: tuple[int, int] | None = None,
     *,
     splatter: SplatterLike = "auto",
-    layers: Layers = 2,
+    layers: Layers = "auto",
     supersample: Supersample = 1,
 ) -> list[Choice]:
     """Explain which sampler `sampler="auto"` chooses for each part, and count samples if a size is given.

@@ -23,6 +23,7 @@ from rts.contracts.checks import (
     check_sampler,
     check_scene,
     is_count,
+    splatter_of,
 )
 from rts.contracts.records import ArraySpec, Fine, Splats
 from rts.contracts.residuals import Residuals
@@ -107,7 +108,7 @@ class ImageResiduals(Residuals):
         background: BackgroundLike = None,
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
-        layers: Layers = 2,
+        layers: Layers = "auto",
         supersample: Supersample = 1,
         capacity: int | None = None,
         channels: int = 3,
@@ -284,26 +285,26 @@ class ImageResiduals(Residuals):
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*equations, strict=True))
             return value, matrix, gradient
         engine = engine_of(parameters)
-        splatter, equations = self._settings.reader, None
+        splatter, equations = self._settings.splatter, None
         if (
             self._ordinary
             and not self._sigma
-            and isinstance(splatter, SummingSplatter)
+            and (splatter == "auto" or isinstance(splatter, SummingSplatter))
             and engine.differentiates
             and self._image_channels == 3
             and self._settings.contrast is None
         ):
-            equations = self._swept(splatter, parameters, engine)
+            equations = self._swept(parameters, engine)
         return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 
-    def _swept(self, splatter: SummingSplatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
+    def _swept(self, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` without a Jacobian: by the splatter's method of that name, band of rows by band.
 
         None where the splatter's method gives None.
         """
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
-            equations = self._swept_band(splatter, parameters, engine, top, rows)
+            equations = self._swept_band(parameters, engine, top, rows)
             if equations is None:
                 return None
             # Means over a band become shares of means over the image.
@@ -312,9 +313,7 @@ class ImageResiduals(Residuals):
         value, matrix, gradient = total
         return value, matrix, gradient
 
-    def _swept_band(
-        self, splatter: SummingSplatter, parameters: Tree, engine: Engine, top: int, rows: int
-    ) -> tuple[Array, Array, Array] | None:
+    def _swept_band(self, parameters: Tree, engine: Engine, top: int, rows: int) -> tuple[Array, Array, Array] | None:
         """`normal_equations` of a band: of `rows` rows of the image, from row `top` on, with means over the band alone.
 
         None where the splatter's method gives None.
@@ -329,6 +328,9 @@ class ImageResiduals(Residuals):
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
         sampled = sample(parts, window(camera), size, sampler=self._sampler, settles=True, **vars(self._settings))
+        splatter = splatter_of(self._settings.splatter, sampled.outlines is not None)
+        if not isinstance(splatter, SummingSplatter):
+            return None
         checked, _ = _checked(parts, camera)
         self._refuse_other(checked[0].shader.channels)
         opaque = all(part.shader.opaque for part in checked)

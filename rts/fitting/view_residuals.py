@@ -97,7 +97,7 @@ class ViewResiduals(Residuals):
         background: BackgroundLike = None,
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
-        layers: Layers = 2,
+        layers: Layers = "auto",
         supersample: Supersample = 1,
         capacity: int | None = None,
         channels: int = 3,

@@ -41,7 +41,7 @@ def render_views(
     *,
     sampler: SamplerLike = "auto",
     splatter: SplatterLike = "auto",
-    layers: Layers = 2,
+    layers: Layers = "auto",
     supersample: Supersample = 1,
     background: BackgroundLike = None,
     capacity: int | None = None,
@@ -108,7 +108,7 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of several views of one scene, without a background."""
-    settings = settings.of(scenes[0].fronts_suffice)
+    settings = settings.of(scenes[0])
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])

@@ -9,7 +9,7 @@ from functools import partial
 from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.arrays.trees import Array
-from rts.contracts.checks import check_background, check_splatter
+from rts.contracts.checks import check_background, splatter_of
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
@@ -36,7 +36,7 @@ def render(
     *,
     sampler: SamplerLike = "auto",
     splatter: SplatterLike = "auto",
-    layers: Layers = 2,
+    layers: Layers = "auto",
     supersample: Supersample = 1,
     background: BackgroundLike = None,
     capacity: int | None = None,
@@ -98,7 +98,7 @@ def image_over(scene: Scene, size: tuple[int, int], background: Array | None, se
 
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The image (H, W, C + 1) of a checked scene, without a background; for `context` see `splatted`."""
-    settings = settings.of(scene.fronts_suffice)
+    settings = settings.of(scene)
     if settings.contrast is not None:
         return _of_contrast(scene, size, context, settings)
     bands, reader = settings.bands(size), settings.reader
@@ -198,7 +198,7 @@ def render_samples(
         raise InputError(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
-    splatter = check_splatter(splatter)
+    splatter = splatter_of(splatter, sampled.outlines is not None)
     if apron < splatter.reach + 1:
         raise InputError(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
@@ -210,7 +210,8 @@ def render_samples(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "
             f"{shaders} need; give rts.sample this splatter and these parts, or leave it out"
         )
-    sampled = _narrowed(sampled, apron - splatter.reach - 1)
+    if "outlines" not in splatter.reads:
+        sampled = _narrowed(replace(sampled, outlines=None), apron - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
     context = scene.context_with(sampled, background)
     return over_background(splatted(sampled, scene, scene.camera, context, splatter), background)

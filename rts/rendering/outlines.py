@@ -11,15 +11,17 @@ import numpy as np
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
-from rts.errors import InputError
+from rts.errors import InputWarning, warn
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
 from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
+from rts.sampling.sample_checks import check_samples
 from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
 from rts.sampling.spans import breaks_of_triangles
 from rts.sampling.stacks_of_spans import breaks_of_stacks
+from rts.sampling.strips import at_cells
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -27,7 +29,8 @@ from rts.scene.camera import Camera
 def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
     """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
 
-    Of several layers the outlines are those of all that light reaches; all parts must have `layered` outlines then.
+    Where light passes through, the outlines are those of all layers that it reaches, if the scene is `layered`; else
+    those of the first layer.
 
     Args:
         sampled: the samples at centres.
@@ -39,13 +42,15 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     Raises:
         InputError: a sampler cannot sample single points.
     """
-    known = []
+    cells, known = sampled.cells, []
+    if all(scene.opaque) or not scene.layered:
+        sampled = replace(sampled, cells=cells.first(1))
     for part in scene.parts:
         known.append((part.transform, {name: part.theta[name] for name in part.surface.reads(part.theta)}))
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or all(map(has_sheets, scene.parts, scene.chosen())):
+    if traced or scene.layered:
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
@@ -66,7 +71,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         none = 0 * rows[:, :2] - 1
         named = {"rows": rows[:, :2], "inner": rows[:, :2], "pair": none, **_stacks(found, rows[:, 2:])}
     outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
-    overflow, cells = sampled.overflow + found.left, _renumbered(sampled, samples)
+    overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
 
 
@@ -316,12 +321,17 @@ class _Points:
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
         request = Request(points=points, exits=exits, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
-        if "points" not in samples.followed:
-            raise InputError(
-                f"the sampler {name_of('rts.samplers', sampler)} does not sample single points, which splatter 'edges' "
-                f"needs; use sampler='raster', or splatter='visible'"
-            )
-        return samples
+        if "points" in samples.followed:
+            return samples
+        warn(
+            f"the sampler {name_of('rts.samplers', sampler)} does not sample single points, so that outlines lie midway"
+            f" between centres of pixels; use sampler='raster' or 'rays', or more samples a pixel",
+            InputWarning,
+        )
+        height, width = self._grid.size
+        x, y = (np.clip(np.floor(points[:, axis]), 0, count - 1) for axis, count in ((0, width), (1, height)))
+        cells = engine_of(samples.row).constant((y * width + x).astype(np.int32)[None], samples.row)
+        return at_cells(check_samples(samples, (height, width), sampler), cells, None)
 
     def _fronts(self, points: np.ndarray) -> Fronts:
         """The nearest samples of all parts at points (M, 2); of equal ones the first part's."""

@@ -80,7 +80,7 @@ class Renderer:
         size: tuple[int, int],
         *,
         splatter: SplatterLike = "auto",
-        layers: Layers = 2,
+        layers: Layers = "auto",
         supersample: Supersample = 1,
         background: BackgroundLike = None,
         capacity: int | None = None,

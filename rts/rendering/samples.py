@@ -41,7 +41,7 @@ def sample(
     *,
     sampler: SamplerLike = "auto",
     splatter: SplatterLike | None = None,
-    layers: Layers = 2,
+    layers: Layers = "auto",
     supersample: Supersample = 1,
     capacity: int | None = None,
     engine: str | None = None,
@@ -55,7 +55,7 @@ def sample(
         size: as in `render`.
         sampler: as in `render`.
         splatter: the splatter for these samples: the apron suits its reach, and hidden samples that it does not need
-            are dropped. None keeps all samples, with an apron that suits every built-in splatter.
+            are dropped. None keeps all samples, and finds outlines, with an apron that suits every built-in splatter.
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.
@@ -92,7 +92,7 @@ def sampled_scene(
 
     See `sample`. With `settles`, samples of cells whose colour cannot change may be left out.
     """
-    settings = settings.of(scene.fronts_suffice)
+    settings = settings.of(scene)
     hidden, side = scene.hidden_by(settings.splatter, settles), settings.side
     if side is not None:
         return _on_one_grid(scene, camera, size, settings, side, hidden)
@@ -129,8 +129,8 @@ def _on_one_grid(
     check_memory(height, width, settings.most_layers, capacity, gradient=gradient)
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     exits = exits and "exit" in reader.reads and gradient
-    outlines = "outlines" in reader.reads
-    request = Request(capacity, facing="facing" in reader.reads, exits=exits, between=settings.thin, triangles=outlines)
+    outlines, facing = settings.finds_outlines, "facing" in reader.reads
+    request = Request(capacity, facing=facing, exits=exits, between=settings.thin, triangles=outlines)
     taken = partial(_taken, scene.telling(settings.thin), grid, request)
     if settings.layers == "auto":
         sampled = with_layers_that_count(taken, hidden, scene.opaque)

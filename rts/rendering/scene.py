@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from rts.arrays.engines import Context, context_of_scene
-from rts.arrays.trees import Tree
+from rts.arrays.engines import Context, context_of_scene, is_traced
+from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
 from rts.contracts.splatter import Splatter
@@ -52,9 +52,15 @@ class Scene(NamedTuple):
         return [bool(part.shader.opaque) for part in self.parts]
 
     @property
-    def fronts_suffice(self) -> bool:
-        """True if outlines are found between fronts alone: all is opaque, or some samples lie on no triangles."""
-        return all(self.opaque) or not all(map(has_sheets, self.parts, self.chosen()))
+    def layered(self) -> bool:
+        """True if outlines can be found between stacks of layers: all samples lie on triangles."""
+        return all(map(has_sheets, self.parts, self.chosen()))
+
+    @property
+    def traced(self) -> bool:
+        """True if it depends on traced values where samples lie."""
+        read = [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in self.parts]
+        return any(map(is_traced, leaves((read, [part.transform for part in self.parts], self.camera))))
 
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | Prepared, camera: Camera, sampler: Any, engine: str | None) -> Scene:

@@ -7,16 +7,19 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from rts.contracts.checks import check_size, check_splatter
+from rts.contracts.checks import check_size, check_splatter, is_auto, splatter_of
 from rts.contracts.splatter import Splatter
 from rts.errors import InputError
 from rts.plugin_base import promised
 from rts.registry import name_of
+from rts.rendering.scene import Scene
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned
 
 BAND = 2**20
 """Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""
+TRACED_LAYERS = {True: 2, False: 4}
+"""Number of layers of `layers="auto"` where values are traced, if all is opaque, or not."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +27,14 @@ class RenderSettings:
     """Checked settings of a render.
 
     Attributes:
-        splatter: the splatter that samples are for; None for any splatter, so that no sample may be left out.
+        splatter: the splatter that samples are for; "auto" until the scene is known, see `of`; None for any splatter,
+            so that no sample may be left out.
         layers: K, or "auto".
         supersample: samples along each side of a pixel, or an `Adaptive`.
         capacity: rows to allot for the samples of a part; None for as many as there are.
     """
 
-    splatter: Splatter | None
+    splatter: Splatter | Literal["auto"] | None
     layers: int | Literal["auto"]
     supersample: int | Adaptive
     capacity: int | None
@@ -56,18 +60,31 @@ class RenderSettings:
         size = check_size(size, layers, capacity, finest)
         if not isinstance(supersample, Adaptive):
             supersample = int(supersample)
-        splatter = check_splatter(splatter)
-        if isinstance(supersample, Adaptive) and "outlines" in splatter.reads:
+        adaptive = isinstance(supersample, Adaptive)
+        if is_auto(splatter) and not adaptive:
+            return size, cls("auto", layers if is_auto(layers) else int(layers), supersample, capacity)
+        splatter = splatter_of(splatter, outlines=False)
+        if adaptive and "outlines" in splatter.reads:
             raise InputError(
                 f"supersample is {supersample!r}, and splatter {name_of('rts.splatters', splatter)!r} finds outlines "
                 f"without further samples; give 1, or a number of samples along each side of a pixel"
             )
-        settings = cls(splatter, layers if layers == "auto" else int(layers), supersample, capacity)
+        settings = cls(splatter, layers if is_auto(layers) else int(layers), supersample, capacity)
         return size, settings._of_most(None if promised(splatter, "translucent") else splatter.layers)
 
-    def of(self, fronts_suffice: bool) -> RenderSettings:
-        """The settings for a scene; `fronts_suffice` is `Scene.fronts_suffice`."""
-        return self._of_most(self.splatter.layers) if self.splatter and fronts_suffice else self
+    def of(self, scene: Scene) -> RenderSettings:
+        """The settings for a scene: with a splatter, and a number of layers where values are traced.
+
+        "auto" is "edges", but "visible" where light passes through surfaces whose outlines are not found layer by
+        layer.
+        """
+        splatter, layers, opaque = self.splatter, self.layers, all(scene.opaque)
+        if splatter == "auto":
+            splatter = splatter_of("auto", outlines=opaque or scene.layered)
+        if layers == "auto" and scene.traced:
+            layers = TRACED_LAYERS[opaque]
+        settings = replace(self, splatter=splatter, layers=layers)
+        return settings._of_most(splatter.layers) if splatter and (opaque or not scene.layered) else settings
 
     def _of_most(self, most: int | None) -> RenderSettings:
         """The settings with no more layers than are read; None for all."""
@@ -82,8 +99,8 @@ class RenderSettings:
 
     @property
     def finds_outlines(self) -> bool:
-        """True if the splatter reads the outlines between centres."""
-        return "outlines" in self.reader.reads
+        """True if the splatter reads the outlines between centres, or may do so."""
+        return self.side is not None if self.splatter is None else "outlines" in self.reader.reads
 
     @property
     def contrast(self) -> float | None:
@@ -102,8 +119,8 @@ class RenderSettings:
 
     @property
     def reader(self) -> Splatter:
-        """The splatter whose `reads` and `reach` guide sampling: the given one, or the default."""
-        return self.splatter or check_splatter("auto")
+        """The splatter whose `reads` and `reach` guide sampling: the given one, or the one that reads most."""
+        return self.splatter if isinstance(self.splatter, Splatter) else check_splatter("visible")
 
     @property
     def apron(self) -> int:
