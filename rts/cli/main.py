@@ -194,6 +194,14 @@ def _size(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[-1])
 
 
+def _layers(text: str) -> Any:
+    """The `layers` written as "4" or "auto"."""
+    try:
+        return int(text)
+    except ValueError:
+        return text  # Refused where layers are.
+
+
 def _supersample(text: str) -> Any:
     """The `supersample` written as "4" or "adaptive:4"."""
     from rts.sampling.adaptive import Adaptive
@@ -314,9 +322,9 @@ def render(
     up: Up = "y",
     sampler: Annotated[str, typer.Option(help="Name of a sampler, see `rts plugins`.")] = "auto",
     engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
-    layers: Annotated[int, typer.Option(help="Surface layers kept at each pixel.")] = 2,
+    layers: Annotated[str, typer.Option(help="Surface layers kept at each pixel, or auto.")] = "auto",
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
-    splatter: Annotated[str, typer.Option(help="Name of a splatter: visible, multi, single or none.")] = "auto",
+    splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, visible, multi, single or none.")] = "auto",
     supersample: Annotated[
         str, typer.Option(help="Samples along each side of a pixel: 4; or adaptive:4, where outlines are.")
     ] = "1",
@@ -363,7 +371,7 @@ def render(
         shape,
         sampler=sampler,
         splatter=splatter,
-        layers=layers,
+        layers=_layers(layers),
         supersample=_supersample(supersample),
         background=color,
     )

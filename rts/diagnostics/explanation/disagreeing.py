@@ -157,30 +157,30 @@ def _constants(case: _Case, touched: Touched) -> None:
 
 
 def _outlines(case: _Case, touched: Touched) -> None:
-    """Add a finding on the splatter if the splatter "visible", in its place, makes the error much smaller."""
+    """Add a finding on the splatter if the one that suits the scene, in its place, makes the error much smaller."""
     splatter = case.subject.options.get("splatter", "auto")
-    if case.subject.splats_as("visible"):
+    if case.subject.splats_as("auto"):
         return
-    before = case.try_out(splatter="visible")
+    before = case.try_out(splatter="auto")
     if before is not None:
         told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
-        because = f"{told} lacks the derivative of outlines that 'visible' has"
-        advice = "Leave out splatter=, or say 'visible'."
+        because = f"{told} lacks derivatives of outlines that 'auto' has"
+        advice = "Leave out splatter=."
         case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
 
 
 def _transparent(case: _Case, touched: Touched) -> None:
-    """Add a finding on shaders that are not opaque, if the splatter "visible" makes the error much smaller."""
-    if case.subject.opaque or case.subject.splats_as("visible"):
+    """Add a finding on shaders that are not opaque, if the splatter that suits them makes the error much smaller."""
+    if case.subject.opaque or case.subject.splats_as("auto"):
         return
-    before, advice = case.try_out(splatter="visible"), "Say splatter='visible'."
+    before, advice = case.try_out(splatter="auto"), "Leave out splatter=."
     if before is not None:
         because = "shaders are not opaque, but the splatter loses what shines through layers"
         case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
 
 
 def _layers(case: _Case, touched: Touched) -> None:
-    layers = case.subject.options.get("layers", 2)
+    layers = case.subject.options.get("layers", "auto")
     if isinstance(layers, str) or layers >= DEEP:
         return
     before = case.try_out(layers=DEEP)
@@ -233,7 +233,7 @@ def _crossing(case: _Case, touched: Touched) -> None:
         mask[apron:-apron, apron:-apron],
         "crossing",
         "parts pass through one another there, and their line of crossing moves otherwise than either",
-        'Take the splatter "visible", whose lines of crossing move, with more layers or samples; or part them.',
+        'Take the splatter "edges", whose lines of crossing move, or more samples; or part them.',
     )
 
 

@@ -142,7 +142,7 @@ class Subject:
 
         If shaders are not opaque, at least `DEEP` layers are kept.
         """
-        layers = self.options.get("layers", 2)
+        layers = self.options.get("layers", "auto")
         if not self.opaque:
             layers = max(DEEP, 0 if isinstance(layers, str) else layers)
         options = dict(splatter="none", supersample=samples, layers=layers)
