@@ -187,7 +187,7 @@ def own_truth(f: Callable, q: tuple[float, float], index: int) -> np.ndarray:
 
     def triangles(q: np.ndarray) -> np.ndarray:
         part = rts.Part(isosurface(f=f, shape=SHAPE), {"q": torch.tensor(q)}, "silhouette")
-        row = rts.sample(part, CAMERA, (OWN_RAYS * SIZE,) * 2, layers=1).row[0] >= 0
+        row = rts.sample(part, CAMERA, (OWN_RAYS * SIZE,) * 2, splatter=None, layers=1).row[0] >= 0
         border = (len(row) - OWN_RAYS * SIZE) // 2
         hit = row.numpy()[border:-border, border:-border] if border else row.numpy()
         return hit.reshape(SIZE, OWN_RAYS, SIZE, OWN_RAYS).mean(axis=(1, 3))

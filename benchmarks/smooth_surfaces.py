@@ -245,7 +245,7 @@ def gradient(found: Contender, scene: Scene, size: tuple[int, int], shader: str,
 
 
 def covered(part: rts.Part, side: int) -> np.ndarray:
-    return rts.sample(part, camera(), (side, side), layers=2).row[0] >= 0
+    return rts.sample(part, camera(), (side, side), splatter=None, layers=2).row[0] >= 0
 
 
 def outline(mask: np.ndarray) -> float:

@@ -218,7 +218,7 @@ def pane_splats(layers: int, alpha: float) -> Splats:
         (left, right), (bottom, top) = sides
         parts.append(card(0.8 - 0.2 * i, color, alpha, left, right, bottom, top))
     scene = Scene.of(parts, CAMERA, "raster", "torch").at((256, 256))
-    sampled = rts.sample(parts, CAMERA, (256, 256), layers=layers, sampler="raster", engine="torch")
+    sampled = rts.sample(parts, CAMERA, (256, 256), splatter=None, layers=layers, sampler="raster", engine="torch")
     return to_splats(sampled, scene.parts, scene.camera, scene.camera, scene.context)
 
 

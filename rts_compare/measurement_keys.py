@@ -33,7 +33,7 @@ def state_key(parts: list[Part], camera: Camera, size: tuple[int, int]) -> str:
     arrays = [*leaves([p.theta for p in parts]), *leaves([p.transform for p in parts]), *leaves(camera.for_size(size))]
     layers = layers_of(parts, camera)
     image = render(parts, camera, size, splatter="none", layers=layers)
-    arrays += [sample(parts, camera, size, layers=layers).depth, image]
+    arrays += [sample(parts, camera, size, splatter=None, layers=layers).depth, image]
     host = [np.asarray(engine_of(x).to_numpy(engine_of(x).stop_gradient(x))) for x in arrays]
     text = repr((size, [(p.cull, type(p.surface).__qualname__) for p in parts], fingerprint(host)))
     return hashlib.sha256(text.encode()).hexdigest()[:20]

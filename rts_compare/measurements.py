@@ -269,7 +269,7 @@ class Measurements:
             for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
                 side = size[0]
                 with limited(patience):
-                    _quietly(lambda size=size: sample(parts, camera, size, sampler=name, layers=1))
+                    _quietly(lambda size=size: sample(parts, camera, size, sampler=name, splatter=None, layers=1))
         except InputError as error:
             return {"suits": False, "why": one_line(str(error))}
         except TooSlow as error:

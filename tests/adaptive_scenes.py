@@ -22,7 +22,7 @@ def scene(vertices=BALL, shader="unlit"):
 
 
 def render(parts, supersample, **options):
-    return rts.render(parts, CAMERA, SIZE, supersample=supersample, **{"layers": 3, **options})
+    return rts.render(parts, CAMERA, SIZE, supersample=supersample, **{"splatter": "visible", "layers": 3, **options})
 
 
 def activate(monkeypatch, mask):

@@ -82,7 +82,7 @@ def test_dilation_reaches_the_eight_neighbours():
 
 def test_masks_are_dilated_for_shaders_of_more_than_one_colour_a_part():
     def active(shader, adaptive):
-        sampled = rts.sample(scene(shader=shader), CAMERA, SIZE, supersample=adaptive, layers=3)
+        sampled = rts.sample(scene(shader=shader), CAMERA, SIZE, supersample=adaptive, layers=3, splatter="visible")
         return sampled.fine.pixel >= 0
 
     bare = active("silhouette", Adaptive(4))
@@ -100,7 +100,7 @@ def test_cells_amid_one_colour_are_no_outlines_though_their_samples_are_left_out
     )
     np.testing.assert_array_equal(settled.fine.pixel, whole.fine.pixel)
     assert len(settled.samples[0].ids) < 0.7 * len(whole.samples[0].ids)
-    images = [rts.render_samples(s, part, CAMERA) for s in (whole, settled)]
+    images = [rts.render_samples(s, part, CAMERA, splatter="visible") for s in (whole, settled)]
     np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
 
 
@@ -118,7 +118,7 @@ def steps_of_colour():
 
 def test_contrast_finds_edges_of_colour():
     part = steps_of_colour()
-    images = [render(part, n) for n in (1, 4, Adaptive(4), Adaptive(4, contrast=0.2))]
+    images = [render(part, n, splatter="visible", layers=2) for n in (1, 4, Adaptive(4), Adaptive(4, contrast=0.2))]
     plain, fine, by_outlines, by_contrast = images
     np.testing.assert_array_equal(by_outlines, plain)
     changed = np.abs(by_contrast - plain).max(axis=-1) > 0
@@ -127,10 +127,12 @@ def test_contrast_finds_edges_of_colour():
 
 def test_contrast_is_refused_where_colours_are_not_known():
     with pytest.raises(rts.InputError, match="rts.sample knows no colours"):
-        rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4, contrast=0.2))
+        rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4, contrast=0.2), splatter="visible", layers=2)
     jax = pytest.importorskip("jax")
     with pytest.raises(rts.InputError, match="colours are traced"):
-        jax.jit(lambda v: render(scene(v), Adaptive(4, contrast=0.2)))(arrays("jax", BALL))
+        jax.jit(lambda v: render(scene(v), Adaptive(4, contrast=0.2), splatter="visible", layers=2))(
+            arrays("jax", BALL)
+        )
 
 
 # ------------------------------------------------------------------------------------------------------ the value
@@ -156,7 +158,7 @@ def test_more_fine_samples_than_memory_are_refused_before_they_are_laid_out(monk
     monkeypatch.setattr(rts.contracts.checks, "MEMORY", 8000 * SIZE[0] * SIZE[1])
     monkeypatch.setattr(rts.sampling.fine_samples, "lay_out", lambda *_: pytest.fail("laid out"))
     with pytest.raises(rts.InputError, match=r"1 x \d+ pixels .* or fewer samples a pixel"):
-        render(scene(), Adaptive(64))
+        render(scene(), Adaptive(64), splatter="visible", layers=2)
 
 
 def test_it_is_a_static_value():

@@ -67,7 +67,7 @@ def test_engines_agree(count, compiled):
 
     def loss(target):
         weigh = arrays(target, weights)
-        return lambda v: (render(scene(v)[:count], Adaptive(3)) * weigh).sum()
+        return lambda v: (render(scene(v)[:count], Adaptive(3), splatter="visible", layers=2) * weigh).sum()
 
     found = (jax.jit if compiled else lambda f: f)(jax.grad(loss("jax")))(arrays("jax", BALL))
     expected = gradient(TORCH[0], loss(TORCH[0]), arrays(TORCH[0], BALL))
@@ -111,8 +111,8 @@ def test_samplers_that_know_no_lists_serve_too(monkeypatch):
 
     mask = random_mask(5)
     activate(monkeypatch, mask)
-    found = rts.sample(scene(), CAMERA, SIZE, sampler=Whole(), supersample=Adaptive(3), layers=3)
-    listed = rts.sample(scene(), CAMERA, SIZE, sampler="raster", supersample=Adaptive(3), layers=3)
+    found = rts.sample(scene(), CAMERA, SIZE, sampler=Whole(), supersample=Adaptive(3), layers=3, splatter="visible")
+    listed = rts.sample(scene(), CAMERA, SIZE, sampler="raster", supersample=Adaptive(3), layers=3, splatter="visible")
     for a, b in zip(found.fine.samples, listed.fine.samples, strict=True):
         np.testing.assert_array_equal(a.row, b.row)
         np.testing.assert_allclose(a.params, b.params)
@@ -131,7 +131,7 @@ def test_every_surface_is_that_of_the_finer_image(name, monkeypatch):
     camera = rts.Camera.look_at((0.3, 0.4, 5.0), (0, 0, 0))
 
     def image(theta, supersample):
-        return rts.render(part.replace(theta=theta), camera, (12, 14), supersample=supersample)
+        return rts.render(part.replace(theta=theta), camera, (12, 14), splatter="visible", supersample=supersample)
 
     images = [to_numpy(image(theta, n)) for n in (Adaptive(2), 2)]
     np.testing.assert_allclose(images[0][mask], images[1][mask], atol=2e-5)
@@ -157,7 +157,9 @@ def edge(target, supersample, x=0.3):
     along = arrays(target, np.broadcast_to([1.0, 0, 0], vertices.shape))
 
     def alpha(v):
-        return rts.render(rts.Part(MESH(faces), {"vertices": v}), camera, (16, 16), supersample=supersample)[..., 3]
+        return rts.render(
+            rts.Part(MESH(faces), {"vertices": v}), camera, (16, 16), splatter="visible", supersample=supersample
+        )[..., 3]
 
     return derivative(target, alpha, arrays(target, vertices), along)
 
@@ -191,7 +193,7 @@ def test_a_ramp_that_moves_is_exact_whatever_is_active(target, monkeypatch):
 
     def image(v):
         part = rts.Part(MESH(faces), {"vertices": v, "colors": colors}, "unlit")
-        return rts.render(part, camera, (16, 16), supersample=Adaptive(3))[..., 0]
+        return rts.render(part, camera, (16, 16), supersample=Adaptive(3), splatter="visible", layers=2)[..., 0]
 
     found, slope = derivative(target, image, arrays(target, vertices), along)
     ramp = 0.5 + (np.arange(16) - 7.5) / 100
@@ -208,7 +210,7 @@ def test_the_outline_of_a_sphere_that_turns_stands_still():
             zero = 0 * t
             pose = rts.namespace(t).stack([t if m else zero for m in motion])
             part = rts.Part(MESH(faces), {"vertices": vertices}, transform=rts.rigid(pose))
-            return rts.render(part, camera, size, supersample=supersample)[..., 3]
+            return rts.render(part, camera, size, splatter="visible", supersample=supersample)[..., 3]
 
         slope = derivative(TORCH[0], alpha, *arrays(TORCH[0], (np.zeros(()), np.ones(()))))[1]
         blur = np.exp(-(np.subtract.outer(np.arange(96), np.arange(96)) ** 2) / 8) / np.sqrt(8 * np.pi)
@@ -242,8 +244,8 @@ def test_depths_beyond_active_pixels_make_no_difference():
     slope = np.array([(-20, -40, -4), (80, -40, -60), (80, 40, -60), (-20, 40, -4)], float)
     behind = rts.Part(MESH(FAR_FACES), {"vertices": slope}, "silhouette")
     for scene_ in (parts, [*parts, behind]):
-        found, fine = (to_numpy(render(scene_, n)) for n in (Adaptive(4), 4))
-        sampled = rts.sample(scene_, CAMERA, SIZE, supersample=Adaptive(4), layers=3)
+        found, fine = (to_numpy(render(scene_, n, splatter="visible", layers=2)) for n in (Adaptive(4), 4))
+        sampled = rts.sample(scene_, CAMERA, SIZE, supersample=Adaptive(4), layers=3, splatter="visible")
         mask = to_numpy(sampled.fine.pixel) >= 0
         np.testing.assert_allclose(found[mask], fine[mask], rtol=0, atol=1e-9)
     deepest = [max(float(s.depth.max()) for s in x) for x in (sampled.samples, sampled.fine.samples)]
@@ -292,10 +294,12 @@ def test_fits_take_fewer_samples():
     def posed(pose):
         return rts.Part(MESH(FACES), {"vertices": vertices}, transform=rts.rigid(pose))
 
-    goal = rts.render(posed(np.array([0.2, 0.1, 0.3, 0.05, 0, 0])), CAMERA, (48, 48), supersample=8)[..., 3]
+    goal = rts.render(
+        posed(np.array([0.2, 0.1, 0.3, 0.05, 0, 0])), CAMERA, (48, 48), supersample=8, splatter="visible", layers=2
+    )[..., 3]
     losses = []
     for s in (1, 4, Adaptive(4)):
-        residuals = rts.ImageResiduals(posed, CAMERA, (48, 48), goal, supersample=s)
+        residuals = rts.ImageResiduals(posed, CAMERA, (48, 48), goal, supersample=s, splatter="visible", layers=2)
         start = arrays(TORCH[0], np.array([0.1, 0, 0.2, 0, 0.05, 0]))
         losses.append(float(rts.fit(residuals, start, method="lm", progress=False).loss))
     assert losses[2] < 1.5 * losses[1] < 0.1 * losses[0]
@@ -308,5 +312,5 @@ def test_explain_counts_pixels_and_samples():
     assert choice.active == (sampled.fine.pixel >= 0).sum() > 0
     assert choice.fine == len(sampled.fine.samples[0].ids)
     assert choice.samples == choice.fine + len(sampled.samples[0].ids)
-    (plain,) = rts.explain(part, CAMERA, SIZE)
+    (plain,) = rts.explain(part, CAMERA, SIZE, splatter="visible")
     assert plain.samples == len(sampled.samples[0].ids) and plain.active is plain.fine is None

@@ -176,7 +176,11 @@ def wire_part(wire="slanted", z=0.0, color=(1.0, 0.5, 0.2)):
 
 
 def render(parts, supersample, **options):
-    return to_numpy(rts.render(parts, flat_camera(), PIXELS, supersample=supersample, **options))
+    return to_numpy(
+        rts.render(
+            parts, flat_camera(), PIXELS, supersample=supersample, **{"splatter": "visible", "layers": 2, **options}
+        )
+    )
 
 
 @pytest.mark.parametrize("wire", [wire for wire in WIRES if wire != "a speck"])
@@ -224,7 +228,9 @@ def test_unless_asked_nothing_looks_between_samples():
 def test_without_thin_things_images_are_the_same_to_the_last_bit():
     for shader in ("unlit", "lambert"):
         images = [
-            rts.render(scene(shader=shader), CAMERA, SIZE, supersample=Adaptive(4, thin=thin), layers=3)
+            rts.render(
+                scene(shader=shader), CAMERA, SIZE, supersample=Adaptive(4, thin=thin), layers=3, splatter="visible"
+            )
             for thin in (True, False)
         ]
         np.testing.assert_array_equal(*map(to_numpy, images))
@@ -238,7 +244,10 @@ def test_the_gradient_of_a_wire_is_that_of_as_many_samples_everywhere(target):
 
         def loss(vertices, supersample=supersample):
             moved = part.replace(theta={**part.theta, "vertices": vertices})
-            return (rts.render(moved, flat_camera(), PIXELS, supersample=supersample) * weights).sum()
+            return (
+                rts.render(moved, flat_camera(), PIXELS, supersample=supersample, splatter="visible", layers=2)
+                * weights
+            ).sum()
 
         gradients.append(gradient(target, loss, arrays(target, part.theta["vertices"])))
     np.testing.assert_allclose(*gradients, rtol=1e-3, atol=1e-3)
@@ -251,7 +260,15 @@ def test_compiled_by_jax_a_wire_has_the_same_image():
 
     def image(vertices):
         moved = part.replace(theta={**part.theta, "vertices": vertices})
-        return rts.render(moved, flat_camera(), PIXELS, supersample=Adaptive(2, thin=True), capacity=4000)
+        return rts.render(
+            moved,
+            flat_camera(),
+            PIXELS,
+            supersample=Adaptive(2, thin=True),
+            capacity=4000,
+            splatter="visible",
+            layers=2,
+        )
 
     vertices = arrays("jax", part.theta["vertices"])
     np.testing.assert_allclose(jax.jit(image)(vertices), render(part, 2), atol=1e-6)
@@ -279,7 +296,9 @@ def test_samplers_that_do_not_tell_change_nothing_and_say_so():
     with pytest.warns(rts.errors.InputWarning, match=r"the sampler Mute does not tell .* of Mesh\(2 faces\); give"):
         np.testing.assert_array_equal(render(part, Adaptive(4, thin=True), sampler=mute), plain)
     with pytest.warns(rts.errors.InputWarning, match="does not tell"):
-        sampled = rts.sample(part, flat_camera(), PIXELS, supersample=Adaptive(4, thin=True), sampler=mute)
+        sampled = rts.sample(
+            part, flat_camera(), PIXELS, supersample=Adaptive(4, thin=True), sampler=mute, splatter="visible", layers=2
+        )
     assert sampled.between is None
 
 
@@ -297,12 +316,14 @@ def test_auto_takes_a_sampler_that_tells(monkeypatch):
     sampler, count = found(Adaptive(4, thin=True))
     assert sampler == "raster" and count > 0
     images = [
-        rts.render(part, camera, PIXELS, supersample=Adaptive(4, thin=True), sampler=sampler)
+        rts.render(
+            part, camera, PIXELS, supersample=Adaptive(4, thin=True), sampler=sampler, splatter="visible", layers=2
+        )
         for sampler in ("auto", "raster")
     ]
     np.testing.assert_array_equal(*map(to_numpy, images))
     with pytest.warns(rts.errors.InputWarning, match="the sampler embree does not tell"):
-        rts.render(rts.prepare(part), camera, PIXELS, supersample=Adaptive(4, thin=True))
+        rts.render(rts.prepare(part), camera, PIXELS, supersample=Adaptive(4, thin=True), splatter="visible", layers=2)
 
 
 def test_a_wrong_thin_is_refused():

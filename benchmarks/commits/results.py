@@ -76,7 +76,7 @@ class Recorder:
         found = []
         for name in rts.plugins("samplers"):
             try:
-                rts.sample(self.scenes[scene], self.camera, SIZE, sampler=name)
+                rts.sample(self.scenes[scene], self.camera, SIZE, sampler=name, splatter=None, layers=2)
                 found.append(name)
             except rts.RtsError as error:
                 self.notes[f"{scene}|{name}"] = " ".join(str(error).split())

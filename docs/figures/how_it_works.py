@@ -342,7 +342,7 @@ def hidden() -> Figure:
     ]  # fmt: skip
     size = (32, 32)
     chosen = splatter("visible")
-    cells = rts.sample(parts, camera, size, layers=2).cells
+    cells = rts.sample(parts, camera, size, splatter=None, layers=2).cells
     row, depth = np.asarray(cells.row), np.asarray(cells.depth)
     covered = row >= 0
     kept = chosen.needed(covered, np.where(covered, depth, 0))

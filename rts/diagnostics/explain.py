@@ -88,7 +88,7 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
     shaders = [Observed(part.shader) for part in parts]
     watched = [part.replace(shader=own) for part, own in zip(parts, shaders, strict=True)]
     small = min(size[0], FEW), min(size[1], FEW)
-    sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, layers=1)
+    sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, splatter=None, layers=1)
     render_samples(sampled, watched, camera.for_size(size).replace(aspect=None))
     return [own.read for own in shaders]
 

@@ -40,7 +40,7 @@ def sample(
     size: tuple[int, int],
     *,
     sampler: SamplerLike = "auto",
-    splatter: SplatterLike | None = None,
+    splatter: SplatterLike | None = "auto",
     layers: Layers = "auto",
     supersample: Supersample = 1,
     capacity: int | None = None,
@@ -54,8 +54,9 @@ def sample(
         camera: as in `render`.
         size: as in `render`.
         sampler: as in `render`.
-        splatter: the splatter for these samples: the apron suits its reach, and hidden samples that it does not need
-            are dropped. None keeps all samples, and finds outlines, with an apron that suits every built-in splatter.
+        splatter: the splatter for these samples: the apron suits its reach, outlines are found if it reads them, and
+            hidden samples that it does not need are dropped. None keeps all samples of all layers, without outlines,
+            and an apron that suits every built-in splatter.
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.

@@ -99,8 +99,8 @@ class RenderSettings:
 
     @property
     def finds_outlines(self) -> bool:
-        """True if the splatter reads the outlines between centres, or may do so."""
-        return self.side is not None if self.splatter is None else "outlines" in self.reader.reads
+        """True if the splatter reads the outlines between centres."""
+        return "outlines" in self.reader.reads
 
     @property
     def contrast(self) -> float | None:

@@ -147,9 +147,8 @@ class SamplerConformance(Conformance):
         for index, part in enumerate(parts):
             held = prepare(part, sampler, camera=scenes.CAMERA, size=scenes.SIZE)
             for moved in (part, part.replace(transform=turn)):
-                sampled = sample(
-                    held.replace(transform=moved.transform), scenes.CAMERA, scenes.SIZE, layers=scenes.LAYERS
-                )
+                own, whole = held.replace(transform=moved.transform), {"splatter": None, "layers": scenes.LAYERS}
+                sampled = sample(own, scenes.CAMERA, scenes.SIZE, **whole)
                 silhouettes += claim_like(sampled, right(moved, scenes.CAMERA, sampler), f"part {index}, prepared")
         silhouettes.claim_few("prepared, ")
 

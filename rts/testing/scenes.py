@@ -84,7 +84,7 @@ def checked(part: Part) -> Part:
 
 def find(part: Part, camera: Camera = CAMERA, sampler: Any = "auto", layers: int = LAYERS, **options: Any) -> Sampled:
     """The samples of a part whose θ holds NumPy arrays."""
-    return sample(part, camera, SIZE, sampler=sampler, layers=layers, **options)
+    return sample(part, camera, SIZE, sampler=sampler, splatter=None, layers=layers, **options)
 
 
 def frozen(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Sampled:

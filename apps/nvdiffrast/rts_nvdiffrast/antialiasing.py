@@ -232,7 +232,7 @@ def _sampled(part: rts.Part, camera: rts.Camera, size: Any, drawn: Drawn) -> Any
         return rts.sample(part, camera, size, sampler="raster", splatter="visible", supersample=more)
     # Outlines of the first layer tell nothing of deeper ones, so all pixels have s² samples.
     first = drawn.layer
-    sampled = rts.sample(part, camera, size, sampler="raster", layers=first + 2, supersample=drawn.samples)
+    sampled = rts.sample(part, camera, size, sampler="raster", splatter=None, layers=first + 2, supersample=drawn.samples)
     layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n)) is not None}
     return sampled.replace(**layers)
 

@@ -320,12 +320,12 @@ class Subject:
         return check_scene(listed_parts(parts), camera)[0]
 
     def sampled(self, **options: Any) -> Sampled:
-        """Samples of the scene at the current parameters, by `rts.sample` with these options.
+        """All samples of the scene at the current parameters, by `rts.sample` with these options.
 
         Of the subject's own options, only the sampler and the engine are passed on.
         """
         given = {name: self.options[name] for name in ("sampler", "engine") if name in self.options}
-        return sample(*self.shown(self.parameters), self.size, **given, **options)
+        return sample(*self.shown(self.parameters), self.size, splatter=None, **given, **options)
 
     @cached_property
     def supersample(self) -> int:
