@@ -22,7 +22,7 @@ def test_a_flat_patch_is_met_where_its_plane_is():
     x, y = np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4), indexing="ij")
     points = np.stack([x, y, 0.25 * x - 0.5 * y], axis=-1).reshape(-1, 3).astype(np.float32)
     part = rts.Part(Bezier([np.arange(16)], 2), {"points": points}, "normals")
-    samples = rts.sample(part, FRONT, SIZE, layers=1).samples[0]
+    samples = rts.sample(part, FRONT, SIZE, layers=1, splatter=None).samples[0]
     rays = FRONT.with_apron(SIZE, APRON).rays(samples.row.shape[1:])
     cells = samples.row[0] >= 0
     x, y = rays.origins[cells][:, :2].T
@@ -50,7 +50,7 @@ def test_the_scene_has_layers_that_change_places_meet_and_miss():
 @pytest.mark.parametrize("layers", [2, 3, 4])
 def test_settled_layers_are_front_to_back_without_gaps_on_centres_of_pixels(view, layers):
     camera = VIEWS[view]
-    samples = rts.sample(BEZIER, camera, SIZE, layers=layers).samples[0]
+    samples = rts.sample(BEZIER, camera, SIZE, layers=layers, splatter=None).samples[0]
     covered, wide = samples.row >= 0, camera.with_apron(SIZE, APRON)
     assert covered[1].sum() > 5 and not (covered[1:] & ~covered[:-1]).any()
     spread = rays_spread(camera)
@@ -69,7 +69,8 @@ def test_settled_layers_are_front_to_back_without_gaps_on_centres_of_pixels(view
 
 def test_coarse_and_fine_triangles_lead_to_the_same_roots():
     coarse, fine = (
-        rts.sample(BEZIER.replace(surface=Bezier(BEZIER.surface.indices, n)), CAMERA, SIZE, layers=4) for n in (3, 24)
+        rts.sample(BEZIER.replace(surface=Bezier(BEZIER.surface.indices, n)), CAMERA, SIZE, layers=4, splatter=None)
+        for n in (3, 24)
     )
     both = (coarse.row >= 0) & (fine.row >= 0)
     assert both.sum() > 0.95 * (fine.row >= 0).sum()
@@ -113,7 +114,7 @@ def test_which_samples_are_needed_is_asked_with_their_final_depths(target):
             return super().needed(covered, depth)
 
     part = BEZIER.replace(theta=arrays(target, BEZIER.theta))
-    whole = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4))
+    whole = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4, splatter=None))
     found = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4, splatter=Spy()))
     ((covered, depth),) = asked
     np.testing.assert_array_equal(covered, whole.row >= 0)

@@ -265,9 +265,8 @@ class TestCompare:
         assert pixel == pytest.approx(2 * 3 * np.tan(np.radians(20)) / SIDE, rel=1e-3)
 
         def image(t):
-            return rts.render(*cards.at(cards.moved("translation", t, measured.engine)), (SIDE, SIDE), layers=2)[
-                ..., :3
-            ]
+            parts, camera = cards.at(cards.moved("translation", t, measured.engine))
+            return rts.render(parts, camera, (SIDE, SIDE), splatter="visible", layers=2)[..., :3]
 
         derivative = torch.func.jvp(image, (torch.zeros(()),), (torch.tensor(pixel),))[1].numpy()
         wanted = {"splatter": "visible", "layers": 2, "supersample": 1}

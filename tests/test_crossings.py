@@ -255,7 +255,7 @@ def test_sheets_that_hide_one_another_without_meeting_do_not_cross():
 )
 def test_faces_that_hide_one_another_do_not_cross(parts, alike, monkeypatch):
     camera = rts.Camera.look_at((0, 0, scene_shapes.DISTANCE), (0, 0, 0), fov_y=40)
-    samples = rts.sample(list(parts), camera, (64, 64), layers=4)
+    samples = rts.sample(list(parts), camera, (64, 64), layers=4, splatter=None)
     covered, depth = np.asarray(samples.row) >= 0, np.asarray(samples.depth)
     assert covered[1].sum() > 500
     assert not crossings.sheets(covered, depth).any()

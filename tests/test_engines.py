@@ -201,11 +201,11 @@ def test_a_scene_of_numpy_with_a_torch_background_has_no_other_gradient(target):
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_where_only_the_pose_is_differentiable_the_mesh_is_evaluated_on_the_host(target):
     scene = {**SCENE, "transform": arrays(target, SCENE["transform"])}
-    samples = rts.sample(part_of(scene), camera_at(SCENE["eye"]), SIZE).samples[0]
+    samples = rts.sample(part_of(scene), camera_at(SCENE["eye"]), SIZE, splatter=None).samples[0]
     assert set(samples.gbuffer) == {"position", "normal", "color"}
     assert type(samples.gbuffer["position"]) is type(scene["transform"])
     full = arrays(target, SCENE)
-    assert rts.sample(part_of(full), camera_at(full["eye"]), SIZE).samples[0].gbuffer is None
+    assert rts.sample(part_of(full), camera_at(full["eye"]), SIZE, splatter=None).samples[0].gbuffer is None
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -393,7 +393,7 @@ def test_torch_records_are_arguments_of_its_transforms(on_torch):
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_records_survive_being_taken_apart_and_put_together(target):
     part = part_of(arrays(target, SCENE)).replace(cull="back")
-    sampled = rts.sample(part, camera_at(arrays(target, SCENE["eye"])), SIZE)
+    sampled = rts.sample(part, camera_at(arrays(target, SCENE["eye"])), SIZE, splatter=None)
 
     def again_from_leaves(record):
         if target == "jax":
@@ -415,7 +415,7 @@ def test_records_survive_being_taken_apart_and_put_together(target):
 @pytest.mark.parametrize("target", ALL)
 def test_rows_are_exact_or_padded_to_a_bucket(target):
     part, camera = arrays(target, (part_of(SCENE), camera_at(SCENE["eye"])))
-    sampled = rts.sample(part, camera, SIZE)
+    sampled = rts.sample(part, camera, SIZE, splatter=None)
     rows, covered = sampled.samples[0].ids.shape[0], int((sampled.row >= 0).sum())
     if target == "jax":
         powers = {2**n for n in range(10, 16)} | {3 * 2**n for n in range(9, 15)}

@@ -64,7 +64,7 @@ def test_pieces_of_a_plugin_are_checked():
 
     part = part_of(icosphere(1))
     with pytest.raises(rts.InputError, match=r"pieces of .* \(5,\); expected int16 of \(80,\)"):
-        rts.sample(part.replace(surface=Numbered(part.surface.faces)), CAMERA, SIZE)
+        rts.sample(part.replace(surface=Numbered(part.surface.faces)), CAMERA, SIZE, splatter=None)
 
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic", "mirrored"])
@@ -73,7 +73,7 @@ def test_what_is_seen_from_its_front_is_what_culling_leaves(kind):
     if kind == "mirrored":
         camera = camera.replace(view=np.diag([-1.0, 1, 1, 1]) @ camera.view)
     part = part_of(icosphere(1))
-    told, culled = (rts.sample(part.replace(cull=c), camera, SIZE, layers=3) for c in ("none", "back"))
+    told, culled = (rts.sample(part.replace(cull=c), camera, SIZE, layers=3, splatter=None) for c in ("none", "back"))
     assert culled.facing is None
     ids = told.samples[0].ids[told.row]
     front = (told.row >= 0) & (told.facing > 0)
@@ -99,11 +99,11 @@ def flat(theta, points):
 @pytest.mark.parametrize("target", ["numpy", *TORCH])
 def test_rays_tell_where_they_enter_and_leave_a_solid(target):
     part = rts.Part(rts.Sdf(flat, 1.0, lipschitz=None), arrays(target, {"depth": np.float32(0.08)}), "normals")
-    cells = to_numpy(rts.sample(part, CAMERA, SIZE, layers=3).cells)
+    cells = to_numpy(rts.sample(part, CAMERA, SIZE, layers=3, splatter=None).cells)
     covered = cells.row >= 0
     assert covered[1].sum() > 20 and not covered[2].any()
     np.testing.assert_array_equal(cells.facing, np.where(covered, np.array([1, -1, 0])[:, None, None], 0))
-    two = to_numpy(rts.sample(part, CAMERA, SIZE, layers=2).cells)
+    two = to_numpy(rts.sample(part, CAMERA, SIZE, layers=2, splatter=None).cells)
     assert set(two.facing[1][two.row[1] >= 0]) == {-1 - Cells.MORE_BEHIND}
     images = [to_numpy(rts.render(part, CAMERA, SIZE, layers=layers)) for layers in (1, 3)]
     np.testing.assert_allclose(*images, rtol=0, atol=1e-6)

@@ -41,7 +41,7 @@ def function(count=33, shader="silhouette", **options):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_a_sample_is_six_lattice_points_and_three_barycentrics(motion):
     part = grid(motion=motion)
-    samples = rts.sample(part, CAMERA, SIZE).samples[0]
+    samples = rts.sample(part, CAMERA, SIZE, splatter=None).samples[0]
     assert samples.ids.shape[1] == 6 and samples.ids.dtype == np.int32
     barycentrics = samples.params[:, :3].astype(np.float64)
     assert (barycentrics > -1e-6).all()
@@ -63,7 +63,7 @@ def test_a_sample_is_six_lattice_points_and_three_barycentrics(motion):
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_nothing_but_the_six_values_moves_a_sample(target, motion):
     part = grid(count=17, motion=motion)
-    samples = rts.sample(part, CAMERA, (12, 12)).samples[0]
+    samples = rts.sample(part, CAMERA, (12, 12), splatter=None).samples[0]
     on_device = arrays(target, samples)
     row = len(samples.ids) // 2
 
@@ -76,7 +76,7 @@ def test_nothing_but_the_six_values_moves_a_sample(target, motion):
 
 def test_motion_along_the_normal_is_by_the_change_of_the_field():
     part = grid(BALL, 65)
-    samples = rts.sample(part, CAMERA, SIZE).samples[0]
+    samples = rts.sample(part, CAMERA, SIZE, splatter=None).samples[0]
     before = part.surface.evaluate(part.theta, samples)["position"].astype(np.float64)
     after = part.surface.evaluate({"values": part.theta["values"] - np.float32(1e-2)}, samples)["position"]
     outwards = before / np.linalg.norm(before, axis=1, keepdims=True)
@@ -85,7 +85,7 @@ def test_motion_along_the_normal_is_by_the_change_of_the_field():
 
 def test_motion_along_edges_keeps_corners_on_their_edges():
     part = grid(BALL, 33, motion="edge")
-    samples = rts.sample(part, CAMERA, SIZE).samples[0]
+    samples = rts.sample(part, CAMERA, SIZE, splatter=None).samples[0]
     moved = on_lattice(lambda p: BALL(p) - 4e-3, 33)[0]
     after = part.surface.evaluate({"values": moved}, samples)["position"]
     flat, places = moved.reshape(-1), part.surface.field.lattice(part.theta).points(samples.ids)
@@ -194,8 +194,8 @@ def test_a_table_changes_nothing_but_how_often_the_function_is_called(target, mo
 
 def test_a_table_has_each_lattice_point_once():
     part = function(17, table=True)
-    sampled = rts.sample(part, CAMERA, SIZE)
-    samples, plain = sampled.samples[0], rts.sample(function(17), CAMERA, SIZE).samples[0]
+    sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
+    samples, plain = sampled.samples[0], rts.sample(function(17), CAMERA, SIZE, splatter=None).samples[0]
     points = samples.tables["points"]
     assert len(np.unique(points)) == len(points) < len(samples.ids)
     np.testing.assert_array_equal(points[samples.ids], plain.ids)
@@ -228,12 +228,12 @@ def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
 
 def test_samples_that_find_no_room_in_a_table_are_counted():
     jax = pytest.importorskip("jax")
-    full = rts.sample(function(33, table=True), CAMERA, SIZE).samples[0]
+    full = rts.sample(function(33, table=True), CAMERA, SIZE, splatter=None).samples[0]
     surface = Isosurface(BOUNDS, f=torus, shape=(33,) * 3, table=200)
 
     @jax.jit
     def sampled(radii):
-        found = rts.sample(Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=4000)
+        found = rts.sample(Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=4000, splatter=None)
         return found.overflow, found.row, found.samples[0].ids
 
     overflow, row, ids = map(np.asarray, sampled(jax.numpy.asarray(RADII["radii"])))
@@ -293,7 +293,7 @@ def test_attributes_are_functions_of_position():
     )
     image = rts.render(part, CAMERA, SIZE)
     inside = image[..., 3] > 0.99
-    sampled = rts.sample(part, CAMERA, SIZE)
+    sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
     position = part.surface.evaluate(part.theta, sampled.samples[0])["position"]
     apron = sampled.apron
     row = sampled.row[0, apron:-apron, apron:-apron]
@@ -363,8 +363,8 @@ def test_samples_of_prepared_parts_are_those_of_what_was_prepared():
         part = function(33, band=band)
         prepared = rts.prepare(part, "raster")
         other = {"radii": np.array([0.3, 0.1], np.float32)}
-        found = rts.sample(prepared.replace(theta=other), CAMERA, SIZE)
-        expected = rts.sample(part, CAMERA, SIZE)
+        found = rts.sample(prepared.replace(theta=other), CAMERA, SIZE, splatter=None)
+        expected = rts.sample(part, CAMERA, SIZE, splatter=None)
         np.testing.assert_array_equal(found.row, expected.row)
         np.testing.assert_array_equal(found.samples[0].params, expected.samples[0].params)
 
@@ -405,7 +405,7 @@ def test_caps_are_met_by_rays_and_face_outwards(scale):
     part = Part(surface, {"more": np.float32(0)})
     areas = []
     for sampler in ("raster", "rays"):
-        sampled = rts.sample(part, camera, SIZE, sampler=sampler)
+        sampled = rts.sample(part, camera, SIZE, sampler=sampler, splatter=None)
         gbuffer = surface.evaluate(part.theta, sampled.samples[0])
         front = sampled.row[0][sampled.row[0] >= 0]
         np.testing.assert_allclose(gbuffer["position"][front][:, 2], BOUNDS[1][2], atol=1e-5)
@@ -467,7 +467,8 @@ def test_a_field_in_small_units_moves_as_one_in_large_ones():
 def test_what_is_bounded_does_not_depend_on_the_view():
     part = grid(motion="edge")
     least = [
-        rts.sample(part, c, SIZE).samples[0].params[0, 3] for c in (CAMERA, Camera.look_at((0.3, 0.2, 1.5), (0, 0, 0)))
+        rts.sample(part, c, SIZE, splatter=None).samples[0].params[0, 3]
+        for c in (CAMERA, Camera.look_at((0.3, 0.2, 1.5), (0, 0, 0)))
     ]
     assert least[0] == least[1] > 0
 
@@ -476,7 +477,7 @@ def test_half_precision_is_computed_in_single():
     torch = pytest.importorskip("torch")
     part = grid(BALL, 21)
     values = torch.from_numpy(part.theta["values"]).to(torch.float16)
-    samples = map_leaves(torch.as_tensor, rts.sample(part, CAMERA, SIZE).samples[0])
+    samples = map_leaves(torch.as_tensor, rts.sample(part, CAMERA, SIZE, splatter=None).samples[0])
     position = part.surface.evaluate({"values": values}, samples)["position"]
     assert position.dtype == torch.float32
     expected = part.surface.evaluate({"values": values.float()}, samples)["position"]

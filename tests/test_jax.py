@@ -73,9 +73,9 @@ def test_jit_with_enough_capacity_keeps_the_image_and_counts_no_overflow(jax, sc
 
 def test_jit_with_too_little_capacity_drops_the_deepest_layers_and_counts_them(jax, scene):
     part, camera = part_of(scene), camera_at(scene["eye"])
-    whole = np.asarray(rts.sample(part, camera, SIZE).row) >= 0
+    whole = np.asarray(rts.sample(part, camera, SIZE, splatter=None).row) >= 0
     capacity = int(whole[0].sum()) + 5
-    sampled = jax.jit(lambda p, c: rts.sample(p, c, SIZE, capacity=capacity))(part, camera)
+    sampled = jax.jit(lambda p, c: rts.sample(p, c, SIZE, capacity=capacity, splatter=None))(part, camera)
     kept = np.asarray(sampled.row) >= 0
     assert int(sampled.overflow) == whole.sum() - capacity > 0
     np.testing.assert_array_equal(kept[0], whole[0])

@@ -208,7 +208,7 @@ def sheets(refining, heights=HEIGHTS, **options):
 
 def layers_of(part, camera=FRONT, **options):
     """The number of samples in each layer."""
-    sampled = rts.sample(part, camera, SIZE, **{"layers": 3, **options})
+    sampled = rts.sample(part, camera, SIZE, **{"layers": 3, **options}, splatter=None)
     return (to_numpy(sampled.row) >= 0).sum(axis=(1, 2)).tolist()
 
 
@@ -274,7 +274,7 @@ def test_what_refine_may_not_give_is_refused_in_its_name(change, words):
 
     part = rts.Part(Tabled(lambda samples, rays: change(samples)), {"heights": HEIGHTS})
     with pytest.raises(rts.InputError, match=f"refine of .*Tabled.*{words}") as caught:
-        rts.sample(part, FRONT, SIZE, layers=3)
+        rts.sample(part, FRONT, SIZE, layers=3, splatter=None)
     assert "\n" not in str(caught.value)
 
 
@@ -299,7 +299,7 @@ def test_refine_is_asked_once_with_a_row_and_a_ray_for_each_covered_cell():
         calls.append((samples, rays))
         return samples
 
-    rts.sample(sheets(refining), CAMERA, SIZE, layers=3)
+    rts.sample(sheets(refining), CAMERA, SIZE, layers=3, splatter=None)
     ((samples, rays),) = calls
     count = (samples.row >= 0).sum()
     assert rays.origins.shape == rays.directions.shape == (count, 3) and rays.spread.shape == (2,)
@@ -316,8 +316,8 @@ def test_refine_is_asked_once_with_a_row_and_a_ray_for_each_covered_cell():
 @pytest.mark.parametrize("target", ALL)
 def test_sheets_that_change_places_are_seen_in_their_new_order(target):
     moved = np.array([-0.75, 0.25, 0.6], np.float32)
-    expected = rts.sample(sheets(lambda samples, rays: samples, moved), FRONT, SIZE, layers=3)
-    found = to_numpy(rts.sample(sheets(moved_to(moved), arrays(target, HEIGHTS)), FRONT, SIZE, layers=3))
+    expected = rts.sample(sheets(lambda samples, rays: samples, moved), FRONT, SIZE, layers=3, splatter=None)
+    found = to_numpy(rts.sample(sheets(moved_to(moved), arrays(target, HEIGHTS)), FRONT, SIZE, layers=3, splatter=None))
     np.testing.assert_array_equal(found.row, expected.row)
     np.testing.assert_allclose(found.depth, expected.depth, rtol=1e-6)
     count = (expected.row >= 0).sum()
@@ -363,7 +363,7 @@ def test_rows_that_refine_renumbers_in_place_are_refused():
 
 @pytest.mark.parametrize("target", [*ALL, "jax.jit"])
 def test_samples_that_find_no_room_in_a_table_or_a_row_are_counted(target):
-    whole = rts.sample(sheets(lambda samples, rays: samples), FRONT, SIZE, layers=3)
+    whole = rts.sample(sheets(lambda samples, rays: samples), FRONT, SIZE, layers=3, splatter=None)
     total, front = int((whole.row >= 0).sum()), int((whole.row[0] >= 0).sum())
     heights = arrays(target.removesuffix(".jit"), HEIGHTS)
     # Room for all, for two layers and some, rows for one and some, and for less than the table has.
@@ -371,7 +371,9 @@ def test_samples_that_find_no_room_in_a_table_or_a_row_are_counted(target):
         part = rts.Part(Crowded(room), {"heights": heights})
 
         def sampled(heights, part=part, capacity=capacity):
-            return rts.sample(part.replace(theta={"heights": heights}), FRONT, SIZE, layers=3, capacity=capacity)
+            return rts.sample(
+                part.replace(theta={"heights": heights}), FRONT, SIZE, layers=3, capacity=capacity, splatter=None
+            )
 
         if target == "jax.jit":
             import jax

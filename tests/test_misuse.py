@@ -24,7 +24,7 @@ PART = Mesh.example()
 Bezier = rts.plugin("surfaces", "bezier")
 Sdf = rts.plugin("surfaces", "sdf")
 PATCH, VASE, PAWN = (rts.plugin("surfaces", name).example() for name in ("bezier", "bspline", "revolution"))
-SAMPLED = rts.sample(PART, CAMERA, SIZE)
+SAMPLED = rts.sample(PART, CAMERA, SIZE, splatter=None)
 K = np.array([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]])
 
 
@@ -102,9 +102,9 @@ CALLS = {
     "render_samples.sampled": lambda v: rts.render_samples(v, PART, CAMERA),
     "render_samples.parts": lambda v: rts.render_samples(SAMPLED, v, CAMERA),
     "render_samples.camera": lambda v: rts.render_samples(SAMPLED, PART, v),
-    "sample.parts": lambda v: rts.sample(v, CAMERA, SIZE),
-    "sample.size": lambda v: rts.sample(PART, CAMERA, v),
-    "sample.layers": lambda v: rts.sample(PART, CAMERA, SIZE, layers=v),
+    "sample.parts": lambda v: rts.sample(v, CAMERA, SIZE, splatter=None),
+    "sample.size": lambda v: rts.sample(PART, CAMERA, v, splatter=None),
+    "sample.layers": lambda v: rts.sample(PART, CAMERA, SIZE, layers=v, splatter=None),
     "sample.splatter": lambda v: rts.sample(PART, CAMERA, SIZE, splatter=v),
     "render_samples.splatter": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, splatter=v),
     "render_samples.background": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, background=v),

@@ -176,7 +176,7 @@ def test_newells_teapot_has_few_triangles_and_samples_at_the_centres_of_pixels(d
     (part,) = rts.load(data / "bezier" / "teapot_patches.txt", surface="bezier")
     camera, size = Camera.look_at((5, -11, 6), (0.2, 0, 1.4), (0, 0, 1), fov_y=30), (256, 256)
     proxy = part.surface.proxy(part.theta["points"], camera.for_size(size), size)
-    sampled = rts.sample(part, camera, size, layers=2)
+    sampled = rts.sample(part, camera, size, layers=2, splatter=None)
     # One facet a pixel: two triangles for each, in front and behind.
     assert len(proxy.faces) <= (sampled.row >= 0).sum()
     theta = {"points": part.theta["points"].astype(np.float64)}
@@ -231,7 +231,7 @@ def test_no_pixel_lacks_the_sheet_in_front_where_patches_are_thin(name):
     wrong, pixels = {}, 0
     for number in range(1, 1 + THIN // (1 if name == "bezier" else 4)):
         view = thin_patches(number, name)
-        lacks, known = lacking(view, rts.sample(view.part, view.camera, view.size, layers=1))
+        lacks, known = lacking(view, rts.sample(view.part, view.camera, view.size, layers=1, splatter=None))
         pixels += known
         if lacks.any():
             wrong[number] = int(lacks.sum())
@@ -259,7 +259,10 @@ def test_outlines_are_within_the_tolerance_wherever_a_view_is_in_its_cell(name):
         direction = rng.normal(size=3)
         eye = direction / np.linalg.norm(direction) * rng.uniform(2.5, 9)
         camera = Camera.look_at(eye, rng.normal(size=3) * 0.2, fov_y=rng.uniform(20, 50))
-        rows = [rts.sample(part.replace(surface=s), camera, size, layers=2).row[0] >= 0 for s in (part.surface, fine)]
+        rows = [
+            rts.sample(part.replace(surface=s), camera, size, layers=2, splatter=None).row[0] >= 0
+            for s in (part.surface, fine)
+        ]
         lost += (rows[1] & ~rows[0]).sum()
         length += sum((rows[1] & ~np.roll(rows[1], step, axis)).sum() for step in (-1, 1) for axis in (0, 1)) / 2
     assert length > 1000
@@ -272,7 +275,7 @@ def test_the_edge_of_a_flat_patch_is_as_fine_as_an_outline():
     points = np.stack([x, y, 0 * x], axis=-1).reshape(16, 3)
     camera, table = Camera.orthographic((0, 0, 3), (0, 0, 0), height=4.5), np.arange(16)[None]
     parts = [Part(Bezier(table, tolerance=t), {"points": points}) for t in (0.1, 0.001)]
-    rows = [rts.sample(p, camera, (400, 400), layers=1).row[0] >= 0 for p in parts]
+    rows = [rts.sample(p, camera, (400, 400), layers=1, splatter=None).row[0] >= 0 for p in parts]
     sides = sum((rows[1] & ~np.roll(rows[1], step, axis)).sum() for step in (-1, 1) for axis in (0, 1))
     length = np.pi / 4 * sides  # Of a line in any direction.
     # Chords are off by two thirds of the tolerance on average, at most.
@@ -301,7 +304,7 @@ def test_triangles_are_as_fine_where_a_transform_scales(name, scale):
     points = part.theta[entry].astype(np.float64)
     plain = part.replace(theta={entry: points}, shader="silhouette")
     scaled = plain.replace(theta={entry: points / scale}, transform=np.diag([*scale, 1.0]))
-    rows = [rts.sample(p, camera, size, layers=2).row[0] >= 0 for p in (plain, scaled)]
+    rows = [rts.sample(p, camera, size, layers=2, splatter=None).row[0] >= 0 for p in (plain, scaled)]
     assert (rows[0] ^ rows[1]).sum() <= 0.005 * rows[0].sum()
     within = camera.for_size(size).within(scaled.transform)
     one = len(plain.surface.proxy(points, camera.for_size(size), size).faces)

@@ -300,7 +300,7 @@ def surface(target="numpy", chunk=100, ndc=None, network_=FIELD.weights["fine"])
 def test_colours_are_those_of_the_ray_that_meets_the_surface():
     part = surface()
     image = rts.render(part, CAMERA, SIZE, splatter="none")
-    samples = rts.sample(part, CAMERA, SIZE, layers=1).samples[0]
+    samples = rts.sample(part, CAMERA, SIZE, layers=1, splatter=None).samples[0]
     found = part.surface.evaluate(part.theta, samples)["position"]
     eye = np.linalg.inv(CAMERA.view)[:3, 3]
     expected = plainly(part.theta["weights"], found, unit(found - eye))[1]
@@ -344,7 +344,7 @@ def test_samples_where_outlines_are_have_the_colours_and_gradients_of_many_every
     part = surface(TORCH[0]) if name == "weights" else Projected.example()
     part = part.replace(theta=arrays(TORCH[0], part.theta))
     camera = CAMERA if name == "weights" else Camera.look_at((0.1, 0.2, 2.5), (0, 0, 0), fov_y=40)
-    sampled = rts.sample(part, camera, SIZE, supersample=rts.Adaptive(2))
+    sampled = rts.sample(part, camera, SIZE, supersample=rts.Adaptive(2), splatter=None)
     active = to_numpy(sampled.fine.pixel) >= 0
     images = {s: to_numpy(rts.render(part, camera, SIZE, supersample=s)) for s in (1, 2, rts.Adaptive(2))}
     found = images[rts.Adaptive(2)]
@@ -419,7 +419,7 @@ def test_a_surface_in_the_world_may_have_a_field_in_ndc():
     ndc = Ndc.of_images(SIZE, 20)
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=40)
     part = surface(ndc=ndc, chunk=10_000).replace(transform=np.diag([0.5, 0.5, 0.5, 1]))
-    samples = rts.sample(part, camera, SIZE, layers=1)
+    samples = rts.sample(part, camera, SIZE, layers=1, splatter=None)
     assert (samples.samples[0].row >= 0).sum() > 50
     position = POINTS - [0, 0, 3]
     found = part.shader(part.theta, rts.GBuffer(position=position), camera)
@@ -573,7 +573,7 @@ class TestProjected(SurfaceConformance):
 def test_a_ball_in_ndc_is_a_ball_in_the_world():
     part = Projected.example()
     camera = Camera.look_at((0.6, 0.4, 2), (0, 0, 0), fov_y=50)
-    samples = rts.sample(part, camera, (48, 48), layers=2).samples[0]
+    samples = rts.sample(part, camera, (48, 48), layers=2, splatter=None).samples[0]
     found = part.surface.evaluate(part.theta, samples)
     outward = found["position"] + [0, 0, 2]
     radius = np.linalg.norm(outward, axis=1)

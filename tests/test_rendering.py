@@ -84,8 +84,8 @@ def test_parts_merged_by_depth_are_the_image_of_one_merged_mesh(target):
     for layers in (1, 3):
         parts_, one_, camera = arrays(target, (parts, one, CAMERA))
         sampled, expected = (
-            rts.sample(parts_, camera, SIZE, layers=layers),
-            rts.sample(one_, camera, SIZE, layers=layers),
+            rts.sample(parts_, camera, SIZE, layers=layers, splatter=None),
+            rts.sample(one_, camera, SIZE, layers=layers, splatter=None),
         )
         np.testing.assert_array_equal(to_numpy(sampled.depth), to_numpy(expected.depth))
         seen = np.unique(to_numpy(sampled.part))
@@ -112,7 +112,7 @@ def test_normals_under_a_stretch_are_those_of_the_ellipsoid():
     transform = np.diag([1.5, 0.75, 1.0, 1.0])
     part = mesh_part((vertices, faces), theta={"normals": vertices}, transform=transform, shader="normals")
     image = show(part, splatter="none")
-    sampled = rts.sample(part, CAMERA, SIZE)
+    sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
     row = sampled.row[0, APRON:-APRON, APRON:-APRON]
     points = moved(transform, part.surface.evaluate(part.theta, sampled.samples[0])["position"])[row]
     expected = points / np.array([1.5, 0.75, 1.0]) ** 2
@@ -145,9 +145,9 @@ def test_culling_hides_the_inside_and_nothing_else():
     vertices, faces = icosphere(2)
     outside = mesh_part((vertices, faces), cull="back")
     inside_out = mesh_part((vertices, faces[:, ::-1]), cull="back")
-    front = rts.sample(outside, CAMERA, SIZE)
-    back = rts.sample(inside_out, CAMERA, SIZE)
-    both = rts.sample(mesh_part((vertices, faces)), CAMERA, SIZE)
+    front = rts.sample(outside, CAMERA, SIZE, splatter=None)
+    back = rts.sample(inside_out, CAMERA, SIZE, splatter=None)
+    both = rts.sample(mesh_part((vertices, faces)), CAMERA, SIZE, splatter=None)
     np.testing.assert_array_equal(front.depth[0], both.depth[0])
     np.testing.assert_array_equal(back.depth[0], both.depth[1])
     assert (front.row[1] == -1).all() and (back.row[1] == -1).all() and (back.row[0] >= 0).any()
@@ -405,11 +405,11 @@ BAD = {
         ("shader", "3)", "4)"),
     ),
     "samples of other parts": (
-        lambda: rts.render_samples(rts.sample(PART, CAMERA, SIZE), [PART, PART], CAMERA),
+        lambda: rts.render_samples(rts.sample(PART, CAMERA, SIZE, splatter=None), [PART, PART], CAMERA),
         ("2 parts", "samples of 1"),
     ),
     "samples of more parts": (
-        lambda: rts.render_samples(rts.sample([PART, PART], CAMERA, SIZE), PART, CAMERA),
+        lambda: rts.render_samples(rts.sample([PART, PART], CAMERA, SIZE, splatter=None), PART, CAMERA),
         ("1 parts", "samples of 2"),
     ),
 }
@@ -465,7 +465,7 @@ def test_samples_in_front_that_find_no_room_are_warned_of(target):
         ):
             rts.render(part, CAMERA, SIZE, capacity=1, **options)
     # Hidden ones are left out first, as it is documented.
-    row = rts.sample(part, CAMERA, SIZE).row
+    row = rts.sample(part, CAMERA, SIZE, splatter=None).row
     rts.render(part, CAMERA, SIZE, capacity=int((row[0] >= 0).sum()) + 5)
 
 
@@ -646,7 +646,7 @@ def test_rooms_and_open_meshes_may_be_wound_inwards():
     pairs = [(v, f) for v, f in ((vertices, half), (box()[0], tube)) for f in (f, f[:, ::-1])]
     for v, f in [*pairs, (vertices, turned)]:
         part = mesh_part((v, f), cull="back")
-        rts.sample(part, CAMERA, SIZE)
+        rts.sample(part, CAMERA, SIZE, splatter=None)
         assert rts.explain(part, CAMERA)[0].remarks == ()
 
 

@@ -150,7 +150,7 @@ def test_a_proxy_that_would_be_read_out_of_bounds_is_refused(change, words):
             return super().proxy(inputs, camera, size)._replace(**change)
 
     with pytest.raises(rts.InputError, match=words):
-        rts.sample(Part(Bad(), {"radius": np.array([0.9])}), CAMERA, SIZE, sampler="raster")
+        rts.sample(Part(Bad(), {"radius": np.array([0.9])}), CAMERA, SIZE, sampler="raster", splatter=None)
 
 
 def test_a_surface_that_cannot_be_hashed_is_sampled_all_the_same():
@@ -215,7 +215,7 @@ def test_triangles_that_are_not_there_are_refused():
     part = rts.plugin("rts.surfaces", "mesh").example()
     camera = rts.Camera.look_at((0, 0, 5), (0, 0, 0))
     with pytest.raises(rts.InputError, match="rasterize of Beyond returned triangle 1[0-9]+ of"):
-        rts.sample(part, camera, (16, 16), sampler=Beyond())
+        rts.sample(part, camera, (16, 16), sampler=Beyond(), splatter=None)
 
 
 def test_samples_of_another_mesh_are_refused():
@@ -263,7 +263,9 @@ def test_the_parts_of_batched_samples_are_those_of_each():
     behind = Part(mesh, {"vertices": (vertices - (0.5, 0, 1)).astype(np.float32)})
 
     def sampled(move):
-        return rts.sample([Part(mesh, {"vertices": vertices.astype(np.float32) + move}), behind], CAMERA, SIZE)
+        return rts.sample(
+            [Part(mesh, {"vertices": vertices.astype(np.float32) + move}), behind], CAMERA, SIZE, splatter=None
+        )
 
     moves = jax.numpy.asarray([(0, 0, 0), (0.4, 0.2, 0)], dtype=np.float32)
     batch = to_numpy(jax.vmap(sampled)(moves).part)

@@ -108,7 +108,7 @@ def test_a_periodic_spline_is_an_open_one_of_points_that_come_again():
 def test_attributes_that_are_affine_in_the_points_are_so_on_the_surface():
     points, surface = grid(6, 5), BSpline((6, 5), "clamped")
     theta = {"points": points, "colors": 0.5 + 0.3 * points, "uv": points[..., :2] * 2}
-    samples = rts.sample(Part(surface, theta), CAMERA, SIZE).samples[0]
+    samples = rts.sample(Part(surface, theta), CAMERA, SIZE, splatter=None).samples[0]
     gbuffer = surface.evaluate(theta, samples)
     np.testing.assert_allclose(gbuffer["color"], 0.5 + 0.3 * gbuffer["position"], atol=1e-12)
     np.testing.assert_allclose(gbuffer["uv"], 2 * gbuffer["position"][:, :2], atol=1e-12)
@@ -122,7 +122,7 @@ def test_attributes_that_are_affine_in_the_points_are_so_on_the_surface():
 def test_samples_lie_on_the_graph_of_a_polynomial_with_its_normals(camera, target):
     surface = Bezier(PATCH)
     theta = {"points": cubic(paraboloid)}
-    samples = rts.sample(Part(surface, theta), camera, SIZE).samples[0]
+    samples = rts.sample(Part(surface, theta), camera, SIZE, splatter=None).samples[0]
     used = np.unique(samples.row[samples.row >= 0])
     assert len(used) > 300
     gbuffer = surface.evaluate(arrays(target, theta, np.float64), samples)
@@ -136,7 +136,7 @@ def test_samples_lie_on_the_graph_of_a_polynomial_with_its_normals(camera, targe
 
 def test_samples_reproject_to_the_centres_of_their_pixels():
     for part in (Bezier.example(), BSpline.example()):
-        sampled = rts.sample(part, CAMERA, SIZE)
+        sampled = rts.sample(part, CAMERA, SIZE, splatter=None)
         position = at_samples(part, sampled.samples[0])
         cells = np.argwhere(sampled.row >= 0)
         wide = CAMERA.for_size(SIZE).with_apron(SIZE, APRON)
@@ -272,7 +272,7 @@ def test_images_do_not_depend_on_what_was_rendered_before():
 def test_hardly_a_sample_is_lost_at_the_outline():
     for part in (Bezier.example(), BSpline.example()):
         fine = part.replace(surface=type(part.surface)(*made_of(part.surface), tolerance=0.005))
-        rows = [rts.sample(p, CAMERA, (120, 160), layers=4).row >= 0 for p in (part, fine)]
+        rows = [rts.sample(p, CAMERA, (120, 160), layers=4, splatter=None).row >= 0 for p in (part, fine)]
         # At open edges some lie beyond, by less than 2 % of a patch.
         assert (rows[0] & ~rows[1]).sum() <= 1e-3 * rows[1].sum()
         # A tolerance of 0.1 pixels, along the whole outline.

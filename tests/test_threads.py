@@ -29,7 +29,7 @@ def made(name):
     """A sampler, or the test is skipped where it cannot work."""
     try:
         sampler = rts.plugin("samplers", name)()
-        rts.sample(scene(name, 0), CAMERA, (4, 5), sampler=sampler)
+        rts.sample(scene(name, 0), CAMERA, (4, 5), sampler=sampler, splatter=None)
         return sampler
     except PluginError as error:
         pytest.skip(str(error))

@@ -119,7 +119,7 @@ def test_every_engine_meets_the_torus_compiled_and_batched(target):
 @pytest.mark.parametrize("view", [*VIEWS, "from the side"])
 def test_layers_of_the_torus_are_front_to_back_on_centres_of_pixels(view):
     camera = {**VIEWS, "from the side": rts.Camera.look_at((3.2, 0.6, 0.5), (0, 0, 0))}[view]
-    samples = rts.sample(TORUS, camera, SIZE, layers=4).samples[0]
+    samples = rts.sample(TORUS, camera, SIZE, layers=4, splatter=None).samples[0]
     covered = samples.row >= 0
     assert covered[0].sum() > 50 and not (covered[1:] & ~covered[:-1]).any()
     assert view != "from the side" or covered[3].sum() > 20
@@ -133,7 +133,7 @@ def test_layers_of_the_torus_are_front_to_back_on_centres_of_pixels(view):
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_gradients_in_radii_are_finite_differences(target):
-    samples = rts.sample(TORUS, CAMERA, SIZE).samples[0]
+    samples = rts.sample(TORUS, CAMERA, SIZE, splatter=None).samples[0]
     weights = np.random.default_rng(1).normal(size=(len(samples.ids), 3)) / len(samples.ids) ** 0.5
 
     def product(radii, weights=weights, samples=samples):
@@ -146,7 +146,7 @@ def test_gradients_in_radii_are_finite_differences(target):
 
 @pytest.mark.parametrize("target", ALL)
 def test_the_gradient_of_its_distance_is_the_normal_of_the_torus(target):
-    samples = rts.sample(TORUS, CAMERA, SIZE).samples[0]
+    samples = rts.sample(TORUS, CAMERA, SIZE, splatter=None).samples[0]
     gbuffer = TORUS.surface.evaluate(TORUS.theta, samples)
     points, radii = arrays(target, (gbuffer["position"], RADII))
     found = rts.plugin_api.operations.gradient(lambda p: distance(radii, p), points)

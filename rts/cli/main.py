@@ -196,10 +196,11 @@ def _size(text: str) -> tuple[int, int]:
 
 def _layers(text: str) -> Any:
     """The `layers` written as "4" or "auto"."""
-    try:
-        return int(text)
-    except ValueError:
-        return text  # Refused where layers are.
+    if text != "auto" and not text.lstrip("-").isdecimal():
+        raise typer.BadParameter(
+            f"{text!r} is no number of layers; expected an integer, or auto", param_hint="'--layers'"
+        )
+    return text if text == "auto" else int(text)
 
 
 def _supersample(text: str) -> Any:

@@ -50,7 +50,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or scene.layered:
+    if traced or scene.layered or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
@@ -211,6 +211,12 @@ def _at_centres(
     for first in np.cumsum(counts)[:-1]:
         part += row >= first
     return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth.astype(np.float64))
+
+
+def _batched(x: Array) -> bool:
+    """True for an array of which a transform maps over several values."""
+    value = value_of(x)
+    return value is not None and value.ndim != x.ndim
 
 
 def _known(x: Array) -> np.ndarray:

@@ -64,7 +64,8 @@ def ends_of(gap, place, near, parts, height, width):
 def join(begins, ends, place, tangent, partner):
     """Fill `partner` (E,): for each end the other end of its segment, or −1, at the least total cost of each square.
 
-    Only ends with the same part in front are joined, one that leaves it with one that enters it. The least cost of
+    Only ends with the same part in front are joined, one that leaves it with one that enters it; where two parts cross,
+    either is in front. The least cost of
     ends i … j of a square is found from that of shorter runs, so that no two segments cross.
 
     Args:
@@ -98,7 +99,14 @@ def join(begins, ends, place, tangent, partner):
 @compiled
 def _cost(a, b, ends, place, tangent):
     """The cost of a segment between two ends; infinite if they cannot be joined."""
-    if ends[a, 3] != ends[b, 3] or ends[a, 2] * ends[b, 2] > 0:
+    front, back, crosses = ends[a, 3], ends[a, 4], (ends[a, 2] == 0) != (ends[b, 2] == 0)
+    other_front, other_back = ends[b, 3], ends[b, 4]
+    if crosses and front != other_front:  # A line of crossing goes on as the outline of either surface.
+        if ends[a, 2] == 0:
+            front, back = back, front
+        else:
+            other_front, other_back = other_back, other_front
+    if front != other_front or ends[a, 2] * ends[b, 2] > 0:
         return np.inf
     p, q = ends[a, 0], ends[b, 0]
     dx, dy, cost = place[q, 0] - place[p, 0], place[q, 1] - place[p, 1], 0.0
@@ -106,8 +114,8 @@ def _cost(a, b, ends, place, tangent):
         tx, ty = tangent[i, 0], tangent[i, 1]
         aside = abs(dx * ty - dy * tx) if tx != 0 or ty != 0 else np.hypot(dx, dy)
         cost += ASIDE * aside + (0.5 - ASIDE) * np.hypot(dx, dy)
-    cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (ends[a, 4] != ends[b, 4])
-    return cost + OTHER_KIND * ((ends[a, 2] == 0) != (ends[b, 2] == 0))
+    cost += ON_ONE_SIDE * (ends[a, 1] == ends[b, 1]) + OTHER_BEHIND * (back != other_back)
+    return cost + OTHER_KIND * crosses
 
 
 @compiled
