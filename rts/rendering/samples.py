@@ -54,9 +54,10 @@ def sample(
         camera: as in `render`.
         size: as in `render`.
         sampler: as in `render`.
-        splatter: the splatter for these samples: the apron suits its reach, and hidden samples that it does not need
-            are dropped. None keeps all samples, and finds outlines, with an apron that suits every built-in splatter.
-        layers: as in `render`.
+        splatter: the splatter for these samples: the apron suits its reach, hidden samples that it does not need are
+            dropped, and outlines are found if it reads them. "auto" is as in `render`. None keeps all samples, and
+            finds outlines, with an apron that suits every built-in splatter.
+        layers: as in `render`; with no splatter "auto" is the number of layers that there are, up to 16.
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
