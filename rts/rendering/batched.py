@@ -56,8 +56,9 @@ def render_views(
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
     shaders without mipmaps do. With jax, and under `torch.func`, views share a picture only if all fit into one, and if
     each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are where
-    outlines are found, as by "edges", with `layers="auto"`, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one
-    on each core. With torch and jax all views are in memory at once, with a gradient or without.
+    outlines are found, as by "edges", with `layers="auto"`, and if images are rendered in bands. NumPy views that are
+    too large for a picture are rendered one on each core. With torch and jax all views are in memory at once, with a
+    gradient or without.
 
     Args:
         parts: as in `render`.
