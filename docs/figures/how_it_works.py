@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.path import Path as Outline
 
 import rts
 
@@ -40,11 +41,6 @@ def bare(axes: Any, title: str = "") -> None:
     axes.set_title(title, fontsize=9, color=INK)
 
 
-def splatter(name: str, **options: Any) -> Any:
-    """A splatter with options."""
-    return rts.plugin("splatters", name)(**options)
-
-
 def derivative(scene: Callable[[Any], Any], camera: Any, side: int, **options: Any) -> np.ndarray:
     """The image's derivative (side, side, 4) in a number at 0, of which `scene` makes the parts."""
 
@@ -63,10 +59,10 @@ def pipeline() -> Figure:
     bare(axes)
     axes.set(xlim=(0, 10), ylim=(0, 2.7))
     steps = (
-        ("sample", "a rasterizer or rays:\nwhich triangle, which\nbarycentrics, which depth", "#e5e7eb"),
+        ("sample", "by a rasterizer or rays:\npoints that pixels see,\nand where outlines run", "#e5e7eb"),
         ("evaluate", "θ and U give positions,\nnormals, uv, colours", "#FBE3D0"),
         ("shade, project", "a colour for each sample,\na place in the image", "#FBE3D0"),
-        ("splat", "a Gaussian over 3 × 3\ncells, sorted by depth", "#FBE3D0"),
+        ("splat", "each colour counts by\nits share of the pixel", "#FBE3D0"),
     )
     for n, (name, text, color) in enumerate(steps):
         x = 0.9 + 2.15 * n
@@ -87,39 +83,154 @@ def pipeline() -> Figure:
     return made
 
 
+# -------------------------------------------------------------------------------------------------------------- gaps
+
+SIDE, EYE = 6, 8.0
+"""Pixels along each side of the scene of `gap`, and the camera's distance."""
+VIEW = np.degrees(2 * np.arctan(SIDE / 2 / EYE))
+"""Degrees of view with which a unit at the origin is a pixel."""
+CARD = np.float32([(-4, -4, 0), (0.15, -4, 0), (1.35, 0.9, 0), (-4, 1.9, 0)])
+BEHIND = np.float32([(-9, -9, -1.5), (9, -9, -1.5), (9, 9, -1.5), (-9, 9, -1.5)])
+
+
+def cards() -> tuple[list[Any], Any]:
+    """A card before another one, and a camera that sees a corner of it in 6 × 6 pixels."""
+    faces = np.int32([(0, 1, 2), (0, 2, 3)])
+    near, far = (
+        rts.Part(rts.Mesh(faces), {"vertices": v, "color": np.float32(c)}, "unlit")
+        for v, c in ((CARD, (1, 1, 1)), (BEHIND, (0, 0, 0)))
+    )
+    return [near, far], rts.Camera.look_at((0, 0, EYE), (0, 0, 0), fov_y=float(VIEW))
+
+
+def chosen_break(found: Any, apron: int, y: int, x: int) -> int:
+    """The index of the break in the gap along the row from pixel (y, x)."""
+    [(index,)] = np.argwhere((found.gap == (y + apron, x + apron, 1)).all(axis=1))
+    return int(index)
+
+
+def seen_from_the_eye(axes: Any, found: Any, apron: int) -> None:
+    """Centres, gaps, breaks and segments, as the library finds them."""
+    bare(axes, "centres see the near card or the far one;\nbetween unlike neighbours lies a gap")
+    corner = np.array([(x + SIDE / 2, SIDE / 2 - y) for x, y, _ in CARD])
+    axes.fill(*corner.T, fc="#D55E0022", ec="none")
+    for line in range(SIDE + 1):
+        axes.plot((0, SIDE), (line, line), color=GRID, lw=0.6, zorder=0)
+        axes.plot((line, line), (0, SIDE), color=GRID, lw=0.6, zorder=0)
+    first = found.gap[:, 1::-1] - apron + 0.5
+    way = np.stack([found.gap[:, 2], 1 - found.gap[:, 2]], axis=1)
+    place = first + found.place[:, None] * way
+    inside = ((first >= 0.5) & (first + way <= SIDE - 0.5)).all(axis=1)
+    for start, step in zip(first[inside], way[inside], strict=True):
+        axes.plot(*zip(start, start + step, strict=True), color=PALE, lw=1.2, zorder=2)
+    near = Outline(corner)
+    for y, x in np.ndindex(SIDE, SIDE):
+        shown = ORANGE if near.contains_point((x + 0.5, y + 0.5)) else BLUE
+        axes.plot(x + 0.5, y + 0.5, "o", ms=4.5, color=shown, zorder=4)
+    for ties, square, turn in zip(found.ties, found.square, found.corner, strict=True):
+        bend = square[::-1] - apron + 0.5 + turn
+        path = np.stack([place[ties[0]], bend, place[ties[1]]])
+        axes.plot(*path.T, color=INK, lw=1.6, zorder=3)
+    axes.plot(*place[inside].T, "D", ms=5, mfc="white", mec=INK, zorder=5)
+    axes.set(xlim=(0, SIDE), ylim=(SIDE, 0), aspect="equal")
+
+
+def seen_from_above(axes: Any, place: float, inner: tuple[float, float]) -> None:
+    """A section along a gap: the samples that it has."""
+    bare(axes, "one gap from above, the eye on top:\nits break, and samples beside it")
+    axes.plot((-0.45, place), (0.6, 0.6), color=ORANGE, lw=2)
+    axes.plot((-0.45, 1.45), (1.5, 1.5), color=BLUE, lw=2)
+    for x in (0, 1):
+        axes.plot((x, x), (0.1, 0.6 if x < place else 1.5), color=GRID, lw=1, zorder=0)
+    axes.plot((place, place), (0.1, 1.5), color=PALE, lw=1, ls=":", zorder=0)
+    axes.plot((0, place), (0.6, 0.6), "o", ms=7, color=ORANGE, mec=INK)
+    axes.plot((place, 1), (1.5, 1.5), "o", ms=7, color=BLUE, mec=INK)
+    axes.plot(inner[0], 0.6, "o", ms=5, mfc="white", mec=ORANGE)
+    axes.plot(inner[1], 1.5, "o", ms=5, mfc="white", mec=BLUE)
+    axes.plot(place, 0.1, "D", ms=5, mfc="white", mec=INK)
+    axes.text(0, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
+    axes.text(1, 0.0, "centre", ha="center", va="bottom", fontsize=8, color=PALE)
+    axes.text(place, 0.0, "break", ha="center", va="bottom", fontsize=8, color=INK)
+    axes.annotate("", (place + 0.3, 0.6), (place + 0.05, 0.6), arrowprops={"arrowstyle": "-|>", "color": ORANGE})
+    axes.text(place + 0.07, 0.72, "the last sample:\nthe break moves\nas it does", va="top", fontsize=8, color=ORANGE)
+    axes.text(-0.4, 1.62, "hollow: samples a little farther in tell the colours", va="top", fontsize=8, color=PALE)
+    axes.set(xlim=(-0.5, 1.5), ylim=(1.85, -0.2))
+
+
+def share_of_a_pixel(axes: Any, y: int, x: int, image: float) -> None:
+    """A pixel that an edge of the card cuts: both shares, and the strip that the segment sweeps."""
+    (x0, y0), (x1, y1) = (CARD[i, :2] * (1, -1) + SIDE / 2 for i in (1, 2))
+    top, bottom = (x0 + (x1 - x0) * (line - y0) / (y1 - y0) - x for line in (y, y + 1))
+    share = (top + bottom) / 2
+    axes.fill((0, top, bottom, 0), (0, 0, 1, 1), fc="#F2BE99", ec="none")
+    axes.fill((top, 1, 1, bottom), (0, 0, 1, 1), fc="#99C7E0", ec="none")
+    step = 0.1
+    axes.fill((top, top + step, bottom + step, bottom), (0, 0, 1, 1), fc="#FBE3D0", ec=ORANGE, hatch="////", lw=0)
+    axes.plot((top, bottom), (0, 1), color=INK, lw=1.8)
+    axes.add_patch(Rectangle((0, 0), 1, 1, fc="none", ec=INK, lw=1))
+    middle = np.array([(top + bottom) / 2, 0.5])
+    axes.annotate("", middle + (0.3, 0), middle, arrowprops={"arrowstyle": "-|>", "color": ORANGE, "lw": 1.5})
+    axes.text(0.05, 0.1, f"share {share:.3f}", va="top", fontsize=9, color=INK)
+    axes.text(0.5, 1.04, "hatched: what the segment sweeps is the derivative", ha="center", va="top", fontsize=8)
+    bare(axes, f"a pixel is the mean of its parts: near card 1,\nfar card 0; the library's pixel is {image:.3f}")
+    axes.set(xlim=(-0.05, 1.05), ylim=(1.12, -0.05), aspect="equal")
+
+
+def gap() -> Figure:
+    """A gap, its samples, and the area: outlines between centres, as the library finds them."""
+    made, (eye, above, area) = figure(10, 3.5, 3)
+    parts, camera = cards()
+    sampled = rts.sample(parts, camera, (SIDE, SIDE), splatter="edges")
+    found, apron = sampled.outlines, sampled.apron
+    y, x = 4, 3
+    index = chosen_break(found, apron, y, x)
+    seen_from_the_eye(eye, found, apron)
+    eye.add_patch(Rectangle((x + 0.3, y + 0.3), 1.4, 0.4, fc="none", ec=PINK, lw=1.3))
+    place = float(found.place[index])
+    seen_from_above(above, place, (place - 0.1, place + 0.1))
+    image = rts.render(parts, camera, (SIDE, SIDE), splatter="edges")
+    eye.add_patch(Rectangle((x, y), 1, 1, fc="none", ec=GREEN, lw=1.3))
+    share_of_a_pixel(area, y, x, float(image[y, x, 0]))
+    return made
+
+
 # ---------------------------------------------------------------------------------------------------------- an edge
+
+PLACE = 6.2
+"""Pixels from the left to the upright edge of the card in `edge`."""
 
 
 def edge_slope(chosen: Any) -> np.ndarray:
-    """The derivative of alpha along a row of pixels as a half-plane's edge moves by a pixel, by a splatter."""
-    height, width, edge = 7, 12, 6
-    y, x = np.indices((height, edge))
-    places = torch.tensor(np.stack([x + 0.5, y + 0.5, np.ones_like(x)], -1).reshape(-1, 3), dtype=torch.float64)
-    row = torch.full((1, height, width), -1, dtype=torch.int32)
-    row[0, :, :edge] = torch.arange(height * edge, dtype=torch.int32).reshape(height, edge)
-    colors = torch.ones((height * edge, 4), dtype=torch.float64)
-    along = torch.zeros_like(places)
-    along[:, 0] = 1
-    slope = torch.func.jvp(lambda p: chosen.splat(p, colors, row), (places,), (along,))[1]
-    return slope[height // 2, :, 3].numpy()
+    """The derivative of alpha along a row of 12 pixels as an upright edge moves by a pixel, by a splatter."""
+    right = PLACE - 6
+    corners = np.float32([(-90, -90, 0), (right, -90, 0), (right, 90, 0), (-90, 90, 0)])
+    part = rts.Part(rts.Mesh(np.int32([(0, 1, 2), (0, 2, 3)])), {"vertices": corners}, "silhouette")
+    camera = rts.Camera.look_at((0, 0, 100), (0, 0, 0), fov_y=float(np.degrees(2 * np.arctan(6 / 100))))
+
+    def scene(shift: Any) -> Any:
+        zero = torch.zeros(())
+        return part.replace(transform=rts.rigid(torch.stack([zero, zero, zero, shift, zero, zero])))
+
+    return derivative(scene, camera, 12, splatter=chosen)[6, :, 3]
 
 
 def edge() -> Figure:
-    """The derivative at a straight edge: the truth, no splat, the paper's constants, calibrated."""
-    made, axes = figure(10, 2.9, 4, sharey=True)
+    """The derivative at a straight edge: the truth, and by four splatters."""
+    made, axes = figure(10, 2.7, 5, sharey=True)
     truth = np.zeros(12)
     truth[6] = 1
     found = {
-        "truth: pixels average over their area": truth,
-        "no splatting (`none`)": edge_slope(splatter("none")),
-        "`multi`, the paper's constants": edge_slope(splatter("multi")),
-        "`visible`, calibrated": edge_slope(splatter("visible")),
+        "truth:\npixels are means of areas": (truth, INK),
+        "no derivative at edges:\n`none`": (edge_slope("none"), PALE),
+        "the paper's:\n`multi`": (edge_slope("multi"), BLUE),
+        "calibrated:\n`visible`": (edge_slope("visible"), PINK),
+        "found:\n`edges`": (edge_slope("edges"), ORANGE),
     }
-    for one, (name, slope), color in zip(axes, found.items(), (INK, PALE, BLUE, ORANGE), strict=True):
-        one.bar(np.arange(12), slope, color=color, width=0.8)
-        one.axvline(5.7, color=PALE, ls=":", lw=1)
-        one.set(xlim=(2.5, 9.5), ylim=(0, 1.15), xticks=[], xlabel="pixels across the edge")
-        one.set_title(f"{name}\nsum {slope[3:].sum():.3f}", fontsize=9)
+    for one, (name, (slope, color)) in zip(axes, found.items(), strict=True):
+        one.bar(np.arange(12) + 0.5, slope, color=color, width=0.8)
+        one.axvline(PLACE, color=PALE, ls=":", lw=1)
+        one.set(xlim=(3, 10), ylim=(0, 1.15), xticks=[], xlabel="pixels across the edge")
+        one.set_title(f"{name}; sum {slope[3:].sum():.3f}", fontsize=8)
     axes[0].set_ylabel("change of coverage\nper pixel of motion")
     return made
 
@@ -163,132 +274,6 @@ def layers() -> Figure:
     return made
 
 
-# ---------------------------------------------------------------------------------------------------------- outlines
-
-
-def ball(camera_size: int = 64) -> tuple[Callable[[Any], Any], Any]:
-    """A ball of one colour that turns about its upright axis, and its camera."""
-    import trimesh
-
-    mesh = trimesh.creation.icosphere(subdivisions=5)
-    vertices = torch.tensor(mesh.vertices, dtype=torch.float32)
-    part = rts.Part(rts.Mesh(mesh.faces), {"vertices": vertices}, "silhouette", cull="back")
-
-    def scene(angle: Any) -> Any:
-        zero = torch.zeros(())
-        return part.replace(transform=rts.rigid(torch.stack([zero, angle, zero, zero, zero, zero])))
-
-    return scene, rts.Camera.look_at((0, 0, 8), (0, 0, 0), fov_y=18)
-
-
-def outlines() -> Figure:
-    """A ball that turns: how fast samples move beside its rim, and the derivative with and without their own motion."""
-    made, (chart, before, after) = figure(10, 3.2, 3, width_ratios=(1.5, 1, 1))
-    radius = 24.0
-    inside = np.linspace(0, 6, 200)
-    chart.plot(inside, np.sqrt(np.maximum(0, 2 * radius * inside - inside**2)) / radius, color=BLUE)
-    chart.axhline(0, color=INK, lw=1)
-    chart.axvspan(0, 1, color="#FBE3D0", zorder=0)
-    chart.text(1.1, 0.05, "first sample inside\nthe rim: anywhere here", fontsize=8, color=ORANGE)
-    chart.set(
-        xlabel="distance δ inside the rim, pixels", ylabel="speed of a sample across\nthe image, share of the largest"
-    )
-    chart.set(ylim=(-0.05, 0.8))
-    chart.set_title("a ball of radius 24 pixels turns; its rim stands still", fontsize=9)
-    scene, camera = ball()
-    largest = 0.0
-    pictures = []
-    for rims in (False, True):
-        slope = derivative(scene, camera, 64, splatter=splatter("visible", rims=rims), layers=1)[..., 3]
-        pictures.append(slope)
-        largest = max(largest, float(np.abs(slope).max()))
-    for axes, slope, name in zip((before, after), pictures, ("as samples", "as outlines"), strict=True):
-        bare(axes, f"coverage moves {name}:\nnorm {np.linalg.norm(slope):.1f} (truth: 0)")
-        axes.imshow(slope, cmap="RdBu", vmin=-largest, vmax=largest, interpolation="nearest")
-    return made
-
-
-# --------------------------------------------------------------------------------------------------------- crossings
-
-
-def planes() -> tuple[Callable[[Any], Any], Any]:
-    """Two planes that cross in an upright line; one of them comes nearer."""
-    corners = np.array([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], np.float32)
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    first, second = corners.copy(), corners.copy()
-    first[:, 2] = 0.5 * corners[:, 0] + 0.13 * corners[:, 1]
-    second[:, 2] = -0.4 * corners[:, 0]
-    colors = ((0.85, 0.35, 0.1), (0.1, 0.45, 0.7))
-    parts = [
-        rts.Part(rts.Mesh(faces), {"vertices": torch.tensor(v), "color": torch.tensor(c)}, "unlit")
-        for v, c in zip((first, second), colors, strict=True)
-    ]
-
-    def scene(nearer: Any) -> Any:
-        zero = torch.zeros(())
-        return [parts[0].replace(transform=rts.rigid(torch.stack([zero] * 5 + [nearer]))), parts[1]]
-
-    return scene, rts.Camera.look_at((0, 0, 8), (0, 0, 0), fov_y=14)
-
-
-def crossings() -> Figure:
-    """Two planes that cross, as one of them comes nearer: a section, the picture, and both derivatives."""
-    made, (section, picture, before, after) = figure(10, 2.9, 4, width_ratios=(1.5, 1, 1, 1))
-    x = np.linspace(-1, 1, 50)
-    section.plot(x, 0.5 * x, color=ORANGE)
-    section.plot(x, 0.5 * x + 0.3, color=ORANGE, ls="--")
-    section.plot(x, -0.4 * x, color=BLUE)
-    section.plot([0, -1 / 3], [0, 0.4 / 3], "o", color=INK)
-    section.annotate("", (-1 / 3, -0.5), (0, -0.5), arrowprops={"arrowstyle": "-|>", "color": INK})
-    section.text(-0.17, -0.62, "the line moves sideways", ha="center", va="top", fontsize=8)
-    section.annotate("", (0.75, 0.675), (0.75, 0.375), arrowprops={"arrowstyle": "-|>", "color": ORANGE})
-    section.text(0.75, 0.02, "the plane\ncomes nearer", ha="center", va="center", fontsize=8, color=ORANGE)
-    bare(section, "seen from above; the eye is on top")
-    section.set_ylim(-0.85, 0.95)
-    scene, camera = planes()
-    image = rts.render(scene(torch.zeros(())), camera, (48, 48), layers=2).numpy()
-    bare(picture, "picture")
-    picture.imshow(image[..., :3].clip(0, 1), interpolation="nearest")
-    shown = ((before, False, "as samples\n(`crossings=False`)"), (after, True, "as depths say"))
-    for axes, moves, name in shown:
-        chosen = splatter("visible", crossings=moves)
-        slope = derivative(scene, camera, 48, splatter=chosen, layers=2)
-        bare(axes, f"the line moves {name}")
-        axes.imshow((0.5 + 0.04 * slope[..., :3]).clip(0, 1), interpolation="nearest")
-    return made
-
-
-# ---------------------------------------------------------------------------------------------------------- adaptive
-
-
-def adaptive() -> Figure:
-    """Where `Adaptive` takes more samples: the grid of pixels of a turned triangle."""
-    made, (grid, coarse, fine) = figure(10, 3.5, 3)
-    corners = np.array([[-0.9, -0.75, 0], [0.95, -0.35, 0], [-0.15, 0.9, 0]], np.float32)
-    part = rts.Part(rts.Mesh(np.array([[0, 1, 2]])), {"vertices": corners}, "silhouette")
-    camera = rts.Camera.look_at((0, 0, 8), (0, 0, 0), fov_y=17)
-    side, s = 14, 4
-    hard = rts.render(part, camera, (side, side), splatter="none")[..., 3] > 0.5
-    fronts = np.pad(hard, 1)
-    beside = [fronts[1 + v : side + 1 + v, 1 + u : side + 1 + u] for u in (-1, 0, 1) for v in (-1, 0, 1)]
-    active = np.logical_or.reduce([x != hard for x in beside])
-    bare(grid, f"{side} × {side} pixels: one sample each, and {s}² where\na front ends beside the pixel")
-    for y, x in np.ndindex(side, side):
-        grid.add_patch(Rectangle((x, y), 1, 1, fc="#FBE3D0" if active[y, x] else "white", ec=GRID, lw=0.6))
-        for v, u in np.ndindex(*((s, s) if active[y, x] else (1, 1))):
-            count = s if active[y, x] else 1
-            place = x + (u + 0.5) / count, y + (v + 0.5) / count
-            grid.plot(*place, ".", ms=1.5 if active[y, x] else 3, color=ORANGE if active[y, x] else PALE)
-    clip = np.asarray(camera.project(corners, (side, side)))[:, :2]
-    grid.fill(*clip.T, fc="#0072B233", ec=BLUE, lw=1)
-    grid.set(xlim=(0, side), ylim=(side, 0), aspect="equal")
-    for axes, value, name in ((coarse, 1, "1 sample a pixel"), (fine, rts.Adaptive(s), "`rts.Adaptive(4)`")):
-        image = rts.render(part, camera, (side, side), supersample=value)[..., 3]
-        bare(axes, f"image, {name}")
-        axes.imshow(1 - image, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-    return made
-
-
 # ------------------------------------------------------------------------------------------------------------ fields
 
 
@@ -326,41 +311,7 @@ def fields() -> Figure:
     return made
 
 
-# ------------------------------------------------------------------------------------------------------------ hidden
-
-
-def hidden() -> Figure:
-    """A ball before a card: the second layer, and what of it reaches the image."""
-    made, axes = figure(10, 3.2, 3)
-    scene, camera = ball()
-    card = np.array([[-3, -3, -2], [3, -3, -2], [3, 3, -2], [-3, 3, -2]], np.float32)
-    keeps = rts.plugin("shaders", "unlit")(opaque=False)  # Behind samples that may be translucent none is left out.
-    parts = [
-        rts.Part(scene(torch.zeros(())).surface, {"vertices": scene(torch.zeros(())).theta["vertices"].numpy()},
-                 keeps, cull="back"),
-        rts.Part(rts.Mesh(np.array([[0, 1, 2], [0, 2, 3]])), {"vertices": card}, keeps),
-    ]  # fmt: skip
-    size = (32, 32)
-    chosen = splatter("visible")
-    cells = rts.sample(parts, camera, size, splatter=None, layers=2).cells
-    row, depth = np.asarray(cells.row), np.asarray(cells.depth)
-    covered = row >= 0
-    kept = chosen.needed(covered, np.where(covered, depth, 0))
-    apron = (covered.shape[1] - size[0]) // 2
-    covered, kept = (x[:, apron:-apron, apron:-apron] for x in (covered, kept))
-    for one, mask, name in zip(
-        axes,
-        (covered[0], covered[1], kept[1]),
-        ("first layer", "second layer: all", "second layer: what the splatter needs"),
-        strict=True,
-    ):
-        bare(one, f"{name}\n{int(mask.sum())} samples")
-        one.imshow(np.where(mask, 0.35, 1.0), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        one.add_patch(Rectangle((-0.5, -0.5), mask.shape[1], mask.shape[0], fc="none", ec=GRID))
-    return made
-
-
-FIGURES = {f.__name__: f for f in (pipeline, edge, layers, outlines, crossings, adaptive, fields, hidden)}
+FIGURES = {f.__name__: f for f in (pipeline, gap, edge, fields, layers)}
 
 
 def main() -> None:

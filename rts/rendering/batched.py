@@ -55,9 +55,10 @@ def render_views(
     Views lie side by side in pictures of at most 1024² cells. Python's overhead, results for the whole of θ such as
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
     shaders without mipmaps do. With jax, and under `torch.func`, views share a picture only if all fit into one, and if
-    each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are with
-    `layers="auto"`, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one
-    on each core. With torch and jax all views are in memory at once, with a gradient or without.
+    each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are where
+    outlines are found, as by "edges", with `layers="auto"`, and if images are rendered in bands. NumPy views that are
+    too large for a picture are rendered one on each core. With torch and jax all views are in memory at once, with a
+    gradient or without.
 
     Args:
         parts: as in `render`.

@@ -49,12 +49,15 @@ def render(
         camera: the camera.
         size: (height, width) in pixels.
         sampler: name or object of a `Sampler`.
-        splatter: name or object of a `Splatter`.
-        layers: K, the number of surface layers kept at each pixel. With "auto" it is the number that the image needs
-            where surfaces hide one another, up to 16 (a warning says if more are needed).
+        splatter: name or object of a `Splatter`. "auto" is "edges", which finds outlines between the centres of pixels.
+            It is "visible", which spreads samples over 3 × 3 cells, with an `rts.Adaptive`, and where light passes
+            through parts whose samples lie on no triangles.
+        layers: K, the number of surface layers kept at each pixel. "auto" is 1 for "edges" if all parts are opaque;
+            else it is the number that the image needs, up to 16 (a warning says if more are needed). Where the places
+            of samples are traced, as in `jax.jit`, it is 4 if some part may be translucent, else at most 2.
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
             bands of rows, so that memory stays bounded; for a gradient each band is then rendered twice. An
-            `rts.Adaptive` takes s² samples only at outlines, and renders without bands.
+            `rts.Adaptive` takes s² samples only at outlines, and renders without bands; "edges" refuses it.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent. It has C or C + 1 channels if the image has C and alpha.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
@@ -82,8 +85,10 @@ def render(
         EmptyImageWarning: nothing is seen; the warning says why.
         AspectWarning: the camera is for images of another ratio of width to height.
         InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`; nothing reads an entry of θ; a
-            culled part is wound inside out.
-        LayersWarning: surfaces or light behind the last layer are left out.
+            culled part is wound inside out; a sampler cannot sample single points, so that outlines lie midway between
+            centres.
+        LayersWarning: surfaces or light behind the last layer are left out, or all behind the fronts, where "edges" by
+            name meets light that passes through parts without triangles.
     """
     scene = Scene.of(parts, camera, sampler, engine)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
@@ -177,7 +182,7 @@ def render_samples(
             new values have no effect. Samples taken with `settles=True` need the same values.
         parts: as in `render`.
         camera: as in `render`.
-        splatter: as in `render`.
+        splatter: name or object of a `Splatter`. "auto" is "edges" if the samples have outlines, else "visible".
         background: as in `render`.
         engine: as in `render`.
 
@@ -199,6 +204,10 @@ def render_samples(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
     splatter = splatter_of(splatter, sampled.outlines is not None)
+    if "outlines" in splatter.reads and sampled.outlines is None:
+        raise InputError(
+            f"the samples have no outlines, which {splatter!r} reads; give it to rts.sample, too, or take another"
+        )
     if apron < splatter.reach + 1:
         raise InputError(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "

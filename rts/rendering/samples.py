@@ -57,7 +57,7 @@ def sample(
         splatter: the splatter for these samples: the apron suits its reach, outlines are found if it reads them, and
             hidden samples that it does not need are dropped. None keeps all samples of all layers, without outlines,
             and an apron that suits every built-in splatter.
-        layers: as in `render`.
+        layers: as in `render`; with no splatter "auto" is the number of layers that there are, up to 16.
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.

@@ -22,6 +22,8 @@ MOST = 64
 class Adaptive:
     """A value for `supersample`: s² samples in pixels near outlines, one in every other pixel.
 
+    It is for splatters that spread samples: `splatter="auto"` is then "visible", and "edges" refuses it.
+
     A pixel with s² samples is called active. In samples of one a pixel, its front ends towards a neighbour that shows
     nothing or another surface, or a neighbour's front ends towards it; behind translucent layers, the next layer does.
     Active pixels look as with `supersample=samples`, the others as with `supersample=1`.

@@ -32,4 +32,4 @@ METHODS = (
     Method("Mitsuba", {"spp": 16}, "Mitsuba"),
 )
 DEFAULT = "visible"
-"""The column of what `rts.render` does unless told otherwise."""
+"""The column of the splatter that was the default before "edges"."""
