@@ -11,10 +11,10 @@ import numpy as np
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
-from rts.errors import InputWarning, warn
+from rts.errors import InputError, InputWarning, warn
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
-from rts.rendering.scene import Grid, Scene, has_sheets
+from rts.rendering.scene import Grid, Scene, has_sheets, shares_tables
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.segments import joined
@@ -40,8 +40,17 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
             row and a column of the grid, if that is more. `overflow` counts those beyond.
 
     Raises:
-        InputError: a sampler cannot sample single points.
+        InputError: samples of a surface share a table.
+
+    Warns:
+        InputWarning: a sampler cannot sample single points.
     """
+    for part in scene.parts:
+        if shares_tables(part.surface):
+            raise InputError(
+                f"samples of {part.surface!r} share a table, to which those beside outlines cannot be added; "
+                f"use table=False, or splatter='visible'"
+            )
     cells, known = sampled.cells, []
     if all(scene.opaque) or not scene.layered:
         sampled = replace(sampled, cells=cells.first(1))
@@ -50,7 +59,9 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or scene.layered or any(map(_batched, leaves(inputs))):
+    # Functions of surfaces that refine samples want the arrays that they are given.
+    plain = scene.layered and not any(part.surface.refines for part in scene.parts)
+    if traced or plain or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
@@ -73,6 +84,27 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
+
+
+def with_entries(scene: Scene, grid: Grid) -> Scene:
+    """The scene with prepared entries of surfaces that refine samples, so that outlines need not prepare them anew.
+
+    The scene itself where values are traced, or several at once.
+    """
+    read = [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in scene.parts]
+    inputs = stopped((read, [part.transform for part in scene.parts], grid.camera))
+    if not any(part.surface.refines for part in scene.parts) or any(
+        is_traced(x) or _batched(x) for x in leaves(inputs)
+    ):
+        return scene
+    entries = []
+    for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
+        if entry is None and isinstance(sampler, TriangleSampler) and part.surface.refines:
+            camera = grid.camera.within(part.transform).for_size(grid.size)
+            camera = camera.map(lambda m: np.asarray(_known(m), np.float64))
+            entry = _entry(part, sampler, None, camera, grid.size)
+        entries.append(entry)
+    return scene._replace(entries=entries)
 
 
 class _Found(NamedTuple):
@@ -321,8 +353,8 @@ class _Points:
     ) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
-        if sheets is None and not len(points):
-            points = np.full((1, 2), 0.5)  # Surfaces may want a ray at least; nothing names its sample.
+        if not len(points) and (sheets is None or self._scene.parts[part].surface.refines):
+            points, triangles = np.full((1, 2), 0.5), None  # Surfaces may want a ray; nothing names its sample.
         if sheets is not None and triangles is not None and (triangles >= 0).all():
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
         request = Request(points=points, exits=exits, triangles=True, entry=entry)

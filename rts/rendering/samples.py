@@ -19,7 +19,7 @@ from rts.errors import InputError, InputWarning, warn
 from rts.plugin_base import promised
 from rts.registry import name_of
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike, Supersample
-from rts.rendering.outlines import with_outlines
+from rts.rendering.outlines import with_entries, with_outlines
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
@@ -131,6 +131,7 @@ def _on_one_grid(
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
     exits = exits and "exit" in reader.reads and gradient
     outlines, facing = settings.finds_outlines, "facing" in reader.reads
+    scene = with_entries(scene, grid) if outlines else scene
     request = Request(capacity, facing=facing, exits=exits, between=settings.thin, triangles=outlines)
     taken = partial(_taken, scene.telling(settings.thin), grid, request)
     if settings.layers == "auto":

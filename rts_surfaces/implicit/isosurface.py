@@ -250,7 +250,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         isovalue, sign = self.field.level_of_values
         arguments = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
         # Where no cell is covered there is a row nevertheless, of nothing.
-        count = int(samples.row.max()) + 1
+        count = int(samples.row.max(initial=-1)) + 1
         results = points, params, least / lattice.step.max()
         parallel(lattice_samples_loops.fill, count, *arguments, samples.ids, samples.params, *results, work=300 * count)
         if along_edges:
