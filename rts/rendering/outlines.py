@@ -10,7 +10,9 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
+from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, InputWarning, warn
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
@@ -60,7 +62,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
     traced = any(map(is_traced, leaves(inputs)))
     # Functions of surfaces that refine samples want the arrays that they are given.
-    plain = scene.layered and not any(part.surface.refines for part in scene.parts)
+    plain = scene.layered and not any(map(_refines, scene.parts))
     if traced or plain or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
@@ -93,13 +95,11 @@ def with_entries(scene: Scene, grid: Grid) -> Scene:
     """
     read = [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in scene.parts]
     inputs = stopped((read, [part.transform for part in scene.parts], grid.camera))
-    if not any(part.surface.refines for part in scene.parts) or any(
-        is_traced(x) or _batched(x) for x in leaves(inputs)
-    ):
+    if not any(map(_refines, scene.parts)) or any(is_traced(x) or _batched(x) for x in leaves(inputs)):
         return scene
     entries = []
     for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
-        if entry is None and isinstance(sampler, TriangleSampler) and part.surface.refines:
+        if entry is None and isinstance(sampler, TriangleSampler) and _refines(part):
             camera = grid.camera.within(part.transform).for_size(grid.size)
             camera = camera.map(lambda m: np.asarray(_known(m), np.float64))
             entry = _entry(part, sampler, None, camera, grid.size)
@@ -245,6 +245,11 @@ def _at_centres(
     return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth.astype(np.float64))
 
 
+def _refines(part: CheckedPart) -> bool:
+    """True if samples on a part's triangles pass through its surface."""
+    return isinstance(part.surface, TriangleSurface) and part.surface.refines
+
+
 def _batched(x: Array) -> bool:
     """True for an array of which a transform maps over several values."""
     value = value_of(x)
@@ -353,7 +358,7 @@ class _Points:
     ) -> Samples:
         """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
         sampler, camera, entry, sheets = self._parts[part]
-        if not len(points) and (sheets is None or self._scene.parts[part].surface.refines):
+        if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
             points, triangles = np.full((1, 2), 0.5), None  # Surfaces may want a ray; nothing names its sample.
         if sheets is not None and triangles is not None and (triangles >= 0).all():
             sampler = _OnTriangles(sheets.at(triangles, points)[0])
