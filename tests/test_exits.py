@@ -237,7 +237,7 @@ def test_samples_that_were_found_before_render_as_at_once():
 
     def later(pose):
         moved = part.replace(transform=rts.rigid(pose))
-        found = rts.sample(moved, CAMERA, (SIZE, SIZE))
+        found = rts.sample(moved, CAMERA, (SIZE, SIZE), splatter=fused.Visible())
         return (rts.render_samples(found, moved, CAMERA, splatter=fused.Visible()) * weights).sum()
 
     slopes = [gradient("torch-cpu", f, pose) for f in (at_once, later)]

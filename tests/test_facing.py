@@ -105,7 +105,7 @@ def test_rays_tell_where_they_enter_and_leave_a_solid(target):
     np.testing.assert_array_equal(cells.facing, np.where(covered, np.array([1, -1, 0])[:, None, None], 0))
     two = to_numpy(rts.sample(part, CAMERA, SIZE, layers=2, splatter=None).cells)
     assert set(two.facing[1][two.row[1] >= 0]) == {-1 - Cells.MORE_BEHIND}
-    images = [to_numpy(rts.render(part, CAMERA, SIZE, layers=layers)) for layers in (1, 3)]
+    images = [to_numpy(rts.render(part, CAMERA, SIZE, layers=layers, splatter="visible")) for layers in (1, 3)]
     np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
     assert np.abs(images[0] - to_numpy(rts.render(part, CAMERA, SIZE, layers=3, splatter=BY_DEPTH))).max() > 1e-3
 
@@ -120,7 +120,7 @@ def test_a_closed_body_looks_as_if_its_back_were_culled(mesh, layers):
 
 
 def test_by_depth_alone_a_back_may_pair_with_a_front():
-    expected = rts.render(part_of(leaf(), cull="back"), CAMERA, SIZE)
+    expected = rts.render(part_of(leaf(), cull="back"), CAMERA, SIZE, splatter="visible", layers=2)
     assert np.abs(rts.render(part_of(leaf()), CAMERA, SIZE, splatter=BY_DEPTH) - expected).max() > 0.02
 
 
@@ -133,8 +133,8 @@ def test_sheets_of_their_own_may_be_wound_in_any_way():
     for mesh, same in ((alone, True), (sheets, False)):
         images = [rts.render(part_of(mesh), CAMERA, SIZE, splatter=s, layers=4) for s in ("visible", BY_DEPTH)]
         assert np.array_equal(*images) == same
-    whole = rts.render(part_of(sheets), CAMERA, SIZE, layers=6)
-    turned = rts.render(part_of((sheets[0], sheets[1][:, ::-1])), CAMERA, SIZE, layers=6)
+    whole = rts.render(part_of(sheets), CAMERA, SIZE, layers=6, splatter="visible")
+    turned = rts.render(part_of((sheets[0], sheets[1][:, ::-1])), CAMERA, SIZE, layers=6, splatter="visible")
     np.testing.assert_allclose(whole, turned, rtol=0, atol=1e-5)
 
 
@@ -149,11 +149,15 @@ def scene():
 
 def test_order_of_parts_and_what_is_pruned_change_nothing():
     parts = scene()
-    image = rts.render(parts, CAMERA, SIZE, layers=6)
-    np.testing.assert_allclose(rts.render(parts[::-1], CAMERA, SIZE, layers=6), image, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(rts.render(parts, CAMERA, SIZE, layers="auto"), image, rtol=0, atol=1e-6)
-    whole = rts.sample(parts, CAMERA, SIZE, layers=6)
-    np.testing.assert_allclose(rts.render_samples(whole, parts, CAMERA), image, rtol=0, atol=1e-6)
+    image = rts.render(parts, CAMERA, SIZE, layers=6, splatter="visible")
+    np.testing.assert_allclose(
+        rts.render(parts[::-1], CAMERA, SIZE, layers=6, splatter="visible"), image, rtol=0, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        rts.render(parts, CAMERA, SIZE, layers="auto", splatter="visible"), image, rtol=0, atol=1e-6
+    )
+    whole = rts.sample(parts, CAMERA, SIZE, layers=6, splatter="visible")
+    np.testing.assert_allclose(rts.render_samples(whole, parts, CAMERA, splatter="visible"), image, rtol=0, atol=1e-6)
     copy = pickle.loads(pickle.dumps(whole))
     np.testing.assert_array_equal(copy.facing, whole.facing)
     numbers = [set((np.abs(whole.facing[whole.part == i]) % Cells.MORE_BEHIND).tolist()) - {0} for i in range(3)]
@@ -165,12 +169,12 @@ def test_order_of_parts_and_what_is_pruned_change_nothing():
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_engines_agree(target):
     parts = scene()[:2]
-    image = rts.render(parts, CAMERA, SIZE, layers=4)
+    image = rts.render(parts, CAMERA, SIZE, layers=4, splatter="visible")
     vertices = arrays(target, [p.theta["vertices"] for p in parts])
 
     def render(vertices):
         moved = [p.replace(theta={**p.theta, "vertices": v}) for p, v in zip(parts, vertices, strict=True)]
-        return rts.render(moved, CAMERA, SIZE, layers=4)
+        return rts.render(moved, CAMERA, SIZE, layers=4, splatter="visible")
 
     render = pytest.importorskip("jax").jit(render) if target == "jax" else render
     np.testing.assert_allclose(to_numpy(render(vertices)), image, rtol=0, atol=1e-5)

@@ -223,7 +223,9 @@ SPHERE = icosphere(2, 0.8)
 def test_fine_samples_see_a_gap_between_parts_that_coarse_ones_do_not():
     parts = [mesh_part(quad(*ends, -1.0, 1.0, 0.0)) for ends in ((-1.0, -0.02), (0.02, 1.0))]
     seen = rts.Camera.look_at((0, 0, 4.0), (0, 0, 0), fov_y=40)
-    dense, adaptive = (rts.render(parts, seen, (40, 40), supersample=s) for s in (4, rts.Adaptive(4)))
+    dense, adaptive = (
+        rts.render(parts, seen, (40, 40), supersample=s, splatter="visible", layers=2) for s in (4, rts.Adaptive(4))
+    )
     assert (dense[20, 18:22, 3] < 0.9).any()
     np.testing.assert_allclose(adaptive[5:-5, 15:25], dense[5:-5, 15:25], rtol=0, atol=1e-5)
 
@@ -399,7 +401,7 @@ def test_samples_that_do_not_fit_are_refused(changes, message, supersample):
 
     parts = [mesh_part(mesh) for mesh in (box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8))]
     with pytest.raises(rts.InputError, match=re.escape(message)):
-        rts.render(parts, CAMERA, SIZE, sampler=Odd(), supersample=supersample)
+        rts.render(parts, CAMERA, SIZE, sampler=Odd(), supersample=supersample, splatter="visible", layers=2)
 
 
 @pytest.mark.parametrize("kind", ["single", "multi", "visible"])
@@ -475,5 +477,12 @@ def test_where_samples_were_dropped_only_outlines_that_are_known_are_read(capaci
     vertices, faces = icosphere(2)
     moved = torch.tensor(vertices, requires_grad=True)
     part = rts.Part(MESH(faces), {"vertices": moved}, "silhouette")
-    rts.render(part, rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=45), (20, 27), capacity=capacity).sum().backward()
+    rts.render(
+        part,
+        rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=45),
+        (20, 27),
+        capacity=capacity,
+        splatter="visible",
+        layers=2,
+    ).sum().backward()
     assert len(read) > 20 and np.isfinite(read).all()

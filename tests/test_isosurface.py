@@ -179,11 +179,13 @@ def test_a_table_changes_nothing_but_how_often_the_function_is_called(target, mo
     found = []
     for table in (False, True):
         surface = Isosurface(BOUNDS, f=counting, shape=(17,) * 3, motion=motion, table=table)
-        sampled = rts.sample(Part(surface, arrays(target, RADII)), CAMERA, SIZE)
+        sampled = rts.sample(Part(surface, arrays(target, RADII)), CAMERA, SIZE, splatter="visible", layers=2)
         calls.clear()
 
         def loss(radii, surface=surface, sampled=sampled):
-            return (rts.render_samples(sampled, Part(surface, {"radii": radii}), CAMERA)[..., 3]).sum()
+            return (
+                rts.render_samples(sampled, Part(surface, {"radii": radii}), CAMERA, splatter="visible")[..., 3]
+            ).sum()
 
         radii = arrays(target, RADII["radii"])
         found.append((float(loss(radii)), gradient(target, loss, radii), calls[0]))
@@ -212,7 +214,9 @@ def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
         traces.append(1)
 
         def area(radii):
-            return rts.render(Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=3000)[..., 3].sum()
+            return rts.render(
+                Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=3000, splatter="visible", layers=2
+            )[..., 3].sum()
 
         return jax.value_and_grad(area)(radii)
 
@@ -221,7 +225,7 @@ def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
         at = radii * jax.numpy.asarray([factor, 1.0])
         value, slope = step(at)
         plain = Part(Isosurface(BOUNDS, f=torus, shape=(17,) * 3, motion=motion), {"radii": at})
-        expected = rts.render(plain, CAMERA, SIZE)[..., 3].sum()
+        expected = rts.render(plain, CAMERA, SIZE, splatter="visible", layers=2)[..., 3].sum()
         assert float(value) == pytest.approx(float(expected), rel=1e-5) and np.isfinite(slope).all()
     assert len(traces) == 1
 
@@ -437,8 +441,10 @@ def test_a_constant_surface_with_a_table_has_its_normals():
     torch = pytest.importorskip("torch")
     part = function(21, shader="normals", table=True)
     camera = CAMERA.map(lambda m: torch.from_numpy(np.asarray(m, np.float32)))
-    found = rts.render(part, camera, SIZE)
-    np.testing.assert_allclose(found.numpy(), rts.render(function(21, shader="normals"), CAMERA, SIZE), atol=1e-4)
+    found = rts.render(part, camera, SIZE, splatter="visible", layers=2)
+    np.testing.assert_allclose(
+        found.numpy(), rts.render(function(21, shader="normals"), CAMERA, SIZE, splatter="visible", layers=2), atol=1e-4
+    )
 
 
 def test_torch_transforms_look_through_a_band():

@@ -375,7 +375,13 @@ def test_levenberg_marquardt_comes_back_from_trials_with_huge_residuals(name):
     part = rts.Part(rts.Mesh(faces), {"vertices": vertices}, "unlit")
     target = np.full((*SIZE, 3), 0.5, np.float32)
     swept = rts.ImageResiduals(
-        lambda p: part.replace(theta={"vertices": vertices, "color": torch.exp(p)}), CAMERA, SIZE, target, loss=name
+        lambda p: part.replace(theta={"vertices": vertices, "color": torch.exp(p)}),
+        CAMERA,
+        SIZE,
+        target,
+        loss=name,
+        splatter="visible",
+        layers=2,
     )
     for own, start in ((swept, -2.5), (lambda p: torch.exp(p) - 0.5, -2.5), (lambda p: torch.exp(p) - 0.5, -3.7)):
         found = rts.fit(own, torch.full((3,), start), method="lm", loss=rts.Loss(name, 0.1), progress=False)

@@ -284,7 +284,7 @@ def test_auto_works_under_gradients_and_says_what_to_do_under_jit():
     parts = SCENES["closed box"]
 
     def loss(vertices):
-        return rts.render(with_vertices(parts, [vertices]), CAMERA, SIZE, layers="auto").sum()
+        return rts.render(with_vertices(parts, [vertices]), CAMERA, SIZE, layers="auto", splatter="visible").sum()
 
     vertices = arrays("jax", parts[0].theta["vertices"])
     assert np.abs(jax.grad(loss)(vertices)).max() > 0

@@ -279,12 +279,18 @@ def test_edges_move_as_areas_do(name, supersample, most):
 def test_outlines_behind_glass_have_fine_samples():
     glass = card(1, (0.5, 0.5, 1), 0.5, left=-3, right=3, bottom=-3, top=3)
     parts = [glass, card(0, (0.9, 0.2, 0.1), 1, left=-0.7, right=0.6), card(-1, (0.1, 0.2, 0.3), 1)]
-    images = [rts.render(parts, CAMERA, (32, 32), layers=3, supersample=s) for s in (1, 4, rts.Adaptive(4))]
+    images = [
+        rts.render(parts, CAMERA, (32, 32), layers=3, supersample=s, splatter="visible")
+        for s in (1, 4, rts.Adaptive(4))
+    ]
     assert np.abs(images[0] - images[1]).max() > 0.1
     np.testing.assert_allclose(images[2], images[1], atol=1e-5)
     # With one layer nothing is hidden.
     with pytest.warns(rts.errors.LayersWarning):
-        finer, adaptive = (rts.render(parts, CAMERA, (32, 32), layers=1, supersample=s) for s in (4, rts.Adaptive(4)))
+        finer, adaptive = (
+            rts.render(parts, CAMERA, (32, 32), layers=1, supersample=s, splatter="visible")
+            for s in (4, rts.Adaptive(4))
+        )
     np.testing.assert_allclose(adaptive, finer, atol=1e-5)
 
 

@@ -165,9 +165,9 @@ def test_prepared_parts_are_rendered_in_bands(narrow_bands):
 
 def test_sampled_knows_its_samples_a_pixel():
     part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
-    sampled = rts.sample(part, CAMERA, SIZE, supersample=2)
+    sampled = rts.sample(part, CAMERA, SIZE, supersample=2, splatter="visible", layers=2)
     assert sampled.row.shape == (2, *(2 * n + 2 * sampled.apron for n in SIZE)) and sampled.supersample == 2
-    np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA), image(CORNERS, 2))
+    np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA, splatter="visible"), image(CORNERS, 2))
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -190,7 +190,10 @@ def test_coverage_of_an_edge_gets_nearer_the_area_with_samples():
     camera = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)
     part = rts.Part(MESH(faces), {"vertices": vertices})
     area = np.clip(8.3 - np.arange(16), 0, 1)
-    errors = [np.abs(rts.render(part, camera, (16, 16), supersample=s)[8, :, 3] - area).sum() for s in (1, 4, 16)]
+    errors = [
+        np.abs(rts.render(part, camera, (16, 16), supersample=s, splatter="visible", layers=2)[8, :, 3] - area).sum()
+        for s in (1, 4, 16)
+    ]
     assert errors[0] > 0.29 and errors[1] < errors[0] / 3 and errors[2] < errors[1] / 3
 
 

@@ -56,19 +56,20 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     cells, known = sampled.cells, []
     if all(scene.opaque) or not scene.layered:
         sampled = replace(sampled, cells=cells.first(1))
-    for part in scene.parts:
-        known.append((part.transform, {name: part.theta[name] for name in part.surface.reads(part.theta)}))
+    for part, entry in zip(scene.parts, scene.entries, strict=True):
+        read = {name: part.theta[name] for name in part.surface.reads(part.theta)}
+        # Functions of surfaces want the arrays that they are given.
+        known.append((part.transform, read, _proxy_inputs(part) if entry is None else None))
     triangles = [own.triangle for own in sampled.samples]
     inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
     traced = any(map(is_traced, leaves(inputs)))
-    # Functions of surfaces that refine samples want the arrays that they are given.
-    plain = scene.layered and not any(map(_refines, scene.parts))
-    if traced or plain or any(map(_batched, leaves(inputs))):
+    if traced or scene.layered or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
         row, depth, own = map_leaves(_known, inputs[3:])
-        here, more = _Points.of(scene, grid).found(_at_centres(row, depth, own, sampled.samples))
+        entered = [map_leaves(_known, x) for *_, x in inputs[0]]
+        here, more = _Points.of(scene, grid, entered).found(_at_centres(row, depth, own, sampled.samples))
         specs = _Found.specs(0, grid.size, _real(scene), len(row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
@@ -89,20 +90,20 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
 
 
 def with_entries(scene: Scene, grid: Grid) -> Scene:
-    """The scene with prepared entries of surfaces that refine samples, so that outlines need not prepare them anew.
+    """The scene with prepared entries of parts whose triangles are not cheap, so that outlines make none anew.
 
     The scene itself where values are traced, or several at once.
     """
     read = [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in scene.parts]
     inputs = stopped((read, [part.transform for part in scene.parts], grid.camera))
-    if not any(map(_refines, scene.parts)) or any(is_traced(x) or _batched(x) for x in leaves(inputs)):
+    if not any(map(_is_dear, scene.parts)) or any(is_traced(x) or _batched(x) for x in leaves(inputs)):
         return scene
     entries = []
     for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
-        if entry is None and isinstance(sampler, TriangleSampler) and _refines(part):
+        if entry is None and isinstance(sampler, TriangleSampler) and _is_dear(part):
             camera = grid.camera.within(part.transform).for_size(grid.size)
             camera = camera.map(lambda m: np.asarray(_known(m), np.float64))
-            entry = _entry(part, sampler, None, camera, grid.size)
+            entry = _entry(part, sampler, map_leaves(_known, _proxy_inputs(part)), camera, grid.size)
         entries.append(entry)
     return scene._replace(entries=entries)
 
@@ -162,8 +163,10 @@ def _found_on_host(
         given = iter(arrays)
         known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
         of_parts, whole, camera, row, depth, own = known
-        parts = [replace(p, transform=t, theta=theta) for p, (t, theta) in zip(scene.parts, of_parts, strict=True)]
-        points = _Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size))
+        own_parts = zip(scene.parts, of_parts, strict=True)
+        parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
+        entered = [x for *_, x in of_parts]
+        points = _Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
         found, more = points.found(_at_centres(row, depth, own, sampled.samples), most)
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
@@ -250,6 +253,11 @@ def _refines(part: CheckedPart) -> bool:
     return isinstance(part.surface, TriangleSurface) and part.surface.refines
 
 
+def _is_dear(part: CheckedPart) -> bool:
+    """True if making a part's triangles costs more than to compare their inputs."""
+    return isinstance(part.surface, TriangleSurface) and not part.surface.proxy_is_cheap
+
+
 def _batched(x: Array) -> bool:
     """True for an array of which a transform maps over several values."""
     value = value_of(x)
@@ -272,14 +280,14 @@ class _Points:
         self._width = np.asarray(_known(grid.camera.spread(grid.size)), np.float64)
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid) -> _Points:
-        """The points of a grid."""
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> _Points:
+        """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
         parts = []
-        for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
+        for part, sampler, entry, own in zip(scene.parts, scene.chosen(), scene.entries, inputs, strict=True):
             camera, sheets = grid.camera.within(part.transform), None
             if isinstance(sampler, TriangleSampler):
                 host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
-                entry = _entry(part, sampler, entry, host, grid.size)
+                entry = entry or _entry(part, sampler, own, host, grid.size)
                 if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
             parts.append((sampler, camera, entry, sheets))
@@ -414,10 +422,13 @@ class _OnTriangles(TriangleSampler):
         return self._fragments
 
 
-def _entry(part: Any, sampler: TriangleSampler, entry: Any, camera: Camera, size: tuple[int, int]) -> Any:
-    """The part's prepared entry, with the inputs of its proxy."""
-    if entry is not None:
-        return entry
+def _proxy_inputs(part: CheckedPart) -> Tree:
+    """The inputs of a part's proxy, without derivatives; None if it has no triangles."""
+    surface = part.surface
+    return stopped(surface.proxy_inputs(stopped(part.theta))) if isinstance(surface, TriangleSurface) else None
+
+
+def _entry(part: CheckedPart, sampler: TriangleSampler, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Any:
+    """The part's prepared entry, with the inputs of its proxy, on the host."""
     surface: Any = part.surface
-    inputs: Tree = map_leaves(_known, surface.proxy_inputs(stopped(part.theta)))
     return sampler.working_on(surface, inputs, camera, size, None, lambda known: known._replace(inputs=inputs))
