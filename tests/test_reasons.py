@@ -298,11 +298,11 @@ SCENES = {
 }
 
 
-@functools.cache
 FOUND = ("opaque_layers", "thin", "turning", "crossing")
 """Scenes whose derivatives agree by the default splatter."""
 
 
+@functools.cache
 def check(make, mended, **options):
     scene, start, given = make(mended)
     usual = {"budget_s": 600, "samples": 5, "entries": 1, "splatter": "visible", "layers": 2}
