@@ -112,20 +112,19 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
-    # Outlines are found in each view by itself.
-    together = settings.layers != "auto" and not settings.finds_outlines
-    if together and settings.side is not None and len(settings.bands(size)) == 1:
+    if settings.layers != "auto" and settings.side is not None and len(settings.bands(size)) == 1:
         height, width = (settings.side * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
         samplings = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
+        # Which rows are in use is unknown if they are padded, so that one call must serve all views.
+        padded = engine.padded(like)
+        one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
         if place.views > 1 and all(own.possible for own in samplings):
-            # The view of a padded row is unknown, so that one call must serve all views.
-            one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
             countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
-            if one_call if engine.padded(like) else countable:
+            if one_call if padded else countable:
                 return _as_pictures([sampled_as_one(own) for own in samplings], scenes, context, settings)
-        if several and differentiates:
+        if (several and differentiates) or (settings.finds_outlines and (one_call or not padded)):
             views = _sampled_at_once(scenes, size, settings)
             pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
             complete = [picture for picture in pictures if picture is not None]
@@ -143,8 +142,12 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
 
 
 def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
-    """The samples of each view; every core samples one view at a time."""
-    return each(lambda own: sampled_scene(own, own.camera, size, settings, settles=True), scenes)
+    """The samples of each view; every core samples one view at a time, if threads may."""
+
+    def own(scene: Scene) -> Sampled:
+        return sampled_scene(scene, scene.camera, size, settings, settles=True)
+
+    return each(own, scenes) if _concurrent(scenes[0]) else list(map(own, scenes))
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:

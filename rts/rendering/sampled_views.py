@@ -32,7 +32,7 @@ from rts.sampling.packing import FAR, lift
 from rts.sampling.sample_checks import check_fragments, checked_pieces
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
-from rts.splatting.side_by_side import Picture, depth_scales
+from rts.splatting.side_by_side import Picture, depth_scales, outlines_side_by_side, renumbered
 
 
 class Views(NamedTuple):
@@ -81,7 +81,10 @@ class Sampling(NamedTuple):
 
         Views of some parts must be sampled one by one: parts with exits, and parts whose sampler overrides `sample`. So
         must views of surfaces that refine samples, leave them off their rays, intersect rays, or depend on the view.
+        Outlines are found in each view by itself.
         """
+        if self.settings.finds_outlines:
+            return False
         exits = self.scenes[0].context.engine.differentiates and "exit" in self.settings.reader.reads
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
 
@@ -194,10 +197,10 @@ def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
 
 
 def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
-    """`Views` of samples that are not traced, with all rows in use."""
-    constant = engine_of(sampled.row).constant
-    view = tuple(constant(_numbers(own, own.sum())) for own in counts)
-    return Views(sampled, picture, view, counts, scales)
+    """`Views` of samples with these numbers of rows; which rows are in use is unknown where they are padded."""
+    engine = engine_of(sampled.row)
+    view = tuple(engine.constant(_numbers(own, own.sum())) for own in counts)
+    return Views(sampled, picture, view, None if engine.padded(sampled.row) else counts, scales)
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
@@ -219,7 +222,9 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
     """One picture of views that were sampled one by one; None if their samples cannot share a table."""
     first, engine = views[0], engine_of(views[0].row)
     for view in views:
-        if engine.padded(view.row) or any(set(s.by_sample) != set(s.tables) for s in view.samples):
+        # With outlines, all rows pass for used.
+        unknown = engine.padded(view.row) and view.outlines is None
+        if unknown or any(set(s.by_sample) != set(s.tables) for s in view.samples):
             return None
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
@@ -237,10 +242,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         several = len(recorded[0].shape) == 3
         stacked = xp.stack([x if several else x[None, ...] for x in recorded])
         if shift is not None:
-            rows = stacked
-            for index in range(shift.shape[1]):
-                from_row, by = (engine.constant(x[:, index, None, None, None], rows) for x in (own_starts, shift))
-                stacked = xp.where(rows >= from_row if index else rows >= 0, rows + by, stacked)
+            stacked = renumbered(stacked, own_starts, shift)
         whole = picture.laid_out(stacked, empty)
         return whole if several else whole[0, ...]
 
@@ -248,19 +250,24 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         own = [view.samples[index] for view in views]
         row = laid_out([s.row for s in own], -1, starts[:, index, None])
         samples.append(in_one_table(own).replace(row=row, depth=laid_out([s.depth for s in own], 0)))
+    cells = Cells(
+        laid_out([view.row for view in views], -1, shifts),
+        laid_out([view.depth for view in views], 0),
+        facing=laid_out([view.facing for view in views], 0),
+        exit=laid_out([view.exit for view in views], -1, shifts),
+        settled=laid_out([view.settled for view in views], -1),
+    )
+    assert cells.depth is not None
+    scales = _scales_of(cells.depth, picture)
+    found = [view.outlines for view in views if view.outlines is not None]
     sampled = replace(
         first,
         samples=tuple(samples),
-        cells=Cells(
-            laid_out([view.row for view in views], -1, shifts),
-            laid_out([view.depth for view in views], 0),
-            facing=laid_out([view.facing for view in views], 0),
-            exit=laid_out([view.exit for view in views], -1, shifts),
-            settled=laid_out([view.settled for view in views], -1),
-        ),
+        cells=cells,
         overflow=sum(view.overflow for view in views),
+        outlines=outlines_side_by_side(found, picture, own_starts, shifts, scales) if found else None,
     )
-    return _with_counts(sampled, picture, _scales_of(sampled.depth, picture), tuple(counts.T))
+    return _with_counts(sampled, picture, scales, tuple(counts.T))
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
