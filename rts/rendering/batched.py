@@ -18,6 +18,7 @@ from rts.errors import InputError
 from rts.operations.inset import averaged
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.rendering.image import image_of, over_background, seen, splatted
+from rts.rendering.outlines_of_views import with_outlines_of_views
 from rts.rendering.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.rendering.samples import sampled_scene
 from rts.rendering.scene import Scene
@@ -122,7 +123,10 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
         one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
         if place.views > 1 and all(own.possible for own in samplings):
             countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
-            if one_call if padded else countable:
+            if settings.finds_outlines and countable:
+                pictures = [with_outlines_of_views(sampled_as_one(own), own) for own in samplings]
+                return _as_pictures(pictures, scenes, context, settings)
+            if not settings.finds_outlines and (one_call if padded else countable):
                 return _as_pictures([sampled_as_one(own) for own in samplings], scenes, context, settings)
         if (several and differentiates) or (settings.finds_outlines and (one_call or not padded)):
             views = _sampled_at_once(scenes, size, settings)

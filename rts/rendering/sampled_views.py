@@ -28,7 +28,7 @@ from rts.sampling.facing import facing_of_views
 from rts.sampling.hidden import HiddenRule, without_hidden
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
-from rts.sampling.packing import FAR, lift
+from rts.sampling.packing import FAR, lift, triangles_of
 from rts.sampling.sample_checks import check_fragments, checked_pieces
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
@@ -81,10 +81,7 @@ class Sampling(NamedTuple):
 
         Views of some parts must be sampled one by one: parts with exits, and parts whose sampler overrides `sample`. So
         must views of surfaces that refine samples, leave them off their rays, intersect rays, or depend on the view.
-        Outlines are found in each view by itself.
         """
-        if self.settings.finds_outlines:
-            return False
         exits = self.scenes[0].context.engine.differentiates and "exit" in self.settings.reader.reads
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
 
@@ -128,6 +125,7 @@ class Sampling(NamedTuple):
             "scales": ArraySpec((picture.views,), np.float32),
             **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
             **({"settled": ArraySpec(picture.size, np.int8)} if hidden and hidden.settles else {}),
+            **({"triangle": shape.row_spec(np.int32)} if settings.finds_outlines else {}),
         }
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
@@ -150,6 +148,8 @@ class Sampling(NamedTuple):
             lifted = lift(fragments, built.proxy, capacity, kept, views=(picture.down, picture.across))
             counts = _counts(lifted.row, len(lifted.ids) if capacity is None else 0, picture)
             extras["view"] = _numbers(counts, len(lifted.ids))
+            if settings.finds_outlines:
+                extras["triangle"] = triangles_of(fragments, lifted)
             return replace(lifted, overflow=np.asarray(over, np.int32)), extras
 
         samples, extras = HostCall(part, surface, cameras, shape, entry).samples(find, specs)
@@ -176,7 +176,7 @@ def sampled_as_one(sampling: Sampling) -> Views:
     if padded:
         return Views(sampled, picture, tuple(_views_of(s, picture) for s in sampled.samples), None, scales)
     counts = tuple(_counts(value_of(s.row), s.ids.shape[0], picture) for s in sampled.samples)
-    return _with_counts(sampled, picture, scales, counts)
+    return with_counts(sampled, picture, scales, counts)
 
 
 def _views_of(samples: Samples, picture: Picture) -> Array:
@@ -196,7 +196,7 @@ def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
     return numbers
 
 
-def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
+def with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
     """`Views` of samples with these numbers of rows; which rows are in use is unknown where they are padded."""
     engine = engine_of(sampled.row)
     view = tuple(engine.constant(_numbers(own, own.sum())) for own in counts)
@@ -267,7 +267,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         overflow=sum(view.overflow for view in views),
         outlines=outlines_side_by_side(found, picture, own_starts, shifts, scales) if found else None,
     )
-    return _with_counts(sampled, picture, scales, tuple(counts.T))
+    return with_counts(sampled, picture, scales, tuple(counts.T))
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
