@@ -219,6 +219,11 @@ def known_value(x: Array) -> np.ndarray:
     return value
 
 
+def _on_host(camera: Camera) -> Camera:
+    """A camera that is not traced, with matrices on the host."""
+    return camera.map(lambda m: np.asarray(known_value(m), np.float64))
+
+
 class _Broken(NamedTuple):
     """Breaks, and the samples that they need. Host arrays.
 
@@ -269,7 +274,7 @@ class Points:
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
         """Take for each part its sampler, camera, entry and, where triangles tell all, sheets."""
         self._scene, self._grid, self._parts = scene, grid, parts
-        self._width = np.asarray(known_value(grid.camera.spread(grid.size)), np.float64)
+        self._width = np.asarray(_on_host(grid.camera).spread(grid.size))
 
     @classmethod
     def of(cls, scene: Scene, grid: Grid) -> Points:
@@ -278,7 +283,7 @@ class Points:
         for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
             camera, sheets = grid.camera.within(part.transform), None
             if isinstance(sampler, TriangleSampler):
-                host = camera.for_size(grid.size).map(lambda m: np.asarray(known_value(m), np.float64))
+                host = _on_host(camera.for_size(grid.size))
                 entry = _entry(part, sampler, entry, host, grid.size)
                 if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)

@@ -13,7 +13,6 @@ from rts.compiling.threads import each
 from rts.contracts.records import Samples
 from rts.rendering.outlines import Found, Points, at_centres, found_in_views, known_value, real_of
 from rts.rendering.sampled_views import Sampling, Views, in_one_table, with_counts
-from rts.rendering.scene import Grid
 from rts.sampling.gaps import Fronts
 from rts.splatting.side_by_side import outlines_side_by_side
 
@@ -26,7 +25,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     """
     sampled, picture, scenes = views.sampled, views.picture, sampling.scenes
     assert views.counts is not None
-    grids = [Grid.sampled(scene, scene.camera, sampling.cells, sampled.apron) for scene in scenes]
+    grids = sampling.grids
     first = Points.of(scenes[0], grids[0])
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
     points = [first, *each(lambda own: Points.of(*own), further)]

@@ -8,7 +8,8 @@ triangles are drawn view by view.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,7 +55,8 @@ class Views(NamedTuple):
     scales: Array
 
 
-class Sampling(NamedTuple):
+@dataclass(frozen=True)
+class Sampling:
     """Arguments for sampling views as one picture.
 
     Attributes:
@@ -74,6 +76,11 @@ class Sampling(NamedTuple):
         """(height, width) of each view in cells, without its apron."""
         side = self.settings.side or 1
         return side * self.size[0], side * self.size[1]
+
+    @cached_property
+    def grids(self) -> list[Grid]:
+        """The cells of each view, and their camera."""
+        return [Grid.sampled(scene, scene.camera, self.cells, self.settings.apron) for scene in self.scenes]
 
     @property
     def possible(self) -> bool:
@@ -112,8 +119,7 @@ class Sampling(NamedTuple):
             Samples on the grid of the picture, and `view` and `scales` of `Views`.
         """
         settings = self.settings
-        grids = [Grid.sampled(scene, scene.camera, self.cells, settings.apron) for scene in self.scenes]
-        cameras = [stopped(grid.camera.within(part.transform)) for grid in grids]
+        cameras = [stopped(grid.camera.within(part.transform)) for grid in self.grids]
         surface, picture, layers = part.surface, self.picture, settings.most_layers
         assert isinstance(surface, TriangleSurface)
         tells = "facing" in settings.reader.reads and layers > 1 and part.cull == "none"
