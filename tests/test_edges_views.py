@@ -143,8 +143,7 @@ def test_views_and_gradients_are_those_of_a_loop_by_one_splat(name):
 @thorough
 @pytest.mark.parametrize("name", FIELDS)
 def test_surfaces_that_are_sampled_view_by_view_share_a_splat(name):
-    # Rays are cast in float32. Tables of patches are of one view.
-    assert assert_same(name) == (len(CAMERAS) if name == "patches" else 1)
+    assert assert_same(name) == 1
 
 
 @pytest.mark.parametrize("name", ["three", "glass"])
@@ -160,6 +159,7 @@ def test_numpy_views_are_those_of_a_loop(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
 
 
+@thorough
 @pytest.mark.parametrize("name", ["three", "glass", "plain"])
 def test_torch_func_sees_the_views_of_a_loop(name):
     pose, splatter, way = torch.tensor(POSE), Counted(), torch.ones(6, dtype=torch.float64)

@@ -57,7 +57,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
 
 
 def _view_after_view(cells: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """The order that puts rows beside breaks behind their view's rows of cells; (B,) numbers of both, one after other."""
+    """The order that puts rows beside breaks behind those of cells of their view, given the number (B,) of both."""
     counts = np.stack([cells, beside])
     ends = np.cumsum(counts).reshape(counts.shape)
     return np.concatenate([np.arange(end - n, end) for end, n in zip(ends.T.flat, counts.T.flat, strict=True)])
