@@ -55,10 +55,11 @@ def render_views(
 
     Views lie side by side in pictures of at most 1024² cells. Python's overhead, results for the whole of θ such as
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
-    shaders without mipmaps do. With jax, and under `torch.func`, views share a picture only if all fit into one, and if
-    each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are with
-    `layers="auto"`, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one
-    on each core. With torch and jax all views are in memory at once, with a gradient or without.
+    shaders without mipmaps do. The splatter "edges" finds the outlines of each view by itself. With jax, and under
+    `torch.func`, views share a picture only if all fit into one, and if each shader takes views or gives one colour.
+    Otherwise views are rendered one after another; so they are with `layers="auto"`, but not with "edges" where all is
+    opaque, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one on each
+    core. With torch and jax all views are in memory at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
@@ -123,12 +124,12 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
         one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
         if place.views > 1 and all(own.possible for own in samplings):
             countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
-            if settings.finds_outlines and countable:
-                pictures = [with_outlines_of_views(sampled_as_one(own), own) for own in samplings]
+            # Outlines of padded samples are found view by view.
+            if (one_call and not settings.finds_outlines) if padded else countable:
+                pictures = [_sampled_as_one(own) for own in samplings]
                 return _as_pictures(pictures, scenes, context, settings)
-            if not settings.finds_outlines and (one_call if padded else countable):
-                return _as_pictures([sampled_as_one(own) for own in samplings], scenes, context, settings)
-        if (several and differentiates) or (settings.finds_outlines and (one_call or not padded)):
+        outlined = settings.finds_outlines and place.views > 1 and (one_call or not padded)
+        if (several and differentiates) or outlined:
             views = _sampled_at_once(scenes, size, settings)
             pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
             complete = [picture for picture in pictures if picture is not None]
@@ -143,6 +144,12 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
         # A shader may close over arrays of an engine whose transforms belong to this thread.
         images += each(draw, scenes[1:]) if type(images[0]) is np.ndarray else map(draw, scenes[1:])
     return namespace(*images).stack(images)
+
+
+def _sampled_as_one(sampling: Sampling) -> Views:
+    """The views of a picture, with their outlines if the splatter reads these."""
+    views = sampled_as_one(sampling)
+    return with_outlines_of_views(views, sampling) if sampling.settings.finds_outlines else views
 
 
 def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
