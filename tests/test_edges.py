@@ -235,14 +235,6 @@ def test_supersampling_keeps_the_area():
     np.testing.assert_allclose(image[..., 3], covered(corners, SIZE), atol=2e-4)
 
 
-def test_views_are_drawn_as_one_by_one():
-    corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
-    cameras = [in_pixels(), in_pixels().replace(view=rts.rigid(np.array([0, 0, 0.1, 0.3, 0.2, 0])))]
-    views = rts.render_views(card(corners), cameras, SIZE, splatter="edges")
-    for camera, image in zip(cameras, views, strict=True):
-        np.testing.assert_array_equal(image, rts.render(card(corners), camera, SIZE, splatter="edges"))
-
-
 def test_prepared_parts_and_samples_are_drawn_alike():
     corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
     whole = edges(card(corners))

@@ -18,6 +18,7 @@ from rts.errors import InputError
 from rts.operations.inset import averaged
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
 from rts.rendering.image import image_of, over_background, seen, splatted
+from rts.rendering.outlines_of_views import with_outlines_of_views
 from rts.rendering.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.rendering.samples import sampled_scene
 from rts.rendering.scene import Scene
@@ -54,11 +55,11 @@ def render_views(
 
     Views lie side by side in pictures of at most 1024² cells. Python's overhead, results for the whole of θ such as
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
-    shaders without mipmaps do. With jax, and under `torch.func`, views share a picture only if all fit into one, and if
-    each shader takes views or gives one colour. Otherwise views are rendered one after another; so they are where
-    outlines are found, as by "edges", with `layers="auto"`, and if images are rendered in bands. NumPy views that are
-    too large for a picture are rendered one on each core. With torch and jax all views are in memory at once, with a
-    gradient or without.
+    shaders without mipmaps do. The splatter "edges" finds the outlines of each view by itself. With jax, and under
+    `torch.func`, views share a picture only if all fit into one, and if each shader takes views or gives one colour.
+    Otherwise views are rendered one after another; so they are with `layers="auto"`, but not with "edges" where all is
+    opaque, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one on each
+    core. With torch and jax all views are in memory at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
@@ -113,20 +114,22 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
-    # Outlines are found in each view by itself.
-    together = settings.layers != "auto" and not settings.finds_outlines
-    if together and settings.side is not None and len(settings.bands(size)) == 1:
+    if settings.layers != "auto" and settings.side is not None and len(settings.bands(size)) == 1:
         height, width = (settings.side * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
         samplings = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
+        # Which rows are in use is unknown if they are padded, so that one call must serve all views.
+        padded = engine.padded(like)
+        one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
         if place.views > 1 and all(own.possible for own in samplings):
-            # The view of a padded row is unknown, so that one call must serve all views.
-            one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
             countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
-            if one_call if engine.padded(like) else countable:
-                return _as_pictures([sampled_as_one(own) for own in samplings], scenes, context, settings)
-        if several and differentiates:
+            # Outlines of padded samples are found view by view.
+            if (one_call and not settings.finds_outlines) if padded else countable:
+                pictures = [_sampled_as_one(own) for own in samplings]
+                return _as_pictures(pictures, scenes, context, settings)
+        outlined = settings.finds_outlines and place.views > 1 and (one_call or not padded)
+        if (several and differentiates) or outlined:
             views = _sampled_at_once(scenes, size, settings)
             pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
             complete = [picture for picture in pictures if picture is not None]
@@ -143,9 +146,19 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     return namespace(*images).stack(images)
 
 
+def _sampled_as_one(sampling: Sampling) -> Views:
+    """The views of a picture, with their outlines if the splatter reads these."""
+    views = sampled_as_one(sampling)
+    return with_outlines_of_views(views, sampling) if sampling.settings.finds_outlines else views
+
+
 def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
-    """The samples of each view; every core samples one view at a time."""
-    return each(lambda own: sampled_scene(own, own.camera, size, settings, settles=True), scenes)
+    """The samples of each view; every core samples one view at a time, if threads may."""
+
+    def own(scene: Scene) -> Sampled:
+        return sampled_scene(scene, scene.camera, size, settings, settles=True)
+
+    return each(own, scenes) if _concurrent(scenes[0]) else list(map(own, scenes))
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
@@ -67,24 +68,21 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
-        row, depth, own = map_leaves(_known, inputs[3:])
-        entered = [map_leaves(_known, x) for *_, x in inputs[0]]
-        here, more = _Points.of(scene, grid, entered).found(_at_centres(row, depth, own, sampled.samples))
-        specs = _Found.specs(0, grid.size, _real(scene), len(row))
+        row, depth, own = map_leaves(known_value, inputs[3:])
+        entered = [map_leaves(known_value, x) for *_, x in inputs[0]]
+        centres = at_centres(row, depth, own, sampled.samples)
+        (here,), more = found_in_views([Points.of(scene, grid, entered)], [centres])
+        specs = Found.specs(0, grid.size, real_of(scene), len(row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
-        found = _Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
+        found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
     for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         count = own.ids.shape[-2]
         rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
         samples.append(in_one_table([own, extra]))
         first += samples[-1].ids.shape[-2]
-    named = {"rows": rows[:, :2], "inner": rows[:, 2:4], "pair": rows[:, 4:]}
-    if sampled.row.shape[0] > 1:
-        none = 0 * rows[:, :2] - 1
-        named = {"rows": rows[:, :2], "inner": rows[:, :2], "pair": none, **_stacks(found, rows[:, 2:])}
-    outlines = Outlines(**{f.name: named.get(f.name, getattr(found, f.name, None)) for f in fields(Outlines)})
+    outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
 
@@ -101,14 +99,13 @@ def with_entries(scene: Scene, grid: Grid) -> Scene:
     entries = []
     for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
         if entry is None and isinstance(sampler, TriangleSampler) and _is_dear(part):
-            camera = grid.camera.within(part.transform).for_size(grid.size)
-            camera = camera.map(lambda m: np.asarray(_known(m), np.float64))
-            entry = _entry(part, sampler, map_leaves(_known, _proxy_inputs(part)), camera, grid.size)
+            camera = _on_host(grid.camera.within(part.transform).for_size(grid.size))
+            entry = _entry(part, sampler, map_leaves(known_value, _proxy_inputs(part)), camera, grid.size)
         entries.append(entry)
     return scene._replace(entries=entries)
 
 
-class _Found(NamedTuple):
+class Found(NamedTuple):
     """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
 
     Attributes:
@@ -152,11 +149,27 @@ class _Found(NamedTuple):
         segments += [ArraySpec((ends, 2), real, packed=True), ArraySpec((ends, 4), real, packed=True)]
         return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
 
+    def outlines(self, rows: Array) -> Outlines:
+        """The outlines, with `rows` counted over all parts."""
+        last = rows[:, :2]
+        named = {"rows": last, "inner": rows[:, 2:4], "pair": rows[:, 4:]}
+        if self.sides.shape[-1]:
+            named = {"rows": last, "inner": last, "pair": 0 * last - 1, **self._stacks(rows[:, 2:])}
+        return Outlines(**{f.name: named.get(f.name, getattr(self, f.name, None)) for f in fields(Outlines)})
+
+    def _stacks(self, rows: Array) -> dict[str, Array]:
+        """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
+        xp, shape, there = namespace(rows), self.sides.shape, self.sides >= 0
+        first = engine_of(rows).constant(np.arange(shape[0], dtype=np.int32) * rows.shape[1], rows)[:, None, None]
+        at = xp.reshape(xp.where(there, first + self.sides, 0), (-1,))
+        stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, self.places))
+        return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
+
 
 def _found_on_host(
     sampled: Sampled, scene: Scene, grid: Grid, most: int | None, inputs: Tree
-) -> tuple[_Found, list[Samples]]:
-    """`_Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
+) -> tuple[Found, list[Samples]]:
+    """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
     owners = [_tables(own) for own in sampled.samples]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
@@ -166,8 +179,8 @@ def _found_on_host(
         own_parts = zip(scene.parts, of_parts, strict=True)
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
         entered = [x for *_, x in of_parts]
-        points = _Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
-        found, more = points.found(_at_centres(row, depth, own, sampled.samples), most)
+        points = Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
+        (found,), more = found_in_views([points], [at_centres(row, depth, own, sampled.samples)], most)
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
@@ -177,30 +190,21 @@ def _found_on_host(
 
     layers = sampled.row.shape[0]
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
-    specs = _Found.specs(most or 0, grid.size, _real(scene), layers)
+    specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
     for x in (x for own in owners for x in own.values()):
         dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
         specs.append(ArraySpec((_columns(layers)[0] * (most or 0), *x.shape[1:]), dtype, packed=True))
     results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
-    found = _Found(*(next(results) for _ in _Found._fields))
+    found = Found(*(next(results) for _ in Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
 
 
 def _columns(layers: int) -> tuple[int, int, int]:
-    """The numbers of samples of a break, of those of its stack, and of layers on each side; see `_Found`."""
+    """The numbers of samples of a break, of those of its stack, and of layers on each side; see `Found`."""
     return (6, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)
 
 
-def _stacks(found: _Found, rows: Array) -> dict[str, Array]:
-    """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
-    xp, shape, there = namespace(rows), found.sides.shape, found.sides >= 0
-    first = engine_of(rows).constant(np.arange(shape[0], dtype=np.int32) * rows.shape[1], rows)[:, None, None]
-    at = xp.reshape(xp.where(there, first + found.sides, 0), (-1,))
-    stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, found.places))
-    return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
-
-
-def _real(scene: Scene) -> Any:
+def real_of(scene: Scene) -> Any:
     """The dtype of a scene's floating arrays."""
     like = scene.context.like
     return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
@@ -235,7 +239,7 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
     return replace(sampled.cells, row=xp.where(row >= 0, moved, row))
 
 
-def _at_centres(
+def at_centres(
     row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
 ) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the `row` and `depth` of a scene, and its parts' triangles."""
@@ -264,59 +268,104 @@ def _batched(x: Array) -> bool:
     return value is not None and value.ndim != x.ndim
 
 
-def _known(x: Array) -> np.ndarray:
+def known_value(x: Array) -> np.ndarray:
     """The value of an array, which is not traced."""
     value = value_of(x)
     assert value is not None
     return value
 
 
-class _Points:
+def _on_host(camera: Camera) -> Camera:
+    """A camera that is not traced, with matrices on the host."""
+    return camera.map(lambda m: np.asarray(known_value(m), np.float64))
+
+
+class _Broken(NamedTuple):
+    """Breaks, and the samples that they need. Host arrays.
+
+    Attributes:
+        breaks: the breaks.
+        parts: (B, R), the parts of samples, or −1.
+        points: (B, R, 2), where they are.
+        triangles: (B, R), on which they are; −1 where none is known.
+        sides: see `Found.sides`.
+        left: number of breaks left out.
+    """
+
+    breaks: Breaks
+    parts: np.ndarray
+    points: np.ndarray
+    triangles: np.ndarray
+    sides: np.ndarray
+    left: int
+
+
+def found_in_views(
+    views: Sequence[Points], layers: Sequence[Fronts], most: int | None = None
+) -> tuple[list[Found], list[Samples]]:
+    """Outlines of each view between what is seen at centres (K, H, W), of at most `most` breaks; samples of each part.
+
+    Samples of several views lie on triangles. They are one table for each part, view after view.
+    """
+    broken = each(lambda b: views[b].broken(layers[b], most), range(len(views)))
+    rows, samples = [np.full(own.parts.shape, -1, np.int32) for own in broken], []
+    for part in range(len(views[0].entries)):
+        asked = [own.parts == part for own in broken]
+        points = [own.points[here] for own, here in zip(broken, asked, strict=True)]
+        known = [own.triangles[here] for own, here in zip(broken, asked, strict=True)]
+        fragments = [view.on_sheets(part, *own) for view, *own in zip(views, points, known, strict=True)]
+        together = None
+        if None not in fragments:
+            together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
+        samples.append(views[0].sample(part, np.concatenate(points), together))
+        ends, numbers = np.cumsum([len(x) for x in points]), known_value(samples[-1].row)[0, 0]
+        for own, here, number in zip(rows, asked, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
+            own[here] = number
+    return [view.found(own, at, samples) for view, own, at in zip(views, broken, rows, strict=True)], samples
+
+
+class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
         """Take for each part its sampler, camera, entry and, where triangles tell all, sheets."""
         self._scene, self._grid, self._parts = scene, grid, parts
-        self._width = np.asarray(_known(grid.camera.spread(grid.size)), np.float64)
+        self._width = np.asarray(_on_host(grid.camera).spread(grid.size))
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> _Points:
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> Points:
         """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
         parts = []
         for part, sampler, entry, own in zip(scene.parts, scene.chosen(), scene.entries, inputs, strict=True):
             camera, sheets = grid.camera.within(part.transform), None
             if isinstance(sampler, TriangleSampler):
-                host = camera.for_size(grid.size).map(lambda m: np.asarray(_known(m), np.float64))
+                host = _on_host(camera.for_size(grid.size))
                 entry = entry or _entry(part, sampler, own, host, grid.size)
                 if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
 
-    def found(self, layers: Fronts, most: int | None = None) -> tuple[_Found, list[Samples]]:
-        """Outlines between what is seen at centres (K, H, W), of at most `most` breaks; each part's samples there."""
-        breaks, parts, points, triangles, sides = self.breaks(layers)
-        left = 0 if most is None else max(0, len(breaks.gap) - most)
-        if left:
-            breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
-            parts, points, triangles, sides = (x[:most] for x in (parts, points, triangles, sides))
-        samples, rows = [], np.full(parts.shape, -1, np.int32)
-        for part in range(len(self._parts)):
-            asked = parts == part
-            samples.append(self.sample(part, points[asked], triangles[asked]))
-            rows[asked] = _known(samples[-1].row)[0, 0]
-        if len(layers.part) == 1:
+    @property
+    def entries(self) -> list[Any]:
+        """The prepared entry of each part."""
+        return [entry for _, _, entry, _ in self._parts]
+
+    def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Found:
+        """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
+        breaks, parts, points, _, sides, left = broken
+        layered = sides.shape[-1] > 0
+        if not layered:
             pairs, of_pairs = self._pairs(breaks, samples)
             rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
         along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
         first = breaks.gap[:, 1::-1] + 0.5
         place = ((breaks.place - first) * along).sum(-1)
         places = ((points - first[:, None]) * along[:, None]).sum(-1)
-        entries = places[:, 2:] if len(layers.part) > 1 else places[:, :0]
+        entries = places[:, 2:] if layered else places[:, :0]
         own = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
-        segments = joined(breaks, len(layers.part) > 1)
-        found = _Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
-        return found, samples
+        segments = joined(breaks, layered)
+        return Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
 
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
@@ -331,17 +380,22 @@ class _Points:
                 continue
             more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
             if more.exit is not None and len(more.exit) == 2:
-                found = _known(more.exit)[:, 0].T
+                found = known_value(more.exit)[:, 0].T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
             samples[own] = in_one_table([samples[own], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
 
-    def breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The breaks between what is seen at centres (K, H, W), and the samples that they need.
+    def broken(self, layers: Fronts, most: int | None) -> _Broken:
+        """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
+        breaks, *others = self._breaks(layers)
+        left = 0 if most is None else max(0, len(breaks.gap) - most)
+        if left:
+            breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
+            others = [x[:most] for x in others]
+        return _Broken(breaks, *others, left)
 
-        Returns:
-            Breaks; parts (B, R), points (B, R, 2) and triangles (B, R) of samples, and `_Found.sides`.
-        """
+    def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """All breaks, and the other arrays of `_Broken`."""
         sheets = [own for *_, own in self._parts if own is not None]
         if len(layers.part) > 1:
             opaque = np.array(self._scene.opaque)
@@ -361,15 +415,19 @@ class _Points:
         )
         return breaks, parts, points, breaks.triangles, np.empty((len(parts), 2, 0), np.int32)
 
-    def sample(
-        self, part: int, points: np.ndarray, triangles: np.ndarray | None = None, exits: bool = False
-    ) -> Samples:
-        """One layer of samples of a part at points (M, 2); on `triangles` (M,) if they are known (not −1)."""
+    def on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
+        """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
+        sheets = self._parts[part][-1]
+        return sheets.at(triangles, points)[0] if sheets is not None and (triangles >= 0).all() else None
+
+    def sample(self, part: int, points: np.ndarray, fragments: Fragments | None = None, exits: bool = False) -> Samples:
+        """One layer of samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
         sampler, camera, entry, sheets = self._parts[part]
         if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
-            points, triangles = np.full((1, 2), 0.5), None  # Surfaces may want a ray; nothing names its sample.
-        if sheets is not None and triangles is not None and (triangles >= 0).all():
-            sampler = _OnTriangles(sheets.at(triangles, points)[0])
+            # Surfaces may want a ray at least; nothing names its sample.
+            points, fragments = np.full((1, 2), 0.5), None
+        if fragments is not None:
+            sampler = _OnTriangles(fragments)
         request = Request(points=points, exits=exits, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" in samples.followed:
@@ -389,7 +447,7 @@ class _Points:
         part, depth = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
         for index in range(len(self._parts)):
             samples = self.sample(index, points)
-            seen, z = _known(samples.row)[0, 0] >= 0, _known(samples.depth)[0, 0]
+            seen, z = known_value(samples.row)[0, 0] >= 0, known_value(samples.depth)[0, 0]
             nearer = seen & (z < depth)
             part[nearer], depth[nearer] = index, z[nearer]
         return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
@@ -420,6 +478,11 @@ class _OnTriangles(TriangleSampler):
     ) -> Fragments:
         """The fragments."""
         return self._fragments
+
+
+def inputs_of(scene: Scene) -> list[Tree]:
+    """The inputs of the proxies of all parts, on the host; none of them is traced."""
+    return [map_leaves(known_value, _proxy_inputs(part)) for part in scene.parts]
 
 
 def _proxy_inputs(part: CheckedPart) -> Tree:

@@ -8,7 +8,8 @@ triangles are drawn view by view.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,11 +29,11 @@ from rts.sampling.facing import facing_of_views
 from rts.sampling.hidden import HiddenRule, without_hidden
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
-from rts.sampling.packing import FAR, lift
+from rts.sampling.packing import FAR, lift, triangles_of
 from rts.sampling.sample_checks import check_fragments, checked_pieces
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
-from rts.splatting.side_by_side import Picture, depth_scales
+from rts.splatting.side_by_side import Picture, depth_scales, outlines_side_by_side, renumbered
 
 
 class Views(NamedTuple):
@@ -54,7 +55,8 @@ class Views(NamedTuple):
     scales: Array
 
 
-class Sampling(NamedTuple):
+@dataclass(frozen=True)
+class Sampling:
     """Arguments for sampling views as one picture.
 
     Attributes:
@@ -74,6 +76,11 @@ class Sampling(NamedTuple):
         """(height, width) of each view in cells, without its apron."""
         side = self.settings.side or 1
         return side * self.size[0], side * self.size[1]
+
+    @cached_property
+    def grids(self) -> list[Grid]:
+        """The cells of each view, and their camera."""
+        return [Grid.sampled(scene, scene.camera, self.cells, self.settings.apron) for scene in self.scenes]
 
     @property
     def possible(self) -> bool:
@@ -112,8 +119,7 @@ class Sampling(NamedTuple):
             Samples on the grid of the picture, and `view` and `scales` of `Views`.
         """
         settings = self.settings
-        grids = [Grid.sampled(scene, scene.camera, self.cells, settings.apron) for scene in self.scenes]
-        cameras = [stopped(grid.camera.within(part.transform)) for grid in grids]
+        cameras = [stopped(grid.camera.within(part.transform)) for grid in self.grids]
         surface, picture, layers = part.surface, self.picture, settings.most_layers
         assert isinstance(surface, TriangleSurface)
         tells = "facing" in settings.reader.reads and layers > 1 and part.cull == "none"
@@ -125,6 +131,7 @@ class Sampling(NamedTuple):
             "scales": ArraySpec((picture.views,), np.float32),
             **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
             **({"settled": ArraySpec(picture.size, np.int8)} if hidden and hidden.settles else {}),
+            **({"triangle": shape.row_spec(np.int32)} if settings.finds_outlines else {}),
         }
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
@@ -147,6 +154,8 @@ class Sampling(NamedTuple):
             lifted = lift(fragments, built.proxy, capacity, kept, views=(picture.down, picture.across))
             counts = _counts(lifted.row, len(lifted.ids) if capacity is None else 0, picture)
             extras["view"] = _numbers(counts, len(lifted.ids))
+            if settings.finds_outlines:
+                extras["triangle"] = triangles_of(fragments, lifted)
             return replace(lifted, overflow=np.asarray(over, np.int32)), extras
 
         samples, extras = HostCall(part, surface, cameras, shape, entry).samples(find, specs)
@@ -173,7 +182,7 @@ def sampled_as_one(sampling: Sampling) -> Views:
     if padded:
         return Views(sampled, picture, tuple(_views_of(s, picture) for s in sampled.samples), None, scales)
     counts = tuple(_counts(value_of(s.row), s.ids.shape[0], picture) for s in sampled.samples)
-    return _with_counts(sampled, picture, scales, counts)
+    return with_counts(sampled, picture, scales, counts)
 
 
 def _views_of(samples: Samples, picture: Picture) -> Array:
@@ -193,11 +202,11 @@ def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
     return numbers
 
 
-def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
-    """`Views` of samples that are not traced, with all rows in use."""
-    constant = engine_of(sampled.row).constant
-    view = tuple(constant(_numbers(own, own.sum())) for own in counts)
-    return Views(sampled, picture, view, counts, scales)
+def with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
+    """`Views` of samples with these numbers of rows; which rows are in use is unknown where they are padded."""
+    engine = engine_of(sampled.row)
+    view = tuple(engine.constant(_numbers(own, own.sum())) for own in counts)
+    return Views(sampled, picture, view, None if engine.padded(sampled.row) else counts, scales)
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
@@ -219,7 +228,9 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
     """One picture of views that were sampled one by one; None if their samples cannot share a table."""
     first, engine = views[0], engine_of(views[0].row)
     for view in views:
-        if engine.padded(view.row) or any(set(s.by_sample) != set(s.tables) for s in view.samples):
+        # With outlines, all rows pass for used.
+        unknown = engine.padded(view.row) and view.outlines is None
+        if unknown or any(set(s.by_sample) != set(s.tables) for s in view.samples):
             return None
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
@@ -237,10 +248,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         several = len(recorded[0].shape) == 3
         stacked = xp.stack([x if several else x[None, ...] for x in recorded])
         if shift is not None:
-            rows = stacked
-            for index in range(shift.shape[1]):
-                from_row, by = (engine.constant(x[:, index, None, None, None], rows) for x in (own_starts, shift))
-                stacked = xp.where(rows >= from_row if index else rows >= 0, rows + by, stacked)
+            stacked = renumbered(stacked, own_starts, shift)
         whole = picture.laid_out(stacked, empty)
         return whole if several else whole[0, ...]
 
@@ -248,19 +256,24 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         own = [view.samples[index] for view in views]
         row = laid_out([s.row for s in own], -1, starts[:, index, None])
         samples.append(in_one_table(own).replace(row=row, depth=laid_out([s.depth for s in own], 0)))
+    cells = Cells(
+        laid_out([view.row for view in views], -1, shifts),
+        laid_out([view.depth for view in views], 0),
+        facing=laid_out([view.facing for view in views], 0),
+        exit=laid_out([view.exit for view in views], -1, shifts),
+        settled=laid_out([view.settled for view in views], -1),
+    )
+    assert cells.depth is not None
+    scales = _scales_of(cells.depth, picture)
+    found = [view.outlines for view in views if view.outlines is not None]
     sampled = replace(
         first,
         samples=tuple(samples),
-        cells=Cells(
-            laid_out([view.row for view in views], -1, shifts),
-            laid_out([view.depth for view in views], 0),
-            facing=laid_out([view.facing for view in views], 0),
-            exit=laid_out([view.exit for view in views], -1, shifts),
-            settled=laid_out([view.settled for view in views], -1),
-        ),
+        cells=cells,
         overflow=sum(view.overflow for view in views),
+        outlines=outlines_side_by_side(found, picture, own_starts, shifts, scales) if found else None,
     )
-    return _with_counts(sampled, picture, _scales_of(sampled.depth, picture), tuple(counts.T))
+    return with_counts(sampled, picture, scales, tuple(counts.T))
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:

@@ -216,6 +216,7 @@ def _shown_in_views(
     """
     inputs, engine = _of_inputs(context), context.engine
     whole = in_one_table([own.samples[index] for own in sampled])
+    used = whole if sampled[0].outlines is None else _all_in_use(whole, inputs)
     counts, size = _counts_of(pictures, index), grids[0].size
     theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
     gbuffer = evaluate(part, whole, inputs)
@@ -233,7 +234,7 @@ def _shown_in_views(
     cameras = context.constants(cameras)
     if shaded_at_once(part):
         camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
-        rgba = shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
+        rgba = shade(part, theta, transform, used, gbuffer, camera, engine)[1]
     else:
         assert counts is not None
         shaded = []

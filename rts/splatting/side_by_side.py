@@ -8,12 +8,15 @@ powers of two, which is exact. The threshold for equal depths is then up to twic
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import namespace
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
+from rts.contracts.records import Outlines
 
 SIDE = 1024
 """Largest number of cells along each side of a picture: float32 places samples there to 1/16000 of a cell."""
@@ -108,3 +111,58 @@ def depth_scales(largest: np.ndarray) -> np.ndarray:
 def at_once(view: tuple[int, int]) -> int:
     """Number of views of (height, width) cells, aprons included, that fit into one picture."""
     return max(1, (SIDE // view[0]) * (SIDE // view[1]))
+
+
+def renumbered(rows: Array, starts: np.ndarray, shifts: np.ndarray) -> Array:
+    """Indices (n, ...) of rows, moved by the `shifts` (n, P) of the tables that they are in; −1 stays.
+
+    The P tables follow one another, and begin at the rows `starts` (n, P), the first at 0.
+    """
+    xp, constant, moved = namespace(rows), engine_of(rows).constant, rows
+    for table in range(shifts.shape[1]):
+        start, shift = (constant(x[:, table].reshape(-1, *[1] * (rows.ndim - 1)), rows) for x in (starts, shifts))
+        moved = xp.where(rows >= start, rows + shift, moved)
+    return moved
+
+
+def outlines_side_by_side(
+    views: Sequence[Outlines], picture: Picture, starts: np.ndarray, shifts: np.ndarray, scales: Array
+) -> Outlines:
+    """The outlines of several views as those of their picture: breaks and segments, view after view.
+
+    Args:
+        views: the outlines of each view.
+        picture: the layout of the views.
+        starts: (B, P) the first row of each part in a view.
+        shifts: (B, P) by how much the rows of these parts move in the picture.
+        scales: (B,) the factors on depths.
+    """
+    xp, first, known = namespace(scales, views[0].place), views[0], {}
+    for name in (field.name for field in fields(Outlines) if getattr(first, field.name) is not None):
+        of_views = [getattr(view, name) for view in views]
+        known[name] = picture.laid_out(xp.stack(of_views), False) if name == "joined" else xp.concat(of_views)
+    whole, constant = Outlines(**known), engine_of(first.place).constant
+    counts = np.array([(view.place.shape[0], view.square.shape[0]) for view in views], np.int32)
+    of_break, of_segment = (np.repeat(np.arange(len(views)), own) for own in counts.T)
+    corners = np.insert(picture.corners()[:, ::-1], 2, 0, axis=1).astype(np.int32)
+    before = np.cumsum(counts[:, :1], axis=0, dtype=np.int32) - counts[:, :1]
+
+    def of_samples(rows: Array) -> Array:
+        return renumbered(rows, starts[of_break], shifts[of_break])
+
+    def of_breaks(ties: Array) -> Array:
+        return renumbered(ties, 0 * before[of_segment], before[of_segment])
+
+    factors = xp.take(xp.astype(scales, whole.slope.dtype), constant(of_break.astype(np.int32)), axis=0)
+    return replace(
+        whole,
+        gap=whole.gap + constant(corners[of_break], whole.gap),
+        square=whole.square + constant(corners[of_segment, :2], whole.square),
+        rows=of_samples(whole.rows),
+        inner=of_samples(whole.inner),
+        pair=of_samples(whole.pair),
+        stack=None if whole.stack is None else of_samples(whole.stack),
+        slope=whole.slope * factors[:, None, None],
+        ties=of_breaks(whole.ties),
+        beyond=of_breaks(whole.beyond),
+    )

@@ -1,0 +1,81 @@
+"""Outlines of several views that were sampled as one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
+from rts.compiling.threads import each
+from rts.contracts.records import Samples
+from rts.rendering.outlines import Found, Points, at_centres, found_in_views, inputs_of, known_value, real_of
+from rts.rendering.sampled_views import Sampling, Views, in_one_table, with_counts
+from rts.sampling.gaps import Fronts
+from rts.splatting.side_by_side import outlines_side_by_side
+
+
+def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
+    """The samples of views, none of them traced, with `Sampled.outlines` and the samples beside breaks.
+
+    Outlines are found view by view, on all cores. Samples beside breaks are taken for all views at once, and put behind
+    those of their view.
+    """
+    sampled, picture, scenes = views.sampled, views.picture, sampling.scenes
+    assert views.counts is not None
+    grids = sampling.grids
+    first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]))
+    further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
+    points = [first, *each(lambda own: Points.of(*own, [None] * len(scenes[0].parts)), further)]
+    row, depth, *triangles = map(known_value, (sampled.row, sampled.depth, *(s.triangle for s in sampled.samples)))
+    centres = at_centres(row, depth, triangles, sampled.samples)
+    layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
+    found, more = found_in_views(points, layers)
+    samples, counts, moved, cells, start = [], [], [], sampled.cells, 0
+    rows = [np.full(of.rows.shape, -1, np.int32) for of in found]
+    for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
+        count, here = own.ids.shape[0], [(of.parts == part) & (of.rows >= 0) for of in found]
+        beside = np.array([np.count_nonzero(x) for x in here])
+        order = _view_after_view(views.counts[part], beside)
+        place = np.full(count + extra.ids.shape[0], -1, np.int32)
+        place[order] = np.arange(len(order), dtype=np.int32)
+        samples.append(_taken(in_one_table([own, extra]), order).replace(row=_moved(own.row, place)))
+        counts.append(views.counts[part] + beside)
+        moved.append(start + place[:count])
+        for at, of, x in zip(rows, found, here, strict=True):
+            at[x] = start + place[count + of.rows[x]]
+        start += len(order)
+    cells = replace(cells, row=_moved(sampled.row, np.concatenate(moved)))
+    specs, none = Found.specs(0, grids[0].size, real_of(scenes[0]), len(row)), np.zeros((len(found), 1), np.int32)
+    found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
+    outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
+    joint = outlines_side_by_side(outlines, picture, none, none, known_value(views.scales))
+    sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
+    return with_counts(sampled, picture, views.scales, tuple(counts))
+
+
+def _view_after_view(cells: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """The order that puts rows beside breaks behind those of cells of their view, given the number (B,) of both."""
+    counts = np.stack([cells, beside])
+    ends = np.cumsum(counts).reshape(counts.shape)
+    return np.concatenate([np.arange(end - n, end) for end, n in zip(ends.T.flat, counts.T.flat, strict=True)])
+
+
+def _moved(row: Array, place: np.ndarray) -> Array:
+    """The rows of cells, −1 for none, with a new `place` for each."""
+    known = known_value(row)
+    return engine_of(row).constant(np.where(known >= 0, place[known], np.int32(-1)), row)
+
+
+def _taken(samples: Samples, order: np.ndarray) -> Samples:
+    """The rows of a table of samples in another order."""
+    xp, at = namespace(samples.ids), engine_of(samples.ids).constant(order.astype(np.int32), samples.ids)
+
+    def taken(named: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: xp.take(x, at, axis=0) for name, x in named.items()}
+
+    own = taken({"ids": samples.ids, "params": samples.params})
+    gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
+    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer, triangle=None)
