@@ -12,10 +12,10 @@ SLACK = 0.01
 
 
 @loop
-def turns(first, last, rows, vertices, faces, seen, sides):
+def turns(first, last, rows, vertices, faces, keep, seen, sides):
     """Fill `sides` (T,) int8: which side of a triangle is seen, by the sign of its determinant.
 
-    A triangle that is more than a cell wide or high, or is seen in part, has 2 or −2, a smaller one 1 or −1.
+    One to keep that is more than a cell wide or high, or is seen in part, has 2 or −2; others have 1 or −1.
 
     Args:
         first: the first triangle.
@@ -23,22 +23,24 @@ def turns(first, last, rows, vertices, faces, seen, sides):
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
+        keep: sign of the determinants of triangles to keep; 0 keeps both.
         seen: (V, 2), see `sheets_loops.projected`.
         sides: (T,) to fill.
     """
     corners = np.empty((3, 4))
     for t in range(first, last):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
-        area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
+        ax, ay = seen[a, 0], seen[a, 1]
+        bx, by, cx, cy = seen[b, 0] - ax, seen[b, 1] - ay, seen[c, 0] - ax, seen[c, 1] - ay
+        area = bx * cy - cx * by
         if area == 0 or np.isnan(area):
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        small = True
-        for axis in range(2):
-            wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
-            small &= wide <= 1  # False for NaN.
-        size = 1 if small else 2
-        sides[t] = size if area > 0 else (-size if area < 0 else 0)
+        side = 1 if area > 0 else (-1 if area < 0 else 0)
+        if area * keep >= 0:
+            small = (abs(bx) <= 1) & (abs(by) <= 1) & (abs(cx) <= 1) & (abs(cy) <= 1)  # False for NaN.
+            small &= (abs(seen[c, 0] - seen[b, 0]) <= 1) & (abs(seen[c, 1] - seen[b, 1]) <= 1)
+            side = side if small else 2 * side
+        sides[t] = side
 
 
 @loop
@@ -55,7 +57,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         seen: (V, 2), see `sheets_loops.projected`.
         beyond: (T, 3), see `sheets_loops.neighbours`.
-        sides: (T,), see `turns`.
+        sides: (T + 1,), see `turns`; the last is 0, of the triangle −1, which is none.
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
@@ -65,6 +67,10 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
     for t in range(first, last):
         side = sides[t]
         if side == 0 or side * keep < 0:
+            continue
+        # In most triangles all three neighbours go on: one branch.
+        on = (sides[beyond[t, 0]] * side > 0) & (sides[beyond[t, 1]] * side > 0) & (sides[beyond[t, 2]] * side > 0)
+        if on:
             continue
         for c in range(3):
             s = beyond[t, c]

@@ -51,13 +51,16 @@ def wanted(first, last, part, joined, met, gaps):
 
 @loop
 def around(gap, cells):
-    """Mark, in `cells` (H, W) bool, the cells of gaps (M, 3), and those around them."""
+    """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around: 1 along rows, 2 along columns, 3 both.
+
+    A triangle that is at most a cell wide and high, and meets a gap, has all its vertices in cells that are marked.
+    """
     height, width = cells.shape
     for n in range(len(gap)):
         y, x, row = gap[n, 0], gap[n, 1], gap[n, 2]
         for j in range(max(y - 1, 0), min(y + 2 - row, height - 1) + 1):
             for i in range(max(x - 1, 0), min(x + 1 + row, width - 1) + 1):
-                cells[j, i] = True
+                cells[j, i] |= 2 - row
 
 
 @loop
@@ -103,11 +106,11 @@ def _range(low, high, count):
 
 @loop
 def close(first, last, seen, cells, marks):
-    """Fill `marks` (V,) bool: is a vertex in one of the cells (H, W) that are marked, or beyond the border there?"""
+    """Fill `marks` (V,) int8 with those of the cells (H, W) of vertices; beyond the border, of the nearest cell."""
     height, width = cells.shape
     for v in range(first, last):
         x, y = seen[v, 0], seen[v, 1]
-        marks[v] = False
+        marks[v] = 0
         if not np.isnan(x):
             marks[v] = cells[int(min(max(y, 0.0), height - 1.0)), int(min(max(x, 0.0), width - 1.0))]
 
@@ -131,9 +134,9 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         last: the triangle after the last.
         faces: see `spans_of`.
         seen: see `spans_of`.
-        sides: (T,) int8, see `silhouettes_loops.turns`.
+        sides: (T + 1,) int8, see `silhouettes_loops.turns`.
         keep: see `spans_of`.
-        close: (V,) bool, see the loop of this name, of cells around gaps.
+        close: (V,), see the loop of this name, of cells `around` gaps.
         by_row: see `Gaps`.
         by_column: see `Gaps`.
         most: to fill.
@@ -144,10 +147,13 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         if sides[t] * keep < 0:
             continue
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        if abs(sides[t]) < 2 and not (close[a] or close[b] or close[c]):
+        axes = 3 if abs(sides[t]) == 2 else close[a] & close[b] & close[c]
+        if axes == 0:
             continue
         _box(a, b, c, seen, len(by_row), len(by_column), box)
         for axis in range(2):
+            if axes & (1 + axis) == 0:
+                continue
             begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
             table = by_row if axis == 0 else by_column
             for n in range(begin, stop):
