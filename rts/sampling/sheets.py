@@ -69,9 +69,9 @@ class Sheets(NamedTuple):
         vertices, faces = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
-        beyond, sides, keep = _beyond(proxy.faces), np.zeros(len(faces) + 1, np.int8), kept_sign(camera, cull)
-        parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, keep, seen, sides, work=10 * len(faces))
-        return cls(vertices, faces, beyond, rows, near_and_far(camera), keep, seen, sides)
+        beyond, sides = _beyond(proxy.faces), np.zeros(len(faces) + 1, np.int8)
+        parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
+        return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen, sides)
 
     def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.

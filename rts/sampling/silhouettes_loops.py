@@ -12,10 +12,10 @@ SLACK = 0.01
 
 
 @loop
-def turns(first, last, rows, vertices, faces, keep, seen, sides):
+def turns(first, last, rows, vertices, faces, seen, sides):
     """Fill `sides` (T,) int8: which side of a triangle is seen, by the sign of its determinant.
 
-    One to keep that is more than a cell wide or high, or is seen in part, has 2 or −2; others have 1 or −1.
+    A triangle that is more than a cell wide or high, or is seen in part, has 2 or −2, a smaller one 1 or −1.
 
     Args:
         first: the first triangle.
@@ -23,24 +23,22 @@ def turns(first, last, rows, vertices, faces, keep, seen, sides):
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
         faces: (T, 3) of the proxy.
-        keep: sign of the determinants of triangles to keep; 0 keeps both.
         seen: (V, 2), see `sheets_loops.projected`.
         sides: (T,) to fill.
     """
     corners = np.empty((3, 4))
     for t in range(first, last):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        ax, ay = seen[a, 0], seen[a, 1]
-        bx, by, cx, cy = seen[b, 0] - ax, seen[b, 1] - ay, seen[c, 0] - ax, seen[c, 1] - ay
-        area = bx * cy - cx * by
+        area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
+        area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
         if area == 0 or np.isnan(area):
             area = np.float32(corners_of(t, rows, vertices, faces, corners))
-        side = 1 if area > 0 else (-1 if area < 0 else 0)
-        if area * keep >= 0:
-            small = (abs(bx) <= 1) & (abs(by) <= 1) & (abs(cx) <= 1) & (abs(cy) <= 1)  # False for NaN.
-            small &= (abs(seen[c, 0] - seen[b, 0]) <= 1) & (abs(seen[c, 1] - seen[b, 1]) <= 1)
-            side = side if small else 2 * side
-        sides[t] = side
+        small = True
+        for axis in range(2):
+            wide = max(seen[a, axis], seen[b, axis], seen[c, axis]) - min(seen[a, axis], seen[b, axis], seen[c, axis])
+            small &= wide <= 1  # False for NaN.
+        size = 1 if small else 2
+        sides[t] = size if area > 0 else (-size if area < 0 else 0)
 
 
 @loop

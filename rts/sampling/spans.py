@@ -88,7 +88,7 @@ def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarr
     parts = np.repeat(np.arange(len(several), dtype=np.int32), [len(names) for names, _ in several])
     names, spans = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
     begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
-    return begins, names[order], spans[order], parts[order]
+    return begins, names.take(order, 0), spans.take(order, 0), parts.take(order)
 
 
 def slopes_at(
