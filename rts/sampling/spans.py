@@ -66,13 +66,12 @@ def _breaks_in(
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
         ends[:, k, 0], ends[:, k, 1], depth[:, k] = (table[y, x] for table in fronts)
-    room, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int32)
+    room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
     whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
-    known = begins, spans, names, parts, ends, depth, INNER, counts, whole, numbers
+    known = begins, spans, names, parts, ends, depth, INNER, rows, counts, whole, numbers
     parallel(spans_loops.breaks, count, *known, work=600 * count)
-    # Each gap has more room than it fills.
-    shift = 2 * begins[:-1] + 4 * np.arange(count) - (np.cumsum(counts) - counts)
-    found = np.repeat(shift, counts) + np.arange(counts.sum())
+    # There is more room than they fill.
+    found = np.repeat(rows - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
     whole = whole[found]
     return gap[whole[:, 0]], whole, numbers[found]
 

@@ -463,8 +463,8 @@ def _kind(spans, triangles, parts, ends, depth, a, b, place):
 
 
 @loop
-def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, counts, whole, numbers):
-    """Fill in the breaks along gaps, in order; those of gap g from row 2 begins[g] + 4 g on.
+def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, rows, counts, whole, numbers):
+    """Fill in the breaks along gaps, in order.
 
     Args:
         first: the first gap.
@@ -476,6 +476,7 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, cou
         ends: (M, 2, 2) int32, part and triangle of the samples at both centres; −1 where nothing is seen.
         end_depth: (M, 2) their depths.
         inner: distance of the samples that tell colours.
+        rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
         counts: (M,) to fill: the number of breaks of each gap.
         whole: (2 N + 4 M, 10) int32 to fill: gap, kind (0, 1 or 2), parts before and behind, then triangles of the last
             samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for its last.
@@ -484,15 +485,16 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, cou
     most = 4
     for g in range(first, last):
         most = max(most, 2 * (begins[g + 1] - begins[g]) + 4)
-    pieces, starts = np.empty(most, np.int32), np.empty(most)
+    pieces, starts, at = np.empty(most, np.int32), np.empty(most), 2 * begins[first] + 4 * first
     for g in range(first, last):
-        a, b, at = begins[g], begins[g + 1], 2 * begins[g] + 4 * g
+        a, b = begins[g], begins[g + 1]
         own, triangles, of, end, depth = spans[a:b], names[a:b, 1], parts[a:b], ends[g], end_depth[g]
         n = _fronts(own, triangles, of, end, depth, pieces, starts)
         known = own, triangles, of, end, depth, pieces[:n], starts[:n]
-        counts[g] = _breaks(known, whole[at:], numbers[at:])
+        rows[g], counts[g] = at, _breaks(known, whole[at:], numbers[at:])
         _inner(known, counts[g], inner, whole[at:], numbers[at:])
         whole[at : at + counts[g], 0] = g
+        at += counts[g]
 
 
 @compiled
