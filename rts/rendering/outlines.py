@@ -244,12 +244,12 @@ def at_centres(
 ) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the `row` and `depth` of a scene, and its parts' triangles."""
     counts = [own.ids.shape[-2] for own in samples]
-    none = [np.full(count, -1, np.int32) for count in counts]
-    of_samples = np.concatenate([n if x is None else x for x, n in zip(triangles, none, strict=True)])
-    part = np.where(row >= 0, np.int32(0), np.int32(-1))
+    of_samples = [np.full(n, -1, np.int32) if x is None else x for x, n in zip(triangles, counts, strict=True)]
+    of_samples = np.concatenate([*of_samples, np.full(1, -1, np.int32)])  # The last is read where nothing is seen.
+    part = np.minimum(row, np.int32(0))
     for first in np.cumsum(counts)[:-1]:
         part += row >= first
-    return Fronts(part, np.where(row >= 0, of_samples[row], np.int32(-1)), depth.astype(np.float64))
+    return Fronts(part, of_samples[row], depth.astype(np.float64))
 
 
 def _refines(part: CheckedPart) -> bool:

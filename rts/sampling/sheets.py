@@ -49,7 +49,7 @@ class Sheets(NamedTuple):
         clip: (2, 4) near and far plane, positive on what is seen.
         keep: sign of the determinants on screen of triangles to keep; 0 for both.
         seen: (V, 2) float32, where vertices lie in the image, in cells; NaN for those behind the camera.
-        sides: (T,) int8, which side of triangles is seen; see `silhouettes_loops.turns`.
+        sides: (T + 1,) int8, which side of triangles is seen, and 0; see `silhouettes_loops.turns`.
     """
 
     vertices: np.ndarray
@@ -69,7 +69,7 @@ class Sheets(NamedTuple):
         vertices, faces = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
-        beyond, sides = _beyond(proxy.faces), np.empty(len(faces), np.int8)
+        beyond, sides = _beyond(proxy.faces), np.zeros(len(faces) + 1, np.int8)
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
         return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen, sides)
 
@@ -99,7 +99,7 @@ class Sheets(NamedTuple):
         """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
         from rts.sampling import spans_loops
 
-        cells, close = np.zeros(gaps.rows.shape, np.bool_), np.empty(len(self.seen), np.bool_)
+        cells, close = np.zeros(gaps.rows.shape, np.int8), np.empty(len(self.seen), np.int8)
         spans_loops.around(gaps.gap, cells)
         parallel(spans_loops.close, len(close), self.seen, cells, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)

@@ -89,19 +89,9 @@ def projected(first, last, vertices, rows, seen):
 
 
 @compiled
-def _opposite(faces, t, i, j):
-    """The corner of triangle t that is neither i nor j."""
-    for k in range(3):
-        if faces[t, k] != i and faces[t, k] != j:
-            return k
-    return 0
-
-
-@compiled
-def _meets(a, b, axis, at, seen):
-    """Where an edge between two vertices, on both sides of a line of centres, meets the line."""
-    far, near = seen[b, 1 - axis] - at, seen[a, 1 - axis] - at
-    return seen[a, axis] - near * (seen[b, axis] - seen[a, axis]) / (far - near)
+def _meets(ax, ay, bx, by):
+    """Where an edge between two vertices, on both sides of a line, meets it; of each, its places along it and aside."""
+    return ax - ay * (bx - ax) / (by - ay)
 
 
 @compiled
@@ -120,37 +110,40 @@ def _walked(t, target, start, axis, at, seen, faces, beyond):
         faces: (T, 3).
         beyond: (T, 3).
     """
-    out, place = -1, -np.inf
+    out, place, first, second = -1, -np.inf, faces[t, 1], faces[t, 2]
+    # The edge that the line goes out through, opposite the corner `out`.
     for c in range(3):
         a, b = faces[t, (c + 1) % 3], faces[t, (c + 2) % 3]
-        if np.isnan(seen[a, 0]):
+        ay, by = seen[a, 1 - axis] - at, seen[b, 1 - axis] - at
+        if np.isnan(ay):
             return np.int32(-1)
-        if (seen[a, 1 - axis] >= at) != (seen[b, 1 - axis] >= at):
-            there = _meets(a, b, axis, at, seen)
+        if (ay >= 0) != (by >= 0):
+            there = _meets(seen[a, axis], ay, seen[b, axis], by)
             if there > place:
-                out, place = c, there
+                out, place, first, second = c, there, a, b
     if out < 0:
         return np.int32(-1)
-    # The edge that the line goes out through.
-    first, second = faces[t, (out + 1) % 3], faces[t, (out + 2) % 3]
+    # Its ends, of which each step replaces one. The steps hardly branch: no processor could tell which way they go.
+    ax, ay, bx, by = seen[first, axis], seen[first, 1 - axis] - at, seen[second, axis], seen[second, 1 - axis] - at
     for _ in range(STEPS):
         if place >= start + 1:
             return t
         s = beyond[t, out]
         if s < 0 or s == target:
             return s
-        third = faces[s, _opposite(faces, s, first, second)]
-        if np.isnan(seen[third, 0]):
+        third = faces[s, 0] ^ faces[s, 1] ^ faces[s, 2] ^ first ^ second
+        cx, cy = seen[third, axis], seen[third, 1 - axis] - at
+        if np.isnan(cy):
             return np.int32(-1)
         # The vertex on the other side of the line than the third one stays.
-        if (seen[first, 1 - axis] >= at) != (seen[third, 1 - axis] >= at):
-            second = third
-        else:
-            first = third
-        before, place = place, _meets(first, second, axis, at, seen)
+        stays = (ay >= 0) != (cy >= 0)
+        left = second if stays else first
+        first, ax, ay = (first, ax, ay) if stays else (third, cx, cy)
+        second, bx, by = (third, cx, cy) if stays else (second, bx, by)
+        before, place = place, _meets(ax, ay, bx, by)
         if place < before:
             return np.int32(-1)  # The triangle lies on the same side of the edge: the sheet turns away.
-        t, out = s, _opposite(faces, s, first, second)
+        t, out = s, 1 if faces[s, 1] == left else (2 if faces[s, 2] == left else 0)
     return np.int32(-1)
 
 
@@ -191,7 +184,7 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
                 continue
             for axis in range(2):
                 dx, dy = 1 - axis, axis
-                if x + dx == width or y + dy == height or part[y + dy, x + dx] != own:
+                if x + dx == width or y + dy == height or part[y + dy, x + dx] != own or met[axis, y, x] == 2:
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
                 end = s

@@ -55,7 +55,7 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
         keep: sign of the determinants of triangles to keep; 0 keeps both.
         seen: (V, 2), see `sheets_loops.projected`.
         beyond: (T, 3), see `sheets_loops.neighbours`.
-        sides: (T,), see `turns`.
+        sides: (T + 1,), see `turns`; the last is 0, of the triangle −1, which is none.
         part: (H, W) int32, −1 where a centre shows nothing.
         depth: (H, W) float64.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
@@ -65,6 +65,10 @@ def meet(first, last, rows, vertices, faces, near_plane, keep, seen, beyond, sid
     for t in range(first, last):
         side = sides[t]
         if side == 0 or side * keep < 0:
+            continue
+        # In most triangles all three neighbours go on: one branch.
+        on = (sides[beyond[t, 0]] * side > 0) & (sides[beyond[t, 1]] * side > 0) & (sides[beyond[t, 2]] * side > 0)
+        if on:
             continue
         for c in range(3):
             s = beyond[t, c]

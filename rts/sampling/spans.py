@@ -61,30 +61,33 @@ def _breaks_in(
 
     gaps = Gaps.of(marks)
     gap, count = gaps.gap, len(gaps.gap)
-    names, spans, parts = spans_on(gaps, sheets)
+    begins, names, spans, parts = spans_on(gaps, sheets)
     ends, depth = np.empty((count, 2, 2), np.int32), np.empty((count, 2))
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
         ends[:, k, 0], ends[:, k, 1], depth[:, k] = (table[y, x] for table in fronts)
-    begins, order = spans_loops.by_gap(names[:, 0], count)
-    room = 2 * len(order) + 4 * count
-    pieces, starts, counts = np.empty(room, np.int32), np.empty(room), np.empty(count, np.int32)
-    known = begins, order, spans, names, parts, ends, depth, pieces, starts, counts
-    parallel(spans_loops.fronts, count, *known, work=300 * count)
-    at = np.cumsum(counts) - counts
-    whole, numbers = np.full((counts.sum(), 10), -1, np.int32), np.empty((counts.sum(), 5))
-    parallel(spans_loops.breaks, count, *known, at, INNER, whole, numbers, work=300 * count)
-    found = np.flatnonzero(whole[:, 0] >= 0)
+    room, rows, counts = 2 * len(spans) + 4 * count, np.empty(count, np.int64), np.empty(count, np.int32)
+    whole, numbers = np.empty((room, 10), np.int32), np.empty((room, 5))
+    known = begins, spans, names, parts, ends, depth, INNER, rows, counts, whole, numbers
+    parallel(spans_loops.breaks, count, *known, work=600 * count)
+    # There is more room than they fill.
+    found = np.repeat(rows - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
     whole = whole[found]
     return gap[whole[:, 0]], whole, numbers[found]
 
 
-def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spans of all parts on gaps, and their parts (N,) int32; see `Sheets.spans`."""
+def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Spans of all parts on gaps, gap after gap: where those of each begin (M + 1,); names, spans; parts (N,) int32.
+
+    See `Sheets.spans`.
+    """
+    from rts.sampling import spans_loops
+
     several = [own.spans(gaps) for own in sheets]
     parts = np.repeat(np.arange(len(several), dtype=np.int32), [len(names) for names, _ in several])
     names, spans = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
-    return names, spans, parts
+    begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
+    return begins, names.take(order, 0), spans.take(order, 0), parts.take(order)
 
 
 def slopes_at(

@@ -51,13 +51,16 @@ def wanted(first, last, part, joined, met, gaps):
 
 @loop
 def around(gap, cells):
-    """Mark, in `cells` (H, W) bool, the cells of gaps (M, 3), and those around them."""
+    """Mark, in `cells` (H, W) int8, the cells of gaps (M, 3), and those around: 1 along rows, 2 along columns, 3 both.
+
+    A triangle that is at most a cell wide and high, and meets a gap, has all its vertices in cells that are marked.
+    """
     height, width = cells.shape
     for n in range(len(gap)):
         y, x, row = gap[n, 0], gap[n, 1], gap[n, 2]
         for j in range(max(y - 1, 0), min(y + 2 - row, height - 1) + 1):
             for i in range(max(x - 1, 0), min(x + 1 + row, width - 1) + 1):
-                cells[j, i] = True
+                cells[j, i] |= 2 - row
 
 
 @loop
@@ -103,11 +106,11 @@ def _range(low, high, count):
 
 @loop
 def close(first, last, seen, cells, marks):
-    """Fill `marks` (V,) bool: is a vertex in one of the cells (H, W) that are marked, or beyond the border there?"""
+    """Fill `marks` (V,) int8 with those of the cells (H, W) of vertices; beyond the border, of the nearest cell."""
     height, width = cells.shape
     for v in range(first, last):
         x, y = seen[v, 0], seen[v, 1]
-        marks[v] = False
+        marks[v] = 0
         if not np.isnan(x):
             marks[v] = cells[int(min(max(y, 0.0), height - 1.0)), int(min(max(x, 0.0), width - 1.0))]
 
@@ -131,9 +134,9 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         last: the triangle after the last.
         faces: see `spans_of`.
         seen: see `spans_of`.
-        sides: (T,) int8, see `silhouettes_loops.turns`.
+        sides: (T + 1,) int8, see `silhouettes_loops.turns`.
         keep: see `spans_of`.
-        close: (V,) bool, see the loop of this name, of cells around gaps.
+        close: (V,), see the loop of this name, of cells `around` gaps.
         by_row: see `Gaps`.
         by_column: see `Gaps`.
         most: to fill.
@@ -144,10 +147,13 @@ def most_spans(first, last, faces, seen, sides, keep, close, by_row, by_column, 
         if sides[t] * keep < 0:
             continue
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        if abs(sides[t]) < 2 and not (close[a] or close[b] or close[c]):
+        axes = 3 if abs(sides[t]) == 2 else close[a] & close[b] & close[c]
+        if axes == 0:
             continue
         _box(a, b, c, seen, len(by_row), len(by_column), box)
         for axis in range(2):
+            if axes & (1 + axis) == 0:
+                continue
             begin, stop, low, high = _gaps_of(box, axis, by_row, by_column)
             table = by_row if axis == 0 else by_column
             for n in range(begin, stop):
@@ -293,41 +299,42 @@ def by_gap(gaps, count):
 
 
 @compiled
-def _z(spans, i, place):
+def depth_at(spans, i, place):
+    """The depth of a span at a place."""
     return (spans[i, 2] + spans[i, 3] * place) / (spans[i, 4] + spans[i, 5] * place)
 
 
 @compiled
-def _nearest(spans, own, place, beyond):
+def _nearest(spans, place, beyond):
     """The nearest of a gap's spans that covers `place`, and goes on after it; −1 for none."""
     best = NOTHING
-    for i in own:
+    for i in range(len(spans)):
         if spans[i, 0] <= place + beyond and spans[i, 1] > place + beyond:
-            if best < 0 or _z(spans, i, place) < _z(spans, best, place):
+            if best < 0 or depth_at(spans, i, place) < depth_at(spans, best, place):
                 best = i
     return best
 
 
 @compiled
-def _next_start(spans, own, place):
+def _next_start(spans, place):
     """The least start of a span of a gap at or after a place; infinite if there is none."""
     best = np.inf
-    for i in own:
+    for i in range(len(spans)):
         if spans[i, 1] > place + TOUCH and spans[i, 0] < best:
             best = spans[i, 0]
     return max(best, place)
 
 
 @compiled
-def _overtaken(spans, own, x, place):
+def _overtaken(spans, x, place):
     """Where the span x ends, or another comes before it, after `place`; and which one does, or −9."""
     best, by = spans[x, 1], -9
-    for i in own:
+    for i in range(len(spans)):
         low, high = max(place, spans[i, 0]), min(spans[x, 1], spans[i, 1])
         if i == x or high - low <= TINY:
             continue
-        z = _z(spans, x, low)
-        before, after = _z(spans, i, low) - z, _z(spans, i, high) - _z(spans, x, high)
+        z = depth_at(spans, x, low)
+        before, after = depth_at(spans, i, low) - z, depth_at(spans, i, high) - depth_at(spans, x, high)
         if before < -MARGIN * abs(z):
             at = low
         elif after < -MARGIN * abs(z):
@@ -338,106 +345,97 @@ def _overtaken(spans, own, x, place):
             at = low + (high - low) * before / (before - after)
         else:
             continue
-        if at < best - TINY or (by >= 0 and at <= best + TINY and _z(spans, i, at) < _z(spans, by, at)):
+        if at < best - TINY or (by >= 0 and at <= best + TINY and depth_at(spans, i, at) < depth_at(spans, by, at)):
             best, by = at, i
     return best, by
 
 
-@loop
-def fronts(first, last, begins, order, spans, names, parts, ends, end_depth, pieces, starts, counts):
-    """The fronts along gaps: which span is the nearest, and from which place on.
+@compiled
+def _fronts(spans, triangles, parts, ends, end_depth, pieces, starts):
+    """The fronts along a gap: which span is the nearest, and from which place on. Returns their number.
 
     Args:
-        first: the first gap.
-        last: the gap after the last.
-        begins: (M + 1,) and
-        order: (N,), the result of `by_gap`.
-        spans: (N, 6), see `spans_of`.
-        names: (N, 2) gap and triangle.
+        spans: (N, 6), those of the gap; see `spans_of`.
+        triangles: (N,) int32.
         parts: (N,) int32.
-        ends: (M, 2, 2) int32, part and triangle of the samples at both centres; −1 where nothing is seen.
-        end_depth: (M, 2) their depths.
-        pieces: (2 N + 4 M,) int32 to fill: spans, NOTHING, FIRST or SECOND.
-        starts: (2 N + 4 M,) float64 to fill: where they begin.
-        counts: (M,) to fill: their number.
+        ends: (2, 2) int32, part and triangle of the samples at both centres; −1 where nothing is seen.
+        end_depth: (2,) their depths.
+        pieces: (2 N + 4,) int32 or more, to fill: spans, NOTHING, FIRST or SECOND.
+        starts: (2 N + 4,) float64 or more, to fill: where they begin.
     """
-    for g in range(first, last):
-        own = order[begins[g] : begins[g + 1]]
-        base, room, n = 2 * begins[g] + 4 * g, 2 * len(own) + 3, 0
-        place, x = 0.0, NOTHING
-        for k in range(2):
-            _agree(spans, own, ends[g, k, 0] >= 0, end_depth[g, k], k)
-        if ends[g, 0, 0] >= 0:
-            x = FIRST
-            for i in own:
-                if parts[i] == ends[g, 0, 0] and names[i, 1] == ends[g, 0, 1] and spans[i, 0] <= TOUCH:
-                    x = i
-        while n < room:
-            pieces[base + n], starts[base + n] = x, place
-            n += 1
-            if x == NOTHING:
-                place = _next_start(spans, own, place)
-                if not place < 1 - TOUCH:
-                    break
-                x = _nearest(spans, own, place, TOUCH)
-            elif x == FIRST:
-                x = _nearest(spans, own, 0.0, TINY)
-            else:
-                place, by = _overtaken(spans, own, x, place)
-                if place >= (1 - TOUCH if by < 0 else 1.0):
-                    break
-                x = by if by >= 0 else _nearest(spans, own, place, TOUCH)
-        # The sample at the second centre has the last word.
-        x, last_part = pieces[base + n - 1], ends[g, 1, 0]
-        known = x >= 0 and last_part == parts[x] and ends[g, 1, 1] == names[x, 1]
-        if not known and not (x == NOTHING and last_part < 0):
-            pieces[base + n], starts[base + n] = (SECOND if last_part >= 0 else NOTHING), 1.0
-            n += 1
-            # The line runs along an edge that both samples are on: nothing ends there, nor lies before it.
-            if pieces[base] == FIRST and last_part == ends[g, 0, 0] and _all_of(pieces, parts, base, n, last_part):
-                n = 1
-        counts[g] = n
+    room, n, place, x = 2 * len(spans) + 3, 0, 0.0, NOTHING
+    for k in range(2):
+        _agree(spans, ends[k, 0] >= 0, end_depth[k], k)
+    if ends[0, 0] >= 0:
+        x = FIRST
+        for i in range(len(spans)):
+            if parts[i] == ends[0, 0] and triangles[i] == ends[0, 1] and spans[i, 0] <= TOUCH:
+                x = i
+    while n < room:
+        pieces[n], starts[n] = x, place
+        n += 1
+        if x == NOTHING:
+            place = _next_start(spans, place)
+            if not place < 1 - TOUCH:
+                break
+            x = _nearest(spans, place, TOUCH)
+        elif x == FIRST:
+            x = _nearest(spans, 0.0, TINY)
+        else:
+            place, by = _overtaken(spans, x, place)
+            if place >= (1 - TOUCH if by < 0 else 1.0):
+                break
+            x = by if by >= 0 else _nearest(spans, place, TOUCH)
+    # The sample at the second centre has the last word.
+    x, last_part = pieces[n - 1], ends[1, 0]
+    known = x >= 0 and last_part == parts[x] and ends[1, 1] == triangles[x]
+    if not known and not (x == NOTHING and last_part < 0):
+        pieces[n], starts[n] = (SECOND if last_part >= 0 else NOTHING), 1.0
+        n += 1
+        # The line runs along an edge that both samples are on: nothing ends there, nor lies before it.
+        if pieces[0] == FIRST and last_part == ends[0, 0] and _all_of(pieces[:n], parts, last_part):
+            n = 1
+    return n
 
 
 @compiled
-def _all_of(pieces, parts, base, n, part):
+def _all_of(pieces, parts, part):
     """True if no piece of front is another part's."""
-    for k in range(base, base + n):
-        if pieces[k] >= 0 and parts[pieces[k]] != part:
+    for x in pieces:
+        if x >= 0 and parts[x] != part:
             return False
     return True
 
 
 @compiled
-def _agree(spans, own, seen, depth, centre):
+def _agree(spans, seen, depth, centre):
     """Empty the spans that reach over a centre before what is seen there: they touch the line with an edge alone."""
-    for i in own:
+    for i in range(len(spans)):
         if spans[i, 0] < centre - TOUCH and spans[i, 1] > centre + TOUCH:
-            if not seen or _z(spans, i, centre) < depth - ALIKE * abs(depth):
+            if not seen or depth_at(spans, i, centre) < depth - ALIKE * abs(depth):
                 spans[i, 0], spans[i, 1] = 9.0, 9.0
 
 
 @compiled
-def _goes_on(spans, parts, own, x, place, way):
+def _goes_on(spans, parts, x, place, way):
     """True if a surface that ends (way 1) or starts (way 0) at a place with the span x goes on there with another."""
-    for i in own:
+    for i in range(len(spans)):
         if i != x and parts[i] == parts[x] and abs(spans[i, 1 - way] - place) <= TOUCH:
-            if abs(_z(spans, i, place) - _z(spans, x, place)) <= ALIKE * abs(_z(spans, x, place)):
+            if abs(depth_at(spans, i, place) - depth_at(spans, x, place)) <= ALIKE * abs(depth_at(spans, x, place)):
                 return True
     return False
 
 
 @compiled
-def _kind(spans, parts, names, own, ends, depth, a, b, place):
+def _kind(spans, triangles, parts, ends, depth, a, b, place):
     """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, not at all.
 
     Args:
-        spans: (N, 6).
+        spans: (N, 6), see `_fronts`.
+        triangles: (N,).
         parts: (N,).
-        names: (N, 2).
-        own: the gap's spans.
-        ends: (2, 2) part and triangle of the samples at both centres.
-        depth: (2,) their depths.
+        ends: (2, 2).
+        depth: (2,), of the samples at both centres.
         a: the piece of front before the place.
         b: the piece behind.
         place: the place.
@@ -445,18 +443,18 @@ def _kind(spans, parts, names, own, ends, depth, a, b, place):
     before, behind = _part(parts, ends, a), _part(parts, ends, b)
     if before < 0 or behind < 0:
         return 3 if before == behind else (1 if before < 0 else 0)
-    t, s = names[a, 1] if a >= 0 else ends[0, 1], names[b, 1] if b >= 0 else ends[1, 1]
+    t, s = triangles[a] if a >= 0 else ends[0, 1], triangles[b] if b >= 0 else ends[1, 1]
     if before == behind and t == s:
         return 3
-    za, zb = _z(spans, a, place) if a >= 0 else depth[0], _z(spans, b, place) if b >= 0 else depth[1]
+    za, zb = depth_at(spans, a, place) if a >= 0 else depth[0], depth_at(spans, b, place) if b >= 0 else depth[1]
     if abs(za - zb) > ALIKE * max(abs(za), abs(zb)):
         return 0 if za < zb else 1
     # What is seen at a centre goes on beyond it.
     stops, starts = a >= 0 and spans[a, 1] <= place + TOUCH, b >= 0 and spans[b, 0] >= place - TOUCH
     if before == behind and (a < 0 or stops) and (b < 0 or starts):
         return 3
-    stops = stops and not _goes_on(spans, parts, own, a, place, 1)
-    starts = starts and not _goes_on(spans, parts, own, b, place, 0)
+    stops = stops and not _goes_on(spans, parts, a, place, 1)
+    starts = starts and not _goes_on(spans, parts, b, place, 0)
     if stops != starts:
         return 0 if stops else 1
     if not stops:
@@ -465,65 +463,82 @@ def _kind(spans, parts, names, own, ends, depth, a, b, place):
 
 
 @loop
-def breaks(
-    first, last, begins, order, spans, names, parts, ends, end_depth, pieces, starts, counts, at, inner, whole, numbers
-):
+def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, rows, counts, whole, numbers):
     """Fill in the breaks along gaps, in order.
 
     Args:
         first: the first gap.
         last: the gap after the last.
-        begins: see `fronts`.
-        order: see `fronts`.
-        spans: see `fronts`.
-        names: see `fronts`.
-        parts: see `fronts`.
-        ends: see `fronts`.
-        end_depth: see `fronts`.
-        pieces: see `fronts`.
-        starts: see `fronts`.
-        counts: see `fronts`.
-        at: (M,) where the breaks of each gap begin in `whole` and `numbers`; at most as many as its pieces.
+        begins: (M + 1,) where the spans of each gap begin.
+        spans: (N, 6), see `spans_of`.
+        names: (N, 2) gap and triangle.
+        parts: (N,) int32.
+        ends: (M, 2, 2) int32, part and triangle of the samples at both centres; −1 where nothing is seen.
+        end_depth: (M, 2) their depths.
         inner: distance of the samples that tell colours.
-        whole: (P, 10) int32 to fill: gap, kind (0, 1 or 2), parts before and behind, then triangles of the last
+        rows: (M,) to fill: the row of `whole` and `numbers` where the breaks of each gap begin.
+        counts: (M,) to fill: the number of breaks of each gap.
+        whole: (2 N + 4 M, 10) int32 to fill: gap, kind (0, 1 or 2), parts before and behind, then triangles of the last
             samples, of those that tell colours (before, behind), and 1 for the gap's first break, and for its last.
-            Filled with −1.
-        numbers: (P, 5) float64 to fill: place of the break, of the last samples, and of those that tell colours.
+        numbers: (2 N + 4 M, 5) float64 to fill: place of the break, the last samples, and those that tell colours.
     """
+    most = 4
     for g in range(first, last):
-        own, base = order[begins[g] : begins[g + 1]], 2 * begins[g] + 4 * g
-        count, a = at[g], 0
-        for n in range(1, counts[g]):
-            # A piece that is too short to count belongs to what comes after it.
-            if n + 1 < counts[g] and starts[base + n + 1] - starts[base + n] < SHORT:
-                continue
-            x, y, place = pieces[base + a], pieces[base + n], starts[base + n]
-            kind = _kind(spans, parts, names, own, ends[g], end_depth[g], x, y, place)
-            a = n
-            if kind == 3:
-                continue
-            whole[count, 0], whole[count, 1] = g, kind
-            whole[count, 2], whole[count, 3] = _part(parts, ends[g], x), _part(parts, ends[g], y)
-            whole[count, 4] = names[x, 1] if x >= 0 else ends[g, 0, 1]
-            whole[count, 5] = names[y, 1] if y >= 0 else ends[g, 1, 1]
-            whole[count, 8], whole[count, 9] = count == at[g], 0
-            numbers[count, 0] = place
-            numbers[count, 1] = min(max(place - LAST, spans[x, 0], 0.0), place) if x >= 0 else place
-            numbers[count, 2] = max(min(place + LAST, spans[y, 1], 1.0), place) if y >= 0 else place
-            count += 1
-        if count > at[g]:
-            whole[count - 1, 9] = 1
-        for b in range(at[g], count):
-            before = numbers[b - 1, 0] if b > at[g] else 0.0
-            after = numbers[b + 1, 0] if b + 1 < count else 1.0
-            for side in range(2):
-                end = numbers[b, 1 + side]
-                length = end - before if side == 0 else after - end
-                inward = end - min(inner, length / 2) if side == 0 else end + min(inner, length / 2)
-                numbers[b, 3 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
-                found = _piece(pieces, starts, base, counts[g], inward)
-                if found >= 0 and parts[found] == whole[b, 2 + side] and abs(inward - end) > TINY:
-                    numbers[b, 3 + side], whole[b, 6 + side] = inward, names[found, 1]
+        most = max(most, 2 * (begins[g + 1] - begins[g]) + 4)
+    pieces, starts, at = np.empty(most, np.int32), np.empty(most), 2 * begins[first] + 4 * first
+    for g in range(first, last):
+        a, b = begins[g], begins[g + 1]
+        own, triangles, of, end, depth = spans[a:b], names[a:b, 1], parts[a:b], ends[g], end_depth[g]
+        n = _fronts(own, triangles, of, end, depth, pieces, starts)
+        known = own, triangles, of, end, depth, pieces[:n], starts[:n]
+        rows[g], counts[g] = at, _breaks(known, whole[at:], numbers[at:])
+        _inner(known, counts[g], inner, whole[at:], numbers[at:])
+        whole[at : at + counts[g], 0] = g
+        at += counts[g]
+
+
+@compiled
+def _breaks(gap, whole, numbers):
+    """Fill in the breaks between the fronts of a gap, but for the samples that tell colours; returns their number."""
+    spans, triangles, parts, ends, depth, pieces, starts = gap
+    count, a = 0, 0
+    for n in range(1, len(pieces)):
+        # A piece that is too short to count belongs to what comes after it.
+        if n + 1 < len(pieces) and starts[n + 1] - starts[n] < SHORT:
+            continue
+        x, y, place = pieces[a], pieces[n], starts[n]
+        kind = _kind(spans, triangles, parts, ends, depth, x, y, place)
+        a = n
+        if kind == 3:
+            continue
+        whole[count, 1], whole[count, 2], whole[count, 3] = kind, _part(parts, ends, x), _part(parts, ends, y)
+        whole[count, 4] = triangles[x] if x >= 0 else ends[0, 1]
+        whole[count, 5] = triangles[y] if y >= 0 else ends[1, 1]
+        whole[count, 8], whole[count, 9] = count == 0, 0
+        numbers[count, 0] = place
+        numbers[count, 1] = min(max(place - LAST, spans[x, 0], 0.0), place) if x >= 0 else place
+        numbers[count, 2] = max(min(place + LAST, spans[y, 1], 1.0), place) if y >= 0 else place
+        count += 1
+    if count > 0:
+        whole[count - 1, 9] = 1
+    return count
+
+
+@compiled
+def _inner(gap, count, inner, whole, numbers):
+    """Fill in the samples that tell colours of the breaks of a gap; see `breaks`."""
+    _, triangles, parts, _, _, pieces, starts = gap
+    for b in range(count):
+        before = numbers[b - 1, 0] if b > 0 else 0.0
+        after = numbers[b + 1, 0] if b + 1 < count else 1.0
+        for side in range(2):
+            end = numbers[b, 1 + side]
+            length = end - before if side == 0 else after - end
+            inward = end - min(inner, length / 2) if side == 0 else end + min(inner, length / 2)
+            numbers[b, 3 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
+            found = _piece(pieces, starts, inward)
+            if found >= 0 and parts[found] == whole[b, 2 + side] and abs(inward - end) > TINY:
+                numbers[b, 3 + side], whole[b, 6 + side] = inward, triangles[found]
 
 
 @compiled
@@ -535,9 +550,9 @@ def _part(parts, ends, x):
 
 
 @compiled
-def _piece(pieces, starts, base, count, place):
+def _piece(pieces, starts, place):
     """The piece of front at a place of a gap."""
     n = 0
-    while n + 1 < count and starts[base + n + 1] <= place:
+    while n + 1 < len(pieces) and starts[n + 1] <= place:
         n += 1
-    return pieces[base + n]
+    return pieces[n]

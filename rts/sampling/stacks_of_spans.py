@@ -95,16 +95,14 @@ def _changes(
     gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The changes of stacks along gaps; see `stacks_of_spans_loops.changes`."""
-    from rts.sampling import spans_loops
     from rts.sampling import stacks_of_spans_loops as loops
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
-    names, spans, parts = spans_on(gaps, sheets)
+    begins, names, spans, parts = spans_on(gaps, sheets)
     seen, depth = np.empty((count, 2, most), np.int32), np.empty((count, 2, most))
     for k in (0, 1):
         y, x = gap[:, 0] + k * (1 - gap[:, 2]), gap[:, 1] + k * gap[:, 2]
         seen[:, k], depth[:, k] = layers.part[:, y, x].T, layers.depth[:, y, x].T
-    begins, order = spans_loops.by_gap(names[:, 0], count)
     counts, at = np.zeros(count, np.int32), np.zeros(count, np.int64)
 
     def filled(total: int) -> tuple[np.ndarray, ...]:
@@ -112,7 +110,7 @@ def _changes(
         numbers = np.empty(total), np.empty((total, size, 2), np.int32), np.empty((total, size))
         return np.empty((total, 6), np.int32), *numbers, np.empty((total, 2, most), np.int32)
 
-    known = begins, order, spans, names, parts, opaque, seen, depth, counts
+    known = begins, spans, names, parts, opaque, seen, depth, counts
     parallel(loops.changes, count, *known, at, False, INNER, *filled(0), work=300 * count)
     at = np.cumsum(counts) - counts
     result = filled(int(counts.sum()))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.sampling.spans_loops import ALIKE, LAST, MARGIN, SHORT, TINY, TOUCH
+from rts.sampling.spans_loops import ALIKE, LAST, MARGIN, SHORT, TINY, TOUCH, depth_at
 
 CLOSE = 1e-5
 """Distance from a centre, in cells, within which the sample there decides on which side of it a run ends."""
@@ -20,15 +20,10 @@ SAME = 1e-4
 
 
 @compiled
-def _z(spans, i, place):
-    return (spans[i, 2] + spans[i, 3] * place) / (spans[i, 4] + spans[i, 5] * place)
-
-
-@compiled
 def _alike(spans, i, j, place):
     """True if two spans have about one depth at a place."""
-    z = _z(spans, i, place)
-    return abs(_z(spans, j, place) - z) <= ALIKE * abs(z)
+    z = depth_at(spans, i, place)
+    return abs(depth_at(spans, j, place) - z) <= ALIKE * abs(z)
 
 
 @compiled
@@ -81,7 +76,7 @@ def _settle(head, tail, own, spans, parts, opaque, seen, depth, g, after, low, h
         i = head
         while high[i] < centre and after[i] >= 0:
             i = after[i]
-        z = _z(spans, own[i], centre)
+        z = depth_at(spans, own[i], centre)
         found = _listed(part, z, seen, depth, g, k)
         if start < centre - CLOSE and end > centre + CLOSE:
             if found == 0 and not _hides(opaque, z, seen, depth, g, k):
@@ -103,10 +98,10 @@ def _settle(head, tail, own, spans, parts, opaque, seen, depth, g, after, low, h
 @compiled
 def _before(spans, i, j, place, until):
     """True if a span lies before another at a place; if they meet there, farther on."""
-    a, b = _z(spans, i, place), _z(spans, j, place)
+    a, b = depth_at(spans, i, place), depth_at(spans, j, place)
     if abs(a - b) > ALIKE * abs(a):
         return a < b
-    return _z(spans, i, until) < _z(spans, j, until)
+    return depth_at(spans, i, until) < depth_at(spans, j, until)
 
 
 @compiled
@@ -163,8 +158,8 @@ def _meeting(spans, i, j, low, high):
     """Where two spans have one depth, between two places at which their order differs."""
     wide = (spans[i, 4] + spans[i, 5] * low) * (spans[j, 4] + spans[j, 5] * low)
     far = (spans[i, 4] + spans[i, 5] * high) * (spans[j, 4] + spans[j, 5] * high)
-    before = max(_z(spans, j, low) - _z(spans, i, low), 0.0) * wide
-    after = min(_z(spans, j, high) - _z(spans, i, high), 0.0) * far
+    before = max(depth_at(spans, j, low) - depth_at(spans, i, low), 0.0) * wide
+    after = min(depth_at(spans, j, high) - depth_at(spans, i, high), 0.0) * far
     return low + (high - low) * before / (before - after) if before - after > 0 else low
 
 
@@ -174,8 +169,8 @@ def _next_meeting(stack, count, own, spans, place, until):
     best, at = np.inf, -1
     for m in range(count - 1):
         i, j = own[stack[m]], own[stack[m + 1]]
-        z = _z(spans, i, until)
-        if _z(spans, j, until) < z - MARGIN * abs(z):
+        z = depth_at(spans, i, until)
+        if depth_at(spans, j, until) < z - MARGIN * abs(z):
             there = _meeting(spans, i, j, place, until)
             if there < best:
                 best, at = there, m
@@ -376,7 +371,7 @@ def _next_knot(knots, k, known):
 
 @loop
 def changes(
-    first, last, begins, order, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
+    first, last, begins, spans, names, parts, opaque, seen, depth, counts, at, fill, inner, whole, place_of,
     samples, places, sides,
 ):  # fmt: skip
     """Count the changes of stacks along gaps, or fill them in, in order.
@@ -386,8 +381,7 @@ def changes(
     Args:
         first: the first gap.
         last: the gap after the last.
-        begins: (M + 1,) and
-        order: (N,), the result of `spans_loops.by_gap`.
+        begins: (M + 1,) where the spans of each gap begin.
         spans: (N, 6), see `spans_loops.spans_of`.
         names: (N, 2) gap and triangle.
         parts: (N,) int32.
@@ -408,7 +402,7 @@ def changes(
     """
     result = whole, place_of, samples, places, sides
     for g in range(first, last):
-        own = order[begins[g] : begins[g + 1]]
+        own = np.arange(begins[g], begins[g + 1])
         n, scene = len(own), (own, spans, names, parts, opaque)
         low, high, after, before = np.empty(n), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
         live, inside = np.empty(n, np.bool_), np.empty(n, np.bool_)

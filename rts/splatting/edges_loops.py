@@ -9,14 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
+from rts.splatting.edges_weights import BORDER
 
 # ------------------------------------------------------------------------------------------------------- weights
 
 
 @loop
-def weigh_breaks(first, last, near, slope, moves):
+def weigh_breaks(near, slope, moves):
     """Fill `moves` (B, 2, 3, 2): motion of breaks along x and y, for motions (x, y, depth) of their two samples."""
-    for b in range(first, last):
+    for b in range(len(near)):
         moves[b] = 0.0
         if near[b] < 2:
             moves[b, near[b], 0, 0], moves[b, near[b], 1, 1] = 1.0, 1.0
@@ -85,9 +86,7 @@ def _add_flux(flux, pull, i, lone, t, first, second, dx, dy):
 
 
 @loop
-def weigh_segments(
-    first, last, place, gap, near_ends, seen, square, ties, side, corner, pull, border, path, share, own, flux
-):
+def weigh_segments(first, last, place, gap, near_ends, seen, square, ties, side, corner, pull, path, share, own, flux):
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
     Args:
@@ -102,7 +101,6 @@ def weigh_segments(
         side: (S, 2).
         corner: (S, 2).
         pull: (S, 4).
-        border: width of the strip along a border of two pixels in which an edge belongs to both.
         path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
         share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps at start and end.
         own: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that the cell's
@@ -152,8 +150,8 @@ def weigh_segments(
                 px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
                 u = t * turn if i == 0 else (1 - t) * turn + t
                 counts = not lone or abs(px - path[s, 0, 0]) + abs(py - path[s, 0, 1]) <= 0.5
-                right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
-                below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
+                right = min(max((px - 0.5) / BORDER + 0.5, 0.0), 1.0)
+                below = min(max((py - 0.5) / BORDER + 0.5, 0.0), 1.0)
                 for k in range(4):
                     east, south = k == 1 or k == 2, k >= 2
                     height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0

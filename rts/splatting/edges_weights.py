@@ -60,13 +60,13 @@ class _Weights(NamedTuple):
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
         own = np.empty((segments, 4, 2), np.int8)
-        loops.weigh_breaks(0, count, outlines.near, outlines.slope, moves)
+        loops.weigh_breaks(outlines.near, outlines.slope, moves)
         paired = np.flatnonzero(outlines.pair[:, 0] >= 0)
         movers, origins = np.array(outlines.rows), points.copy()
         movers[paired], origins[paired] = outlines.pair[paired], points[paired, outlines.near[paired]][:, None]
         moves[paired] = 0.5 * np.eye(3, 2)
         ties = outlines.ties
-        known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, BORDER, path, share, own, flux
+        known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, path, share, own, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen
         parallel(loops.weigh_segments, segments, *at, *known, work=400 * segments)
