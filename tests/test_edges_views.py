@@ -84,7 +84,7 @@ SCENES = {
     "over": (crossing, {"background": np.float32([0.3, 0.1, 0.9])}),
     "glass": (glass, {"layers": 4}),
     "glass, finer": (lambda: glass()[:2], {"layers": 3, "supersample": 2}),
-    "plain": (lambda: [crossing()[0].replace(shader=plain)], {}),
+    "plain": (lambda: [crossing()[0].replace(shader=plain)], {"layers": 2}),
 }
 FIELDS = {
     "field": (lambda: [part_of("field")], {}),

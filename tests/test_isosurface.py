@@ -232,12 +232,12 @@ def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
 
 def test_samples_that_find_no_room_in_a_table_are_counted():
     jax = pytest.importorskip("jax")
-    full = rts.sample(function(33, table=True), CAMERA, SIZE, splatter=None).samples[0]
+    full = rts.sample(function(33, table=True), CAMERA, SIZE, splatter=None, layers=2).samples[0]
     surface = Isosurface(BOUNDS, f=torus, shape=(33,) * 3, table=200)
 
     @jax.jit
     def sampled(radii):
-        found = rts.sample(Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=4000, splatter=None)
+        found = rts.sample(Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=4000, splatter=None, layers=2)
         return found.overflow, found.row, found.samples[0].ids
 
     overflow, row, ids = map(np.asarray, sampled(jax.numpy.asarray(RADII["radii"])))

@@ -42,7 +42,7 @@ def moving(pose, shader="silhouette"):
 
 def residuals(shader="silhouette", channels=1, **options):
     image, weights = goal(channels)
-    given = {"weights": weights, **options}
+    given = {"weights": weights, "splatter": "visible", "layers": 2, **options}
     return rts.ImageResiduals(lambda pose: moving(pose, shader), CAMERA, SIZE, image, **given)
 
 
@@ -271,7 +271,11 @@ def test_every_way_has_the_same_number():
     assert expected < 0.7 * float(mean_loss(residuals("lambert", 4))(torch.tensor(POSE)))
     image, weights = goal(4)
     several = rts.ImageResiduals(
-        *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2), weights=[weights] * 2, **options
+        *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2),
+        weights=[weights] * 2,
+        splatter="visible",
+        layers=2,
+        **options,
     )
     ways = [
         mean_loss(residuals("lambert", 4, **options))(POSE),
@@ -375,13 +379,7 @@ def test_levenberg_marquardt_comes_back_from_trials_with_huge_residuals(name):
     part = rts.Part(rts.Mesh(faces), {"vertices": vertices}, "unlit")
     target = np.full((*SIZE, 3), 0.5, np.float32)
     swept = rts.ImageResiduals(
-        lambda p: part.replace(theta={"vertices": vertices, "color": torch.exp(p)}),
-        CAMERA,
-        SIZE,
-        target,
-        loss=name,
-        splatter="visible",
-        layers=2,
+        lambda p: part.replace(theta={"vertices": vertices, "color": torch.exp(p)}), CAMERA, SIZE, target, loss=name
     )
     for own, start in ((swept, -2.5), (lambda p: torch.exp(p) - 0.5, -2.5), (lambda p: torch.exp(p) - 0.5, -3.7)):
         found = rts.fit(own, torch.full((3,), start), method="lm", loss=rts.Loss(name, 0.1), progress=False)

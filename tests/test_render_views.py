@@ -388,7 +388,7 @@ def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_r
         position = gbuffer["position"]
         return np.concatenate([np.abs(position) / 2, np.ones_like(position[:, :1])], axis=1)
 
-    expected = looped(part := mesh_part(icosphere(1), shader=shader))
+    expected = looped(part := mesh_part(icosphere(1), shader=shader), layers=2)
     for promises, kinds in (
         ({}, [Camera] * 3),
         ({"takes_views": True}, [Camera] * 3),
@@ -397,9 +397,7 @@ def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_r
     ):
         vars(shader).update(promises)
         calls.clear()
-        np.testing.assert_allclose(
-            rts.render_views(part, CAMERAS, SIZE, splatter="visible", layers=2), expected, rtol=0, atol=1e-5
-        )
+        np.testing.assert_allclose(rts.render_views(part, CAMERAS, SIZE, layers=2), expected, rtol=0, atol=1e-5)
         assert calls == kinds
 
 
@@ -412,12 +410,10 @@ class Dimmed(rts.plugin("rts.shaders", "lambert")):
 
 def test_promises_of_a_call_that_is_overridden_hold_no_more():
     part = mesh_part(icosphere(1), shader=Dimmed())
-    np.testing.assert_allclose(
-        rts.render_views(part, CAMERAS, SIZE, splatter="visible", layers=2), looped(part), rtol=0, atol=1e-5
-    )
+    np.testing.assert_allclose(rts.render_views(part, CAMERAS, SIZE), looped(part), rtol=0, atol=1e-5)
     again = type("Again", (Dimmed,), {"takes_views": True, "reads": Dimmed.reads})
     with pytest.raises(AttributeError, match="view of a camera was asked for by a shader that takes_views"):
-        rts.render_views(part.replace(shader=again()), CAMERAS, SIZE, splatter="visible", layers=2)
+        rts.render_views(part.replace(shader=again()), CAMERAS, SIZE)
 
 
 # ----------------------------------------------------------------------------------------------- how it is done
@@ -440,21 +436,19 @@ def test_the_surface_is_evaluated_once_for_all_views_and_threads_share_the_sampl
 
     monkeypatch.setattr(surface, "evaluate", lambda *given: calls.append(given) or evaluate(*given))
     monkeypatch.setattr(sampler, "rasterize", drawn)
-    rts.render_views(part, CAMERAS, SIZE, splatter="visible", layers=2)
+    rts.render_views(part, CAMERAS, SIZE)
     assert len(calls) == 1 and len(threads) == 2
 
 
 def test_pictures_are_bounded_and_more_views_make_more_of_them(monkeypatch):
     torch = pytest.importorskip("torch")
     parts = [part.replace(theta={"vertices": torch.tensor(part.theta["vertices"])}) for part in scene()[:2]]
-    expected = rts.render_views(parts, CAMERAS, SIZE, splatter="visible", layers=2)
+    expected = rts.render_views(parts, CAMERAS, SIZE)
     made = []
     apart = Picture.apart
     monkeypatch.setattr(Picture, "apart", lambda self, *given: made.append(self.views) or apart(self, *given))
     monkeypatch.setattr(side_by_side, "SIDE", 60)  # Views of 28 × 35 cells, two above one another.
-    torch.testing.assert_close(
-        rts.render_views(parts, CAMERAS, SIZE, splatter="visible", layers=2), expected, rtol=0, atol=2e-5
-    )
+    torch.testing.assert_close(rts.render_views(parts, CAMERAS, SIZE), expected, rtol=0, atol=2e-5)
     assert made == [2, 1]
 
 

@@ -80,7 +80,7 @@ def test_light_behind_the_last_layer_is_told(name):
     with pytest.warns(
         rts.errors.LayersWarning, match="up to 40 % of the light passes through the last of 2 layers.*'auto'"
     ):
-        rts.render(parts, CAMERA, (8, 8), splatter=name)
+        rts.render(parts, CAMERA, (8, 8), splatter=name, layers=2)
 
 
 @pytest.mark.parametrize("name", ["none", "visible"])

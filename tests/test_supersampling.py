@@ -92,7 +92,7 @@ def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
             return super().image(splats)
 
     bands = len(settings.RenderSettings(None, 2, 3, None).bands(SIZE))
-    gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))
+    gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting(), layers=2).sum(), arrays(TORCH[0], CORNERS))
     assert len(calls) == 2 * bands
 
 
@@ -116,9 +116,9 @@ def test_memory_is_bounded_by_the_bands(monkeypatch):
 
 def test_between_forward_and_backward_bands_keep_next_to_nothing(monkeypatch):
     vertices = arrays(TORCH[0], CORNERS).requires_grad_(True)
-    whole, _ = memory(lambda s, size: image(vertices, s, size))
+    whole, _ = memory(lambda s, size: image(vertices, s, size, splatter="visible"))
     monkeypatch.setattr(settings, "BAND", 2**15)
-    banded, _ = memory(lambda s, size: image(vertices, s, size))
+    banded, _ = memory(lambda s, size: image(vertices, s, size, splatter="visible"))
     assert banded < 0.25 * whole  # What splatters have decided of each cell, four bytes.
 
 
@@ -167,7 +167,9 @@ def test_sampled_knows_its_samples_a_pixel():
     part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
     sampled = rts.sample(part, CAMERA, SIZE, supersample=2, splatter="visible", layers=2)
     assert sampled.row.shape == (2, *(2 * n + 2 * sampled.apron for n in SIZE)) and sampled.supersample == 2
-    np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA, splatter="visible"), image(CORNERS, 2))
+    np.testing.assert_array_equal(
+        rts.render_samples(sampled, part, CAMERA, splatter="visible"), image(CORNERS, 2, splatter="visible")
+    )
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

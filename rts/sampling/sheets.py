@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling.threads import parallel
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments, Proxy
 from rts.sampling.gaps import Fronts
 from rts.sampling.points import kept_sign, near_and_far, pixel_rows
@@ -66,7 +66,8 @@ class Sheets(NamedTuple):
         """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
         from rts.sampling import sheets_loops, silhouettes_loops
 
-        vertices, faces = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
+        arrays = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
+        vertices, faces = map(read_only, arrays)  # One type, for which loops are compiled once.
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
         beyond, sides = _beyond(proxy.faces), np.zeros(len(faces) + 1, np.int8)
