@@ -153,7 +153,7 @@ def outlines_side_by_side(
     def of_breaks(ties: Array) -> Array:
         return renumbered(ties, 0 * before[of_segment], before[of_segment])
 
-    factors = xp.take(xp.astype(scales, whole.slope.dtype), constant(of_break.astype(np.int32)), axis=0)
+    factors = xp.take(xp.astype(scales, whole.slope.dtype), constant(of_break.astype(np.int32), whole.gap), axis=0)
     return replace(
         whole,
         gap=whole.gap + constant(corners[of_break], whole.gap),
