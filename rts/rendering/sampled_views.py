@@ -205,7 +205,7 @@ def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
 def with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
     """`Views` of samples with these numbers of rows; which rows are in use is unknown where they are padded."""
     engine = engine_of(sampled.row)
-    view = tuple(engine.constant(_numbers(own, own.sum())) for own in counts)
+    view = tuple(engine.constant(_numbers(own, own.sum()), sampled.row) for own in counts)
     return Views(sampled, picture, view, None if engine.padded(sampled.row) else counts, scales)
 
 

@@ -14,6 +14,7 @@ from rts.arrays.engines import is_traced, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Hidden, Request, Sampled
+from rts.contracts.splatter import Splatter
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, InputWarning, warn
 from rts.plugin_base import promised
@@ -220,7 +221,7 @@ class Finer(NamedTuple):
         grid = Grid.sampled(scene, self.camera, (cells.side * height, cells.side * width), cells.apron)
         reads, gradient = settings.reader.reads, scene.context.engine.differentiates
         splatter = settings.splatter
-        flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
+        flat = coarse.settled is not None and isinstance(splatter, Splatter) and promised(splatter, "fills_interiors")
 
         def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
             request = Request(capacity, listed, facing="facing" in reads, exits="exit" in reads and gradient)

@@ -85,9 +85,9 @@ class Scene(NamedTuple):
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
 
-    def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenRule | None:
+    def hidden_by(self, splatter: Splatter | str | None, settles: bool = False) -> HiddenRule | None:
         """The rule that tells which samples are hidden; None to keep all. See `rts.sampling.hidden.hidden_by`."""
-        return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
+        return hidden_by(splatter, self.parts, self.sizes, settles) if isinstance(splatter, Splatter) else None
 
     def telling(self, thin: bool) -> Scene:
         """The scene itself; with `thin`, "auto" takes samplers that tell what lies between samples."""
