@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.splatting.edges_weights import BORDER
 
 # ------------------------------------------------------------------------------------------------------- weights
 
@@ -86,12 +85,15 @@ def _add_flux(flux, pull, i, lone, t, first, second, dx, dy):
 
 
 @loop
-def weigh_segments(first, last, place, gap, near_ends, seen, square, ties, side, corner, pull, path, share, own, flux):
+def weigh_segments(
+    first, last, border, place, gap, near_ends, seen, square, ties, side, corner, pull, path, share, own, flux
+):
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
     Args:
         first: the first segment.
         last: the segment after the last.
+        border: width, in cells, beside borders of pixels in which both have a share.
         place: (B,) of outlines.
         gap: (B, 3).
         near_ends: (B, 2), `Outlines.ends`.
@@ -150,8 +152,8 @@ def weigh_segments(first, last, place, gap, near_ends, seen, square, ties, side,
                 px, py, dx, dy = x + t * wx, y + t * wy, part * wx, part * wy
                 u = t * turn if i == 0 else (1 - t) * turn + t
                 counts = not lone or abs(px - path[s, 0, 0]) + abs(py - path[s, 0, 1]) <= 0.5
-                right = min(max((px - 0.5) / BORDER + 0.5, 0.0), 1.0)
-                below = min(max((py - 0.5) / BORDER + 0.5, 0.0), 1.0)
+                right = min(max((px - 0.5) / border + 0.5, 0.0), 1.0)
+                below = min(max((py - 0.5) / border + 0.5, 0.0), 1.0)
                 for k in range(4):
                     east, south = k == 1 or k == 2, k >= 2
                     height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0

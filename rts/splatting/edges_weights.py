@@ -69,7 +69,7 @@ class _Weights(NamedTuple):
         known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, path, share, own, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen
-        parallel(loops.weigh_segments, segments, *at, *known, work=400 * segments)
+        parallel(loops.weigh_segments, segments, BORDER, *at, *known, work=400 * segments)
         normal = np.empty((count, 2))
         loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
         return cls(shown, points, movers, origins, moves, share, own, flux, cells, sides)
