@@ -232,7 +232,8 @@ def _sampled(part: rts.Part, camera: rts.Camera, size: Any, drawn: Drawn) -> Any
         return rts.sample(part, camera, size, sampler="raster", splatter="visible", supersample=more)
     # Outlines of the first layer tell nothing of deeper ones, so all pixels have s² samples.
     first = drawn.layer
-    sampled = rts.sample(part, camera, size, sampler="raster", splatter=None, layers=first + 2, supersample=drawn.samples)
+    options = {"sampler": "raster", "splatter": None, "supersample": drawn.samples}
+    sampled = rts.sample(part, camera, size, layers=first + 2, **options)
     layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n)) is not None}
     return sampled.replace(**layers)
 
