@@ -666,3 +666,13 @@ def test_vertices_that_are_traced_are_not_looked_at():
     wrong = mesh_part((vertices, faces[:, ::-1]), cull="back")
     draw = jax.jit(lambda v: rts.render(wrong.replace(theta={"vertices": v}), CAMERA, SIZE))
     assert draw(jax.numpy.asarray(vertices))[..., 3].sum() > 10
+
+
+def test_explain_tells_of_functions_that_do_not_say_whether_they_are_opaque():
+    def shader(theta, gbuffer, camera):
+        return rts.namespace(gbuffer["position"]).ones_like(gbuffer["position"][:, [0, 0, 0, 0]])
+
+    part = rts.Mesh.example().replace(shader=shader)
+    assert "does not say whether light passes" in str(rts.explain(part, CAMERA)[0])
+    shader.opaque = True
+    assert "light" not in str(rts.explain(part.replace(shader=shader), CAMERA)[0])

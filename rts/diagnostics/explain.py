@@ -10,6 +10,7 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import CheckedPart, check_scene
 from rts.contracts.records import Sampled, Samples
+from rts.contracts.shader import FunctionShader
 from rts.registry import name_of
 from rts.rendering.arguments import Layers, SplatterLike, Supersample
 from rts.rendering.image import render_samples
@@ -93,6 +94,13 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
     return [own.read for own in shaders]
 
 
+NO_PROMISE = (
+    "its shader, a function, does not say whether light passes through it: all layers are kept, which takes two to "
+    "four times as long; set its attribute opaque to True if alpha is 1, else to False"
+)
+"""A remark on shaders."""
+
+
 def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:
     """Likely mistakes in a part; `shaded` are the entries of θ that its shader reads, None if unknown."""
     for name in unread(part, shaded):
@@ -100,6 +108,8 @@ def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) 
         yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
     if is_inside_out(part, camera):
         yield INSIDE_OUT
+    if isinstance(part.shader, FunctionShader) and not hasattr(part.shader.function, "opaque"):
+        yield NO_PROMISE
 
 
 def _missed(sampled: Sampled) -> int | None:
