@@ -581,6 +581,8 @@ def test_shaders_that_do_not_say_what_they_read_are_not_spoken_of():
     def shader(theta, gbuffer, camera):
         return np.ones((len(gbuffer["position"]), 4)) * theta["colour"][0]
 
+    shader.opaque = True
+
     class Tinted(Lambert):
         def base_color(self, theta, gbuffer):
             return np.ones_like(gbuffer["position"]) * theta["colour"], np.ones_like(gbuffer["position"][:, :1])
@@ -597,6 +599,7 @@ def test_explain_at_a_size_observes_what_functions_read(target):
         tint = theta.get("tint", {"color": 1.0})["color"] * (2 if "double" in theta else 1)
         return gbuffer["position"][:, [0, 0, 0, 0]] * 0 + tint
 
+    shader.opaque = False
     theta = {"vertices": BOX[0], "tint": {"color": np.float32(0.5)}, "tints": np.ones(3), "Double": np.ones(1)}
     part = Part(Mesh(BOX[1]), arrays(target, theta), shader)
     (lambert, own) = rts.explain([PART.replace(shader="lambert"), part], CAMERA, SIZE)
@@ -606,6 +609,7 @@ def test_explain_at_a_size_observes_what_functions_read(target):
     def all_of_it(theta, gbuffer, camera):
         return shader({**theta}, gbuffer, camera)
 
+    all_of_it.opaque = False
     assert rts.explain(part.replace(shader=all_of_it), CAMERA, SIZE)[0].remarks == ()
 
 
