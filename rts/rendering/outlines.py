@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -80,11 +80,38 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
         count = own.ids.shape[-2]
         rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
-        samples.append(in_one_table([own, extra]))
-        first += samples[-1].ids.shape[-2]
+        whole = in_one_table([own, extra])
+        if engine_of(whole.ids).padded(whole.ids):
+            whole = _without_gaps(whole, own, xp.where(found.parts == part, found.rows, -1))
+        samples.append(whole)
+        first += whole.ids.shape[-2]
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
+
+
+def _without_gaps(whole: Samples, own: Samples, beside: Array) -> Samples:
+    """Samples, those `own` of cells and then further ones, in which unused rows repeat one in use.
+
+    `beside` (B, R) holds the numbers of the further ones in use, or −1.
+    """
+    xp, count, constant = namespace(whole.ids), own.ids.shape[-2], engine_of(whole.ids).constant
+    rows = constant(np.arange(whole.ids.shape[-2], dtype=np.int32), whole.ids)
+    used, last = (xp.max(xp.concat([xp.reshape(x, (-1,)), 0 * rows[:1] - 1])) + 1 for x in (own.row, beside))
+    there = (rows < used) | ((rows >= count) & (rows < count + last))
+    return taken_rows(whole, xp.where(there, rows, xp.where(used > 0, 0, count)))
+
+
+def taken_rows(samples: Samples, index: Array) -> Samples:
+    """The rows of samples with some indices (N,)."""
+    xp = namespace(samples.ids)
+
+    def taken(named: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: xp.take(x, index, axis=0) for name, x in named.items()}
+
+    own = taken({"ids": samples.ids, "params": samples.params})
+    gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
+    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer, triangle=None)
 
 
 def with_entries(scene: Scene, grid: Grid) -> Scene:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.records import Samples
-from rts.rendering.outlines import Found, Points, at_centres, found_in_views, inputs_of, known_value, real_of
+from rts.rendering.outlines import (
+    Found,
+    Points,
+    at_centres,
+    found_in_views,
+    inputs_of,
+    known_value,
+    real_of,
+    taken_rows,
+)
 from rts.rendering.sampled_views import Sampling, Views, in_one_table, with_counts
 from rts.sampling.gaps import Fronts
 from rts.splatting.side_by_side import outlines_side_by_side
@@ -41,7 +48,8 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
         order = _view_after_view(views.counts[part], beside)
         place = np.full(count + extra.ids.shape[0], -1, np.int32)
         place[order] = np.arange(len(order), dtype=np.int32)
-        samples.append(_taken(in_one_table([own, extra]), order).replace(row=_moved(own.row, place)))
+        at = engine_of(own.ids).constant(order.astype(np.int32), own.ids)
+        samples.append(taken_rows(in_one_table([own, extra]), at).replace(row=_moved(own.row, place)))
         counts.append(views.counts[part] + beside)
         moved.append(start + place[:count])
         for at, of, x in zip(rows, found, here, strict=True):
@@ -67,15 +75,3 @@ def _moved(row: Array, place: np.ndarray) -> Array:
     """The rows of cells, −1 for none, with a new `place` for each."""
     known = known_value(row)
     return engine_of(row).constant(np.where(known >= 0, place[known], np.int32(-1)), row)
-
-
-def _taken(samples: Samples, order: np.ndarray) -> Samples:
-    """The rows of a table of samples in another order."""
-    xp, at = namespace(samples.ids), engine_of(samples.ids).constant(order.astype(np.int32), samples.ids)
-
-    def taken(named: Mapping[str, Array]) -> dict[str, Array]:
-        return {name: xp.take(x, at, axis=0) for name, x in named.items()}
-
-    own = taken({"ids": samples.ids, "params": samples.params})
-    gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
-    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer, triangle=None)

@@ -14,12 +14,10 @@ from rts.plugin_base import promised
 from rts.registry import name_of
 from rts.rendering.scene import Scene
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.hidden import planned
+from rts.sampling.hidden import TRACED_LAYERS, planned
 
 BAND = 2**20
 """Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""
-TRACED_LAYERS = {True: 2, False: 4}
-"""Number of layers of `layers="auto"` where values are traced, if all is opaque, or not."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def to_splats(
     height, width, apron = *sampled.row.shape[1:], sampled.apron
     grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
     sampled = _owned(sampled, sampled.row, context)
-    beside = sampled.outlines is not None
+    beside = None if sampled.outlines is None else sampled.outlines.rows
     positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, grid, context, beside))
     return _splats(sampled, parts, positions, rgba, context, border=apron)
 
@@ -154,7 +154,7 @@ def _shown(
     camera: Camera,
     grid: Grid,
     context: Context,
-    beside: bool = False,
+    beside: Array | None = None,
 ) -> tuple[list[Array], list[Array]]:
     """Positions (N, 3) and colours (N, C + 1) of the samples of each part, all of one engine.
 
@@ -165,7 +165,7 @@ def _shown(
         camera: the camera of the whole image, which shaders see.
         grid: the cells of the samples, and their camera.
         context: the engine to compute with, and an exemplar of the results.
-        beside: True if rows behind those of cells are samples, too: those beside outlines.
+        beside: integers, the indices of samples beside outlines, behind those of cells; None without outlines.
     """
     inputs, engine = _of_inputs(context), context.engine
     seen = grid.camera.replace(view=inputs.constants(grid.camera.view))
@@ -176,7 +176,7 @@ def _shown(
         local = evaluate(part, samples, inputs)
         own = seen.within(transform)
         add_footprint(part, samples, local, own, grid.size, inputs)
-        used = _all_in_use(samples, inputs) if beside else samples
+        used = samples if beside is None else _all_in_use(samples, inputs, beside, first)
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
         positions.append(context.constants(own.project(_on_rays(samples, local["position"]), grid.size)))
         check_splats(index, part, world, positions[-1], rgba, row, first)
@@ -188,10 +188,21 @@ def _shown(
     return positions, colors
 
 
-def _all_in_use(samples: Samples, context: Context) -> Samples:
-    """The samples with cells of their own, one a row, so that no row passes for unused."""
-    every = np.arange(samples.ids.shape[0], dtype=np.int32)[None, None]
-    return replace(samples, cells=replace(samples.cells, row=context.constants(every)))
+def _all_in_use(samples: Samples, context: Context, beside: Array | None, first: int) -> Samples:
+    """The samples with cells of their own, one a row, so that no row passes for unused; or all do, if none is in use.
+
+    Args:
+        samples: the samples of a part.
+        context: of their arrays.
+        beside: see `_shown`; None if some row is in use.
+        first: the index of the part's first sample.
+    """
+    xp, count = namespace(samples.row), samples.ids.shape[-2]
+    every = context.constants(np.arange(count, dtype=np.int32)[None, None])
+    if beside is None:
+        return replace(samples, cells=replace(samples.cells, row=every))
+    there = xp.any(samples.row >= 0) | xp.any((beside >= first) & (beside < first + count))
+    return replace(samples, cells=replace(samples.cells, row=xp.where(there, every, -1)))
 
 
 def _shown_in_views(
@@ -216,7 +227,11 @@ def _shown_in_views(
     """
     inputs, engine = _of_inputs(context), context.engine
     whole = in_one_table([own.samples[index] for own in sampled])
-    used = whole if sampled[0].outlines is None else _all_in_use(whole, inputs)
+    used, outlines = whole, sampled[0].outlines
+    if outlines is not None:
+        before = sum(own.ids.shape[-2] for own in sampled[0].samples[:index])
+        # Engines that pad rows have all views in one picture.
+        used = _all_in_use(whole, inputs, outlines.rows if len(sampled) == 1 else None, before)
     counts, size = _counts_of(pictures, index), grids[0].size
     theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
     gbuffer = evaluate(part, whole, inputs)

@@ -26,6 +26,8 @@ from rts.sampling.packing import too_far
 
 LAYER_LIMIT = 16
 """The largest number of layers that `layers="auto"` takes."""
+TRACED_LAYERS = {True: 2, False: 4}
+"""The number of layers that it takes where values are traced, if all is opaque, or not."""
 
 
 def planned(layers: int | Literal["auto"]) -> int:
@@ -135,6 +137,8 @@ def with_layers_that_count(
 ) -> Sampled:
     """A scene sampled with as many layers as its image needs, up to `LAYER_LIMIT`; a LayersWarning if that is too few.
 
+    Traced values cannot decide; the number is then of `TRACED_LAYERS`.
+
     If parts are translucent, an empty layer is added: it says that nothing lies behind the others. Samples beyond the
     limit are counted in `overflow`.
 
@@ -143,8 +147,6 @@ def with_layers_that_count(
         hidden: the rule; None to keep all.
         opaque: for each part, whether its shader promises to be opaque.
 
-    Raises:
-        InputError: the samples are traced.
     """
     count = 3  # A closed surface before nothing needs two: the second at its outlines.
     while True:
@@ -152,7 +154,7 @@ def with_layers_that_count(
         sampled = taken(min(count, LAYER_LIMIT + 1), hidden)
         row = value_of(sampled.row)
         if row is None:
-            raise InputError('layers is "auto", but the values that decide are traced; give a number of layers')
+            return taken(TRACED_LAYERS[all(opaque)], hidden)
         other_axes = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
         counts = (row[..., 1:, :, :] >= 0).sum(axis=other_axes)
         most = 1 + int(np.flatnonzero(np.append(1, counts)).max())
