@@ -79,12 +79,12 @@ def test_refined_samples_lie_on_the_true_surface_and_in_the_centres_of_their_pix
 def test_refinement_and_tables_work_on_every_engine(target):
     reference = rts.render(Part(Ball(), {"radius": np.array([0.9], np.float32)}), CAMERA, SIZE, layers=1)
     part = Part(Ball(), {"radius": arrays(target, np.array([0.9]))})
-    np.testing.assert_allclose(to_numpy(rts.render(part, CAMERA, SIZE, layers=1)), reference, atol=1e-5)
+    np.testing.assert_allclose(to_numpy(rts.render(part, CAMERA, SIZE, layers=1)), reference, atol=1e-4)
     if target == "jax":
         import jax
 
         traced = jax.jit(lambda r: rts.render(Part(part.surface, {"radius": r}), CAMERA, SIZE, layers=1))
-        np.testing.assert_allclose(traced(part.theta["radius"]), reference, atol=1e-5)
+        np.testing.assert_allclose(traced(part.theta["radius"]), reference, atol=1e-4)
 
 
 def test_lift_numbers_samples_layer_by_layer_and_interpolates_corner_parameters():
@@ -264,7 +264,11 @@ def test_the_parts_of_batched_samples_are_those_of_each():
 
     def sampled(move):
         return rts.sample(
-            [Part(mesh, {"vertices": vertices.astype(np.float32) + move}), behind], CAMERA, SIZE, splatter=None
+            [Part(mesh, {"vertices": vertices.astype(np.float32) + move}), behind],
+            CAMERA,
+            SIZE,
+            splatter=None,
+            layers=2,
         )
 
     moves = jax.numpy.asarray([(0, 0, 0), (0.4, 0.2, 0)], dtype=np.float32)

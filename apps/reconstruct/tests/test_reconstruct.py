@@ -107,7 +107,7 @@ def test_files_hold_the_mesh_with_its_texture(folder, tmp_path):
     assert "KHR_materials_unlit" in tables["extensionsUsed"]
     assert all("KHR_materials_unlit" in material["extensions"] for material in tables["materials"])
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png") == 6 and "<polyline" in page and "http" not in page
+    assert page.count("data:image/png") == 6 and "<polyline" in page and "http:" not in page and "https:" not in page
     with Image.open(out / "turntable.gif") as turning:
         assert turning.n_frames == 36
 
