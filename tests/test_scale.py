@@ -97,8 +97,8 @@ def test_in_jax_a_mesh_of_any_scale_looks_the_same_and_has_right_gradients(shade
 @pytest.mark.parametrize("surface", quick(("bezier", "bspline", "subdivision", isosurface, sdf)))
 @pytest.mark.thorough
 def test_other_surfaces_of_any_scale_look_the_same_and_have_right_gradients(surface, scale):
-    # Rounding decides where the rays of a field just miss it, and in which order refined samples are.
-    off = {"image_off": 0.02, "slope_off": 5e-4}
+    # Outlines of what has no triangles, or moves samples off them, are found by halving, which rounding may change.
+    off = {"image_off": 0.02, "slope_off": 1e-2}
     check(example(surface) if isinstance(surface, str) else surface, scale, "normals", "torch-cpu", **off)
 
 
