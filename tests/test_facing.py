@@ -230,3 +230,9 @@ def test_the_compiled_splatter_is_the_specification(layers):
         image = splatter.image(splats_of(moved, *constant[:2], facing=constant[2]))
         found.append(torch.autograd.grad((image * along).sum(), moved)[0].numpy())
     np.testing.assert_allclose(*found, rtol=0, atol=1e-10)
+
+
+def test_found_outlines_do_not_depend_on_the_order_of_parts():
+    parts = scene()
+    images = [rts.render(own, CAMERA, SIZE, splatter="edges") for own in (parts, parts[::-1])]
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
