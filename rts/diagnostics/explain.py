@@ -23,6 +23,11 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.shading.unused_entries import Observed, likely_name, shaded_by, unread
 
+NO_PROMISE = (
+    "its shader, a function, does not say whether light passes through it: all layers are kept, which takes two to "
+    "four times as long; set its attribute opaque to True if alpha is 1, else to False"
+)
+"""The remark on a part whose shader is a function without the attribute."""
 FEW = 32
 """Pixels along each side of the image that shows what shaders read."""
 
@@ -92,13 +97,6 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
     sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, splatter=None, layers=1)
     render_samples(sampled, watched, camera.for_size(size).replace(aspect=None))
     return [own.read for own in shaders]
-
-
-NO_PROMISE = (
-    "its shader, a function, does not say whether light passes through it: all layers are kept, which takes two to "
-    "four times as long; set its attribute opaque to True if alpha is 1, else to False"
-)
-"""A remark on shaders."""
 
 
 def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:

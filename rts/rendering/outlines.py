@@ -57,8 +57,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     cells, known = sampled.cells, []
     if all(scene.opaque) or not scene.layered:
         sampled = replace(sampled, cells=cells.first(1))
-    for part, entry in zip(scene.parts, scene.entries, strict=True):
-        read = {name: part.theta[name] for name in part.surface.reads(part.theta)}
+    for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True):
         # Functions of surfaces want the arrays that they are given.
         known.append((part.transform, read, _proxy_inputs(part) if entry is None else None))
     triangles = [own.triangle for own in sampled.samples]
@@ -68,8 +67,8 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
-        row, depth, own = map_leaves(known_value, inputs[3:])
-        entered = [map_leaves(known_value, x) for *_, x in inputs[0]]
+        row, depth, own = map_leaves(host_value, inputs[3:])
+        entered = [map_leaves(host_value, x) for *_, x in inputs[0]]
         centres = at_centres(row, depth, own, sampled.samples)
         (here,), more = found_in_views([Points.of(scene, grid, entered)], [centres])
         specs = Found.specs(0, grid.size, real_of(scene), len(row))
@@ -119,15 +118,16 @@ def with_entries(scene: Scene, grid: Grid) -> Scene:
 
     The scene itself where values are traced, or several at once.
     """
-    read = [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in scene.parts]
-    inputs = stopped((read, [part.transform for part in scene.parts], grid.camera))
-    if not any(map(_is_dear, scene.parts)) or any(is_traced(x) or _batched(x) for x in leaves(inputs)):
+    if not any(map(_is_dear, scene.parts)):
+        return scene
+    inputs = stopped((scene.read, [part.transform for part in scene.parts], grid.camera))
+    if any(is_traced(x) or _batched(x) for x in leaves(inputs)):
         return scene
     entries = []
     for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
         if entry is None and isinstance(sampler, TriangleSampler) and _is_dear(part):
             camera = _on_host(grid.camera.within(part.transform).for_size(grid.size))
-            entry = _entry(part, sampler, map_leaves(known_value, _proxy_inputs(part)), camera, grid.size)
+            entry = _entry(part, sampler, map_leaves(host_value, _proxy_inputs(part)), camera, grid.size)
         entries.append(entry)
     return scene._replace(entries=entries)
 
@@ -295,7 +295,7 @@ def _batched(x: Array) -> bool:
     return value is not None and value.ndim != x.ndim
 
 
-def known_value(x: Array) -> np.ndarray:
+def host_value(x: Array) -> np.ndarray:
     """The value of an array, which is not traced."""
     value = value_of(x)
     assert value is not None
@@ -304,7 +304,7 @@ def known_value(x: Array) -> np.ndarray:
 
 def _on_host(camera: Camera) -> Camera:
     """A camera that is not traced, with matrices on the host."""
-    return camera.map(lambda m: np.asarray(known_value(m), np.float64))
+    return camera.map(lambda m: np.asarray(host_value(m), np.float64))
 
 
 class _Broken(NamedTuple):
@@ -345,7 +345,7 @@ def found_in_views(
         if None not in fragments:
             together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
         samples.append(views[0].sample(part, np.concatenate(points), together))
-        ends, numbers = np.cumsum([len(x) for x in points]), known_value(samples[-1].row)[0, 0]
+        ends, numbers = np.cumsum([len(x) for x in points]), host_value(samples[-1].row)[0, 0]
         for own, here, number in zip(rows, asked, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
             own[here] = number
     return [view.found(own, at, samples) for view, own, at in zip(views, broken, rows, strict=True)], samples
@@ -407,7 +407,7 @@ class Points:
                 continue
             more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
             if more.exit is not None and len(more.exit) == 2:
-                found = known_value(more.exit)[:, 0].T
+                found = host_value(more.exit)[:, 0].T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
             samples[own] = in_one_table([samples[own], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
@@ -474,7 +474,7 @@ class Points:
         part, depth = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
         for index in range(len(self._parts)):
             samples = self.sample(index, points)
-            seen, z = known_value(samples.row)[0, 0] >= 0, known_value(samples.depth)[0, 0]
+            seen, z = host_value(samples.row)[0, 0] >= 0, host_value(samples.depth)[0, 0]
             nearer = seen & (z < depth)
             part[nearer], depth[nearer] = index, z[nearer]
         return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
@@ -509,7 +509,7 @@ class _OnTriangles(TriangleSampler):
 
 def inputs_of(scene: Scene) -> list[Tree]:
     """The inputs of the proxies of all parts, on the host; none of them is traced."""
-    return [map_leaves(known_value, _proxy_inputs(part)) for part in scene.parts]
+    return [map_leaves(host_value, _proxy_inputs(part)) for part in scene.parts]
 
 
 def _proxy_inputs(part: CheckedPart) -> Tree:

@@ -14,8 +14,8 @@ from rts.rendering.outlines import (
     Points,
     at_centres,
     found_in_views,
+    host_value,
     inputs_of,
-    known_value,
     real_of,
     taken_rows,
 )
@@ -36,7 +36,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]))
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
     points = [first, *each(lambda own: Points.of(*own, [None] * len(scenes[0].parts)), further)]
-    row, depth, *triangles = map(known_value, (sampled.row, sampled.depth, *(s.triangle for s in sampled.samples)))
+    row, depth, *triangles = map(host_value, (sampled.row, sampled.depth, *(s.triangle for s in sampled.samples)))
     centres = at_centres(row, depth, triangles, sampled.samples)
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)
@@ -59,7 +59,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     specs, none = Found.specs(0, grids[0].size, real_of(scenes[0]), len(row)), np.zeros((len(found), 1), np.int32)
     found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
     outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = outlines_side_by_side(outlines, picture, none, none, known_value(views.scales))
+    joint = outlines_side_by_side(outlines, picture, none, none, host_value(views.scales))
     sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
     return with_counts(sampled, picture, views.scales, tuple(counts))
 
@@ -73,5 +73,5 @@ def _view_after_view(cells: np.ndarray, beside: np.ndarray) -> np.ndarray:
 
 def _moved(row: Array, place: np.ndarray) -> Array:
     """The rows of cells, −1 for none, with a new `place` for each."""
-    known = known_value(row)
+    known = host_value(row)
     return engine_of(row).constant(np.where(known >= 0, place[known], np.int32(-1)), row)

@@ -62,10 +62,14 @@ class Scene(NamedTuple):
         return not any(shares_tables(part.surface) for part in self.parts)
 
     @property
+    def read(self) -> list[dict[str, Tree]]:
+        """The entries of each part's θ that its surface reads."""
+        return [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in self.parts]
+
+    @property
     def traced(self) -> bool:
         """True if it depends on traced values where samples lie."""
-        read = [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in self.parts]
-        return any(map(is_traced, leaves((read, [part.transform for part in self.parts], self.camera))))
+        return any(map(is_traced, leaves((self.read, [part.transform for part in self.parts], self.camera))))
 
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | Prepared, camera: Camera, sampler: Any, engine: str | None) -> Scene:

@@ -201,8 +201,8 @@ def _all_in_use(samples: Samples, context: Context, beside: Array | None, first:
     every = context.constants(np.arange(count, dtype=np.int32)[None, None])
     if beside is None:
         return replace(samples, cells=replace(samples.cells, row=every))
-    beside = context.constants(beside)
-    there = xp.any(samples.row >= 0) | xp.any((beside >= first) & (beside < first + count))
+    rows: Array = context.constants(beside)
+    there = xp.any(samples.row >= 0) | xp.any((rows >= first) & (rows < first + count))
     return replace(samples, cells=replace(samples.cells, row=xp.where(there, every, -1)))
 
 
