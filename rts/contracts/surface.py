@@ -175,21 +175,6 @@ class TriangleSurface(Surface):
         """
         return size, *(m.tobytes() for m in camera)
 
-    def pieces(self, proxy: Proxy) -> np.ndarray:
-        """The consistently oriented piece of each triangle, so that splatters do not join a front to a back side.
-
-        Not called where `refine` moves samples. `rts.plugin_api.checks.pieces` computes them from the edges
-        that triangles share.
-
-        Args:
-            proxy: the result of `proxy`.
-
-        Returns:
-            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 if its winding tells no sides; or
-            (1,), one such number for all triangles.
-        """
-        return np.zeros(1, np.int16)
-
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
         """Move samples from the triangles onto the surface, along their rays, or drop them; on the host.
 

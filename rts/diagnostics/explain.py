@@ -12,7 +12,7 @@ from rts.contracts.checks import CheckedPart, check_scene
 from rts.contracts.records import Sampled, Samples
 from rts.contracts.shader import FunctionShader
 from rts.registry import name_of
-from rts.rendering.arguments import Layers, SplatterLike, Supersample
+from rts.rendering.arguments import Layers, SplatterLike
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive, missed
@@ -42,7 +42,7 @@ def explain(
     *,
     splatter: SplatterLike = "auto",
     layers: Layers = "auto",
-    supersample: Supersample = 1,
+    supersample: int = 1,
 ) -> list[Choice]:
     """Explain which sampler `sampler="auto"` chooses for each part, and count samples if a size is given.
 

@@ -35,7 +35,7 @@ from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.plugin_base import overrides
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
 from rts.rendering.samples import sample
@@ -109,7 +109,7 @@ class ImageResiduals(Residuals):
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
         layers: Layers = "auto",
-        supersample: Supersample = 1,
+        supersample: int = 1,
         capacity: int | None = None,
         channels: int = 3,
         loss: str | Loss = "linear",

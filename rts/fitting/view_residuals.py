@@ -20,7 +20,7 @@ from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage
 from rts.operations.linear import matmul
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.sampling.adaptive import Adaptive
 from rts.scene.camera import Camera
 from rts.scene.view import View
@@ -98,7 +98,7 @@ class ViewResiduals(Residuals):
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
         layers: Layers = "auto",
-        supersample: Supersample = 1,
+        supersample: int = 1,
         capacity: int | None = None,
         channels: int = 3,
         loss: str | Loss = "linear",

@@ -7,7 +7,6 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 from rts.contracts.sampler import Sampler
 from rts.contracts.splatter import Splatter
-from rts.sampling.adaptive import Adaptive
 
 
 class ArrayLike(Protocol):
@@ -31,15 +30,12 @@ SamplerLike: TypeAlias = (
 """A name of a sampler, built in or another plugin's; a sampler; or its class."""
 
 SplatterLike: TypeAlias = (
-    Literal["auto", "visible", "edges", "multi", "single", "none"] | str | Splatter | type[Splatter]
+    Literal["auto", "edges", "multi", "single", "none"] | str | Splatter | type[Splatter]
 )
 """A name of a splatter, built in or another plugin's; a splatter; or its class."""
 
 Layers: TypeAlias = int | Literal["auto"]
 """A number of surface layers at each pixel, or "auto"."""
-
-Supersample: TypeAlias = int | Adaptive
-"""Samples along each side of a pixel, or `rts.Adaptive`."""
 
 ColorLike: TypeAlias = ArrayLike | Sequence[float]
 """A colour as an array (C,), or numbers."""

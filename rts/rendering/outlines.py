@@ -24,7 +24,6 @@ from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
 from rts.sampling.spans import breaks_of_triangles
 from rts.sampling.stacks_of_spans import breaks_of_stacks
-from rts.sampling.strips import at_cells
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -405,9 +404,9 @@ class Points:
             at = np.flatnonzero(part == own)
             if isinstance(known[0], TriangleSampler) or not len(at):
                 continue
-            more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
-            if more.exit is not None and len(more.exit) == 2:
-                found = host_value(more.exit)[:, 0].T
+            more = self.sample(own, breaks.points[at, breaks.near[at]], pairs=True)
+            if more.pair is not None:
+                found = host_value(more.pair).T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
             samples[own] = in_one_table([samples[own], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
@@ -447,7 +446,7 @@ class Points:
         sheets = self._parts[part][-1]
         return sheets.at(triangles, points)[0] if sheets is not None and (triangles >= 0).all() else None
 
-    def sample(self, part: int, points: np.ndarray, fragments: Fragments | None = None, exits: bool = False) -> Samples:
+    def sample(self, part: int, points: np.ndarray, fragments: Fragments | None = None, pairs: bool = False) -> Samples:
         """One layer of samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
         sampler, camera, entry, sheets = self._parts[part]
         if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
@@ -455,7 +454,7 @@ class Points:
             points, fragments = np.full((1, 2), 0.5), None
         if fragments is not None:
             sampler = _OnTriangles(fragments)
-        request = Request(points=points, exits=exits, triangles=True, entry=entry)
+        request = Request(points=points, pairs=pairs, triangles=True, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" in samples.followed:
             return samples
@@ -466,8 +465,14 @@ class Points:
         )
         height, width = self._grid.size
         x, y = (np.clip(np.floor(points[:, axis]), 0, count - 1) for axis, count in ((0, width), (1, height)))
-        cells = engine_of(samples.row).constant((y * width + x).astype(np.int32)[None], samples.row)
-        return at_cells(check_samples(samples, (height, width), sampler), cells, None)
+        at = (y * width + x).astype(np.int64)
+        check_samples(samples, (height, width), sampler)
+        row, depth = (host_value(z)[0].reshape(-1)[at] for z in (samples.row, samples.depth))
+        constant, number = engine_of(samples.row).constant, np.where(row >= 0, np.arange(len(row)), -1)
+        taken = taken_rows(samples, constant(np.maximum(row, 0).astype(np.int32), samples.row))
+        return taken.replace(
+            row=constant(number.astype(np.int32)[None, None], samples.row), depth=constant(depth[None, None], samples.depth)
+        )
 
     def _fronts(self, points: np.ndarray) -> Fronts:
         """The nearest samples of all parts at points (M, 2); of equal ones the first part's."""

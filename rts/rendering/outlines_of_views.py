@@ -59,9 +59,9 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     specs, none = Found.specs(0, grids[0].size, real_of(scenes[0]), len(row)), np.zeros((len(found), 1), np.int32)
     found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
     outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = outlines_side_by_side(outlines, picture, none, none, host_value(views.scales))
+    joint = outlines_side_by_side(outlines, picture, none, none)
     sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
-    return with_counts(sampled, picture, views.scales, tuple(counts))
+    return with_counts(sampled, picture, tuple(counts))
 
 
 def _view_after_view(cells: np.ndarray, beside: np.ndarray) -> np.ndarray:
