@@ -467,12 +467,11 @@ class Points:
         x, y = (np.clip(np.floor(points[:, axis]), 0, count - 1) for axis, count in ((0, width), (1, height)))
         at = (y * width + x).astype(np.int64)
         check_samples(samples, (height, width), sampler)
-        row, depth = (host_value(z)[0].reshape(-1)[at] for z in (samples.row, samples.depth))
-        constant, number = engine_of(samples.row).constant, np.where(row >= 0, np.arange(len(row)), -1)
-        taken = taken_rows(samples, constant(np.maximum(row, 0).astype(np.int32), samples.row))
-        return taken.replace(
-            row=constant(number.astype(np.int32)[None, None], samples.row), depth=constant(depth[None, None], samples.depth)
-        )
+        found, depth = (host_value(z)[0].reshape(-1)[at] for z in (samples.row, samples.depth))
+        constant, number = engine_of(samples.row).constant, np.where(found >= 0, np.arange(len(found)), -1)
+        taken = taken_rows(samples, constant(np.maximum(found, 0).astype(np.int32), samples.row))
+        row = constant(number.astype(np.int32)[None, None], samples.row)
+        return taken.replace(row=row, depth=constant(depth[None, None], samples.depth))
 
     def _fronts(self, points: np.ndarray) -> Fronts:
         """The nearest samples of all parts at points (M, 2); of equal ones the first part's."""

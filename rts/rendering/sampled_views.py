@@ -90,9 +90,7 @@ class Sampling:
         first = self.scenes[0]
         return list(zip(first.parts, first.chosen(), first.entries, strict=True))
 
-    def of_part(
-        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None
-    ) -> tuple[Samples, Array]:
+    def of_part(self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None) -> tuple[Samples, Array]:
         """The samples of a part in all views, by one call to the host; at most `settings.capacity` in each view.
 
         Args:

@@ -10,6 +10,7 @@ from rts.arrays.extremes import named
 from rts.contracts.records import Cells, Fragments, Proxy, Samples
 from rts.errors import InputError
 
+
 def covered_cells(triangle_ids: np.ndarray) -> tuple[np.ndarray, int]:
     """Cells (bool) where `Fragments.triangle_ids` name a triangle, and the largest index among these, or −1.
 
