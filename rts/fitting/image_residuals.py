@@ -280,9 +280,8 @@ class ImageResiduals(Residuals):
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*equations, strict=True))
             return value, matrix, gradient
         engine, equations = engine_of(parameters), None
-        splatter = self._settings.splatter
-        sums = isinstance(splatter, SummingSplatter) and self._ordinary and not self._sigma
-        if sums and engine.differentiates and self._image_channels == 3:
+        splatter, ordinary = self._settings.splatter, self._ordinary and not self._sigma and self._image_channels == 3
+        if isinstance(splatter, SummingSplatter) and ordinary and engine.differentiates:
             equations = self._swept(parameters, engine, splatter)
         return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 

@@ -164,8 +164,9 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
 
 def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
-    pairs = zip(views, scenes, strict=True)
-    images = [splatted(own, scene, scene.camera, context, settings.splatter) for own, scene in pairs]
+    pairs, splatter = zip(views, scenes, strict=True), settings.splatter
+    assert splatter is not None
+    images = [splatted(own, scene, scene.camera, context, splatter) for own, scene in pairs]
     return namespace(*images).stack(images)
 
 
@@ -173,9 +174,10 @@ def _as_pictures(
     pictures: Sequence[Views], scenes: Sequence[Scene], context: Context, settings: RenderSettings
 ) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted picture by picture."""
-    images, cameras = [], [scene.camera for scene in scenes]
+    images, cameras, splatter = [], [scene.camera for scene in scenes], settings.splatter
+    assert splatter is not None
     for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
-        cells = views.picture.apart(cropped_image(settings.splatter, splats), views.sampled.apron)
+        cells = views.picture.apart(cropped_image(splatter, splats), views.sampled.apron)
         xp, (count, height, width, channels), side = namespace(cells), cells.shape, views.sampled.supersample
         if side > 1:
             cells = averaged(xp.reshape(cells, (count * height, width, channels)), side)
