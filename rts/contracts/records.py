@@ -96,14 +96,17 @@ class Cells:
     Attributes:
         row: (K, H, W) int32, the index of the sample in each cell, or −1 for none.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1. None where positions hold it.
+        triangle: (K, H, W) int32, the triangle of the proxy that the sample lies on; −1 where `row` is. None if it was
+            not requested, or if samples left their triangles.
     """
 
     row: Array
     depth: Array | None = None
+    triangle: Array | None = None
 
     def map(self, f: Callable[[Array], Array]) -> Cells:
         """The cells with `f` applied to each array; `f` sees axes (..., H, W), and None stays None."""
-        return Cells(f(self.row), None if self.depth is None else f(self.depth))
+        return Cells(f(self.row), *(None if x is None else f(x) for x in (self.depth, self.triangle)))
 
     def first(self, layers: int) -> Cells:
         """The cells with only their first layers."""
@@ -117,6 +120,7 @@ class _OnCells:
 
     row = property(attrgetter("cells.row"), doc="See `Cells`.")
     depth = property(attrgetter("cells.depth"), doc="See `Cells`.")
+    triangle = property(attrgetter("cells.triangle"), doc="See `Cells`.")
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed; fields of `cells` may be named directly."""
@@ -146,8 +150,6 @@ class Samples(_OnCells):
         followed: ("points",) if the `Request` had points and the sampler obeyed.
         ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
             None for a surface that is not refined.
-        triangle: (N,) int32, the triangle of the proxy that each sample lies on; None if it was not requested, or if
-            samples left their triangles.
         pair: (2, M) int32, of M points: the indices of two further samples, not in `row`, beside the deepest point of
             the point's ray, where the field that it crosses is least; −1 for none. The mean of their motions is that
             of the outline. None if not requested, or not known.
@@ -164,7 +166,6 @@ class Samples(_OnCells):
     by_sample: tuple[str, ...] = ()
     followed: tuple[str, ...] = ()
     ran_out: Array | None = None
-    triangle: Array | None = None
     pair: Array | None = None
 
 
@@ -178,7 +179,8 @@ class Request:
             of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None for
             centres.
         pairs: whether to compute `Samples.pair` of `points`, of surfaces that tell how their outlines move.
-        triangles: whether to record `Samples.triangle`.
+        triangles: whether to record `Cells.triangle`.
+        uniform: whether all samples look alike, so that one row may stand for all cells.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
@@ -186,6 +188,7 @@ class Request:
     points: Array | None = None
     pairs: bool = False
     triangles: bool = False
+    uniform: bool = False
     entry: Any = None
 
 

@@ -59,18 +59,16 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True):
         # Functions of surfaces want the arrays that they are given.
         known.append((part.transform, read, _proxy_inputs(part) if entry is None else None))
-    triangles = [own.triangle for own in sampled.samples]
-    inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
+    inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
     if traced or scene.layered or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, inputs)
     else:
-        row, depth, own = map_leaves(host_value, inputs[3:])
         entered = [map_leaves(host_value, x) for *_, x in inputs[0]]
-        centres = at_centres(row, depth, own, sampled.samples)
+        centres = at_centres(map_leaves(host_value, inputs[3]), sampled.samples)
         (here,), more = found_in_views([Points.of(scene, grid, entered)], [centres])
-        specs = Found.specs(0, grid.size, real_of(scene), len(row))
+        specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
@@ -109,7 +107,7 @@ def taken_rows(samples: Samples, index: Array) -> Samples:
 
     own = taken({"ids": samples.ids, "params": samples.params})
     gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
-    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer, triangle=None)
+    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer)
 
 
 def with_entries(scene: Scene, grid: Grid) -> Scene:
@@ -201,12 +199,12 @@ def _found_on_host(
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         given = iter(arrays)
         known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
-        of_parts, whole, camera, row, depth, own = known
+        of_parts, whole, camera, cells = known
         own_parts = zip(scene.parts, of_parts, strict=True)
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
         entered = [x for *_, x in of_parts]
         points = Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
-        (found,), more = found_in_views([points], [at_centres(row, depth, own, sampled.samples)], most)
+        (found,), more = found_in_views([points], [at_centres(cells, sampled.samples)], most)
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
@@ -256,26 +254,23 @@ def _with_tables(samples: Samples, arrays: dict[tuple[str, str], Array]) -> Samp
 def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
     """The cells of a scene whose parts have got further rows behind their own."""
     if sampled.one_part:
-        return sampled.cells
+        return replace(sampled.cells, triangle=None)
     row, counts = sampled.row, [own.ids.shape[-2] for own in sampled.samples]
     more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
     shift = engine_of(row).constant(np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), row)
     xp = namespace(row)
     moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
-    return replace(sampled.cells, row=xp.where(row >= 0, moved, row))
+    return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)
 
 
-def at_centres(
-    row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
-) -> Fronts:
-    """Surfaces seen at centres (K, H, W), from the `row` and `depth` of a scene, and its parts' triangles."""
-    counts = [own.ids.shape[-2] for own in samples]
-    of_samples = [np.full(n, -1, np.int32) if x is None else x for x, n in zip(triangles, counts, strict=True)]
-    of_samples = np.concatenate([*of_samples, np.full(1, -1, np.int32)])  # The last is read where nothing is seen.
-    part = np.minimum(row, np.int32(0))
-    for first in np.cumsum(counts)[:-1]:
-        part += row >= first
-    return Fronts(part, of_samples[row], depth.astype(np.float64))
+def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
+    """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
+    part = np.minimum(cells.row, np.int32(0))
+    for first in np.cumsum([own.ids.shape[-2] for own in samples])[:-1]:
+        part += cells.row >= first
+    triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
+    assert cells.depth is not None
+    return Fronts(part, triangle, cells.depth.astype(np.float64))
 
 
 def _refines(part: CheckedPart) -> bool:
@@ -454,7 +449,7 @@ class Points:
             points, fragments = np.full((1, 2), 0.5), None
         if fragments is not None:
             sampler = _OnTriangles(fragments)
-        request = Request(points=points, pairs=pairs, triangles=True, entry=entry)
+        request = Request(points=points, pairs=pairs, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" in samples.followed:
             return samples

@@ -25,7 +25,7 @@ from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
-from rts.sampling.packing import lift, triangles_of
+from rts.sampling.packing import lift
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
@@ -109,7 +109,7 @@ class Sampling:
         shape = Shape(layers, picture.size, capacity, picture.size)
         specs = {"view": shape.row_spec(np.int32)}
         if settings.finds_outlines:
-            specs["triangle"] = shape.row_spec(np.int32)
+            specs["triangle"] = ArraySpec((layers, *picture.size), np.int32)
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
             def drawn(built: Entry) -> tuple[Entry, Fragments, np.ndarray]:
@@ -123,7 +123,7 @@ class Sampling:
             counts = _counts(lifted.row, len(lifted.ids) if capacity is None else 0, picture)
             extras = {"view": _numbers(counts, len(lifted.ids))}
             if settings.finds_outlines:
-                extras["triangle"] = triangles_of(fragments, lifted)
+                extras["triangle"] = np.where(lifted.row >= 0, fragments.triangle_ids, np.int32(-1))
             return replace(lifted, overflow=np.asarray(over, np.int32)), extras
 
         samples, extras = HostCall(part, surface, cameras, shape, entry).samples(find, specs)

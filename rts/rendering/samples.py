@@ -72,7 +72,9 @@ def sampled_scene(scene: Scene, camera: Camera, size: tuple[int, int], settings:
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     scene = with_entries(scene, grid) if outlines else scene
-    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines))
+    # Inside of one colour nothing depends on where a sample lies.
+    uniform = outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
+    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines, uniform=uniform))
     layers = settings.layers
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:

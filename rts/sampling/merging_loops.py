@@ -9,31 +9,53 @@ from rts.compiling.threads import parallel, read_only
 
 
 def interleave(
-    rows: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...], layers: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rows: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...], triangles: tuple[np.ndarray, ...], layers: int
+) -> tuple[np.ndarray, ...]:
     """The nearest layers of several parts: part, row within it, and depth, (K, H, W) each; −1, −1 and 0 where empty.
+
+    If parts have triangles, those of the merged layers are a fourth result.
 
     Args:
         rows: `row` of each part, (L, H, W) int32, front to back.
         depths: depths of each part, (L, H, W).
+        triangles: triangles of each part, (L, H, W) int32; or empty.
         layers: K; fewer layers are returned if all parts together have fewer.
     """
     (_, height, width), kind = rows[0].shape, np.result_type(*depths)
     shape = (min(layers, sum(r.shape[0] for r in rows)), height, width)
-    given = [(read_only(r, np.int32), read_only(d, kind)) for r, d in zip(rows, depths, strict=True)]
+    told = shape if triangles else (0, height, width)
+    of_parts = triangles or [r[:0] for r in rows]
+    given = [
+        (read_only(r, np.int32), read_only(d, kind), read_only(t, np.int32))
+        for r, d, t in zip(rows, depths, of_parts, strict=True)
+    ]
     # One part after the other: earlier parts are merged already.
     before: tuple[np.ndarray, ...] = (np.empty((0, height, width), np.int32), *given[0])
     given += [tuple(x[:0] for x in given[0])] * (len(rows) == 1)  # A single part is merged with no layers.
     for number, own in enumerate(given[1:], start=1):
-        merged = tuple(np.empty(shape, dtype) for dtype in (np.int32, np.int32, kind))
+        merged = *(np.empty(shape, dtype) for dtype in (np.int32, np.int32, kind)), np.empty(told, np.int32)
         parallel(_merge, height, *map(read_only, before), *own, number, *merged, work=4 * merged[0].size)
         before = merged
-    part, row, depth = before
-    return part, row, depth
+    return before if triangles else before[:3]
 
 
 @loop
-def _merge(start, stop, part, row, depth, own_row, own_depth, number, merged_part, merged_row, merged_depth):
+def _merge(
+    start,
+    stop,
+    part,
+    row,
+    depth,
+    triangle,
+    own_row,
+    own_depth,
+    own_triangle,
+    number,
+    merged_part,
+    merged_row,
+    merged_depth,
+    merged_triangle,
+):
     """Fill lines [start, stop) of `merged_*` (K, H, W) with a part and the parts before it, which are merged already.
 
     Args:
@@ -42,14 +64,17 @@ def _merge(start, stop, part, row, depth, own_row, own_depth, number, merged_par
         part: (L, H, W) int32, of the parts before; no layers if part 0 alone came before.
         row: (L, H, W) int32, within its part, or −1.
         depth: (L, H, W) float.
+        triangle: (L, H, W) int32; no layers if triangles are not told, and then none have any.
         own_row: (M, H, W), of the part to merge.
         own_depth: (M, H, W).
+        own_triangle: (M, H, W).
         number: the part to merge, counted from 0.
         merged_part: to be filled; −1 in empty layers.
         merged_row: to be filled; −1 in empty layers.
         merged_depth: to be filled; 0 in empty layers.
+        merged_triangle: to be filled; −1 in empty layers.
     """
-    before, deepest, layers = len(row), len(own_row), len(merged_part)
+    before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(merged_triangle) > 0
     for y in range(start, stop):
         for x in range(row.shape[2]):
             a = b = 0
@@ -58,14 +83,21 @@ def _merge(start, stop, part, row, depth, own_row, own_depth, number, merged_par
                     a += 1
                 while b < deepest and own_row[b, y, x] < 0:
                     b += 1
+                told = -1
                 if b < deepest and (a == before or own_depth[b, y, x] < depth[a, y, x]):
                     merged_part[k, y, x], merged_row[k, y, x] = number, own_row[b, y, x]
                     merged_depth[k, y, x] = own_depth[b, y, x]
+                    if tells:
+                        told = own_triangle[b, y, x]
                     b += 1
                 elif a < before:
                     merged_part[k, y, x] = part[a, y, x] if len(part) > 0 else 0
                     merged_row[k, y, x], merged_depth[k, y, x] = row[a, y, x], depth[a, y, x]
+                    if tells:
+                        told = triangle[a, y, x]
                     a += 1
                 else:
                     merged_part[k, y, x] = merged_row[k, y, x] = -1
                     merged_depth[k, y, x] = 0
+                if tells:
+                    merged_triangle[k, y, x] = told

@@ -80,10 +80,3 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
         overflow=overflow,
         tables={name: packed(x) if name in samples.by_sample else x for name, x in samples.tables.items()},
     )
-
-
-def triangles_of(fragments: Fragments, samples: Samples) -> np.ndarray:
-    """(N,) int32, the triangle of each packed sample of fragments (K, ·, ·); 0 in rows that no cell names."""
-    triangles, covered = np.zeros(len(samples.ids), np.int32), samples.row >= 0
-    triangles[samples.row[covered]] = fragments.triangle_ids[covered]
-    return triangles

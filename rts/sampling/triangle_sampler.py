@@ -20,7 +20,7 @@ from rts.plugin_base import overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.layer_order import on_surface, refined
-from rts.sampling.packing import lift, repack, triangles_of
+from rts.sampling.packing import lift, repack
 from rts.sampling.points import at_points
 from rts.sampling.sample_checks import check_faces, check_fragments, checked_proxy
 from rts.scene.camera import Camera
@@ -184,13 +184,13 @@ class TriangleSampler(Sampler):
         tables, moves = shape.tables(surface) if refines else {}, refines and surface.refine_moves
         beside = {
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
-            **({"triangle": shape.row_spec(np.int32)} if request.triangles and not moves else {}),
+            **({"triangle": ArraySpec((layers, *cells), np.int32)} if request.triangles and not moves else {}),
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *given: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(given[0], np.float64)[None] if given else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, entry, own)
-            samples = search.moved() if moves else search.in_place()
+            samples = search.moved() if moves else search.in_place(request.uniform)
             return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
@@ -259,17 +259,20 @@ class _Search:
     entry: Entry | None
     points: np.ndarray | None
 
-    def in_place(self) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them."""
+    def in_place(self, uniform: bool) -> Samples:
+        """Samples on the triangles, or refined by a surface that does not move them; `uniform` as in `Request`."""
         known, fragments, covered = self._drawn(self.shape.layers)
+        ids, capacity = fragments.triangle_ids, self.shape.capacity
         if not self.surface.refines:
-            packed = lift(fragments, known.proxy, self.shape.capacity, covered)
-        else:
-            lifted = lift(fragments, known.proxy, None, covered)
-            given = self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.points
-            samples, _ = refined(*given)
-            packed = repack(samples, samples.row >= 0, self.shape.capacity)
-        return packed.replace(triangle=triangles_of(fragments, packed))
+            if uniform:
+                return _of_one_row(lift(fragments, known.proxy, capacity, _first_of(covered)), covered, fragments)
+            packed = lift(fragments, known.proxy, capacity, covered)
+            return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
+        lifted = lift(fragments, known.proxy, None, covered)
+        given = self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.points
+        samples, _ = refined(*given)
+        packed = repack(samples, samples.row >= 0, capacity)
+        return packed.replace(triangle=np.where(packed.row >= 0, ids, np.int32(-1)))
 
     def moved(self) -> Samples:
         """Samples that the surface moves off its triangles, with `ran_out`."""
@@ -300,6 +303,20 @@ class _Search:
             return known, fragments, check_fragments(fragments, grid, count, sampler)
 
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
+
+
+def _first_of(covered: np.ndarray) -> np.ndarray:
+    """The mask `covered` with only its first cell; none if there is none."""
+    first = np.zeros_like(covered)
+    at = covered.argmax()
+    first.reshape(-1)[at] = covered.reshape(-1)[at]
+    return first
+
+
+def _of_one_row(samples: Samples, covered: np.ndarray, fragments: Fragments) -> Samples:
+    """Samples of one row, which all covered cells name."""
+    row = covered.view(np.int8).astype(np.int32) - np.int32(1)
+    return samples.replace(row=row, depth=fragments.depth, triangle=fragments.triangle_ids)
 
 
 def _of_triangles(surface: Any) -> TriangleSurface:
