@@ -210,7 +210,7 @@ def check_splatter(chosen: Any) -> Splatter:
 
 def splatter_of(chosen: Any, outlines: bool) -> Splatter:
     """A usable splatter, as `check_splatter`; of samples with outlines between them, or without, if "auto" is given."""
-    return check_splatter("visible" if is_auto(chosen) and not outlines else chosen)
+    return check_splatter("edges" if is_auto(chosen) and not outlines else chosen)
 
 
 def is_auto(chosen: Any) -> bool:

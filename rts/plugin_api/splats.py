@@ -1,7 +1,7 @@
-"""The splatters in array code, which compiled ones extend, and cells at outlines."""
+"""Splatters that plugins may extend, the check of rows before compiled loops read by them, and cells at outlines."""
 
 from rts.sampling.exits import outline_cells
-from rts.splatting.single_and_multi import Multi, Single
-from rts.splatting.visible import Visible
+from rts.splatting.cells import check_rows
+from rts.splatting.paper import Multi, Single
 
-__all__ = ["Multi", "Single", "Visible", "outline_cells"]
+__all__ = ["Multi", "Single", "check_rows", "outline_cells"]

@@ -118,7 +118,7 @@ class RenderSettings:
     @property
     def reader(self) -> Splatter:
         """The splatter whose `reads` and `reach` guide sampling: the given one, or the one that reads most."""
-        return self.splatter if isinstance(self.splatter, Splatter) else check_splatter("visible")
+        return self.splatter if isinstance(self.splatter, Splatter) else check_splatter("edges")
 
     @property
     def apron(self) -> int:

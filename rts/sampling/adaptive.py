@@ -154,8 +154,6 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
             None if no cell is settled.
     """
     from rts.sampling import adaptive_loops
-    from rts.splatting.kernel import TIE
-    from rts.splatting.visible import CONTINUED
 
     settled = np.empty((0, row.shape[2]), np.int8) if settled is None else settled
     depth, kind = read_only(depth), depth.dtype.type
@@ -167,7 +165,7 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
         read_only(settled, np.int8),
         depth,
         np.cumsum(sizes)[:-1],
-        *map(kind, (beyond, TIE * max(largest, -least), CONTINUED)),
+        *map(kind, (beyond, 1.5e-4 * max(largest, -least), 0.8)),
     )
     parallel(adaptive_loops.mark, len(marks), *arguments, marks, work=4 * row.size)
     return marks.view(bool)

@@ -16,7 +16,6 @@ from rts.contracts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, missed, visible_outlines
 from rts.sampling.hidden import HiddenRule, planned, with_layers_that_count
 from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, Room, arranged, lay_out, of_engine, rounded
-from rts.splatting.layers import dilated
 
 FEW = 1 / 6
 """A share of all pixels at outlines that few images exceed: compiled programs have a branch with room for these."""
@@ -167,3 +166,10 @@ def fine_samples(
     taken = partial(take, listed=layout.cells, capacity=allotted)
     sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known, where.opaque)
     return replace(arranged(sampled, layout, grid), flat=flat)
+
+
+def dilated(cells: np.ndarray) -> np.ndarray:
+    """The marks (H, W), bool or uint8, spread to the eight cells around each."""
+    wide = np.pad(cells, ((1, 1), (0, 0)))
+    wide = np.pad(wide[:-2] | wide[1:-1] | wide[2:], ((0, 0), (1, 1)))
+    return wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
