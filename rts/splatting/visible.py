@@ -15,7 +15,7 @@ class Visible(Edges):
         """Warn; settings of the former splatter are an InputError."""
         if settings or options:
             raise InputError(
-                f"splatter 'visible' is now 'edges', which has no settings, and got "
-                f"{', '.join([*map(repr, settings), *options])}; take splatter='edges', or 'multi' for a Gaussian kernel"
+                f"splatter 'visible' is now 'edges', which has no settings; it was given "
+                f"{', '.join([*map(repr, settings), *options])}; take splatter='edges', or 'multi'"
             )
         warn_deprecated("splatter 'visible'", "'edges', which it now is", until="0.4")
