@@ -18,7 +18,7 @@ from rts.errors import InputError
 from rts.sampling.packing import covered_cells
 from rts.scene.camera import Camera
 from rts.scene.topology import table_extent
-from rts.splatting.layers import check_rows
+from rts.splatting.cells import check_rows
 
 
 def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
