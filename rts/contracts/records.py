@@ -166,7 +166,8 @@ class Samples(_OnCells):
         params: (N, P) float32, such as barycentrics; in θ's own dtype if they were computed on the device.
         cells: the index of the sample in each cell.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
-        tables: further arrays of the surface by name, filled by its `refine`.
+        tables: further arrays of the surface by name, filled by its `refine`. If samples share one (see `by_sample`),
+            all `ids` are rows of it, so that samples can be joined.
         gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
         asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.

@@ -271,7 +271,9 @@ class TriangleSurface(Surface):
                 tables may have any length up to that of their specs, which then set `packed=True`.
 
         Returns:
-            Name → spec; none by default. The core sets the number of rows of tables `by_sample`.
+            Name → spec; none by default. The core sets the number of rows of tables `by_sample`. Other tables are
+            shared by samples, whose `ids` are rows of them, all of one length. Where further samples join the first
+            ones, their tables are appended, and their ids are shifted by the rows before.
         """
         return {}
 

@@ -74,11 +74,11 @@ class RenderSettings:
         """The settings for a scene: with a splatter, and a number of layers where values are traced.
 
         "auto" is "edges", but "visible" where light passes through surfaces whose outlines are not found layer by
-        layer, or no samples can be added.
+        layer.
         """
         splatter, layers, opaque = self.splatter, self.layers, all(scene.opaque)
         if splatter == "auto":
-            splatter = splatter_of("auto", outlines=scene.joinable and (opaque or scene.layered))
+            splatter = splatter_of("auto", outlines=opaque or scene.layered)
         if layers == "auto" and scene.traced:
             layers = TRACED_LAYERS[opaque]
         settings = replace(self, splatter=splatter, layers=layers)
