@@ -260,7 +260,7 @@ class Request:
         hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
         facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
         exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them; of `points`
-            at all of them, and then for fields alone.
+            at all of them, which are just inside of outlines, and then for fields alone.
         between: whether to compute `Cells.between`, of all cells of the grid.
         triangles: whether to record `Samples.triangle`.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.

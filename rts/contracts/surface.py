@@ -214,12 +214,14 @@ class TriangleSurface(Surface):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
         """Pairs of samples that tell how outlines move, on the host; see `RaySurface.deepest`.
 
-        Called for cells at outlines of surfaces with a `refine` that does not move samples.
+        Called for cells at outlines, or for points just inside of them, of surfaces with a `refine` that does not move
+        samples.
 
         Args:
             inputs: the result of `proxy_inputs`, on the host.
             rays: the rays (R, 3), local space.
-            beside: the rays (R, 8, 3) of the eight cells around each, NaN for those towards which its front goes on.
+            beside: the rays (R, 8, 3) of the eight cells around each, NaN for those towards which its front is known to
+                go on.
             depth: (R,), the depth of each ray's front.
             tables: the tables that `refine` filled. None may be `by_sample`.
 

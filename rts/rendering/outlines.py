@@ -15,6 +15,7 @@ from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
+from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
 from rts.rendering.scene import Grid, Scene, has_sheets
@@ -191,7 +192,8 @@ def _found_on_host(
 ) -> tuple[Found, list[Samples]]:
     """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
     owners, layers = [_tables(own) for own in sampled.samples], sampled.row.shape[0]
-    rows = _columns(layers)[0] * (most or 0)
+    # Where a break has a pair, its last sample is there once more.
+    rows = (_columns(layers)[0] + 1) * (most or 0)
     room = [_rooms(*own, rows, capacity) for own in zip(scene.parts, sampled.samples, strict=True)]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
@@ -411,15 +413,19 @@ class Points:
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
 
-        They are added to the samples of parts. Triangles have no kinks within, and no pairs.
+        They are added to the samples of parts. Triangles that stand for no field have no pairs.
         """
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
         for own, known in enumerate(self._parts):
             at = np.flatnonzero(part == own)
-            if isinstance(known[0], TriangleSampler) or not len(at):
+            surface, points, triangles = self._scene.parts[own].surface, breaks.points, breaks.triangles
+            drawn = isinstance(known[0], TriangleSampler)
+            if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
                 continue
-            more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
+            chosen = at, breaks.near[at]
+            fragments = self.on_sheets(own, points[chosen], triangles[chosen]) if drawn else None
+            more = self.sample(own, points[chosen], fragments, exits=True)
             if more.exit is not None and len(more.exit) == 2:
                 found = host_value(more.exit)[:, 0].T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)

@@ -63,6 +63,10 @@ def outline_ends(
     """
     from rts.sampling import exits_loops
 
+    if cells is not None and cells.ndim == 3:
+        # Points are all at outlines; on which side these are is unknown.
+        there = np.flatnonzero(covered[0]).astype(np.int32)
+        return there, np.full(len(there), 255, np.uint8)
     if cells is not None:
         listed, layers = np.flatnonzero(cells >= 0), len(covered)
         own = cells.reshape(-1)[listed]
@@ -99,7 +103,8 @@ def with_pairs(
         inputs: the result of its `proxy_inputs`, on the host.
         rays: the rays of the samples' rows.
         steps: (2, 3), changes of rays from a cell to the next one, along x and along y; see `layer_order.steps_of`.
-        listed: (L, C), the cells of the samples; None for all. See `outline_cells`.
+        listed: (L, C), the cells of the samples; or points (L, C, 2), all at outlines; None for all cells. See
+            `outline_cells`.
         size: (height, width) of the grid.
         specs: the result of the surface's `table_specs`.
 

@@ -80,6 +80,7 @@ def repack(
     kept: np.ndarray,
     capacity: int | None,
     pairs: tuple[np.ndarray, np.ndarray] | None = None,
+    more: int = 0,
 ) -> Samples:
     """Samples of the cells that are kept, packed anew and numbered layer by layer; pairs at outlines get the last rows.
 
@@ -89,6 +90,7 @@ def repack(
         capacity: rows to allot, zeros where they are not used; None for as many as are kept, at least one.
         pairs: ids (2 M, I) and params (2 M, P) of pairs, for the M cells that have an exit, in order. Those that find
             no room are left out.
+        more: without a capacity there is room for a row a cell, and for so many more.
     """
     index = samples.row[kept]
     rows = max(1, len(index)) if capacity is None else capacity
@@ -97,7 +99,7 @@ def repack(
     index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
     exits, count, last = samples.exit, len(index), len(index)
     if exits is not None and pairs is not None:
-        rows = min(rows + len(pairs[0]), max(1, samples.row.size)) if capacity is None else rows
+        rows = min(rows + len(pairs[0]), max(1, samples.row.size + more)) if capacity is None else rows
         cells = tuple(x[: (rows - count) // 2] for x in np.nonzero(exits[0] >= 0))
         exits, last = np.full_like(exits, -1), count + 2 * len(cells[0])
         exits[:, *cells] = np.arange(count, last, dtype=np.int32).reshape(-1, 2).T

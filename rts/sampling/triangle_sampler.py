@@ -256,7 +256,8 @@ class TriangleSampler(Sampler):
         listed, hidden, entry = request.cells, request.hidden, request.entry
         if request.points is not None:
             listed = request.points[None, ...]
-        shape = Shape(layers, size if listed is None else tuple(listed.shape[:2]), request.capacity, size)
+        more = 0 if request.points is None or not request.exits else 2 * layers * len(request.points)
+        shape = Shape(layers, size if listed is None else tuple(listed.shape[:2]), request.capacity, size, more)
         refines = surface.refines
         tables, moves = shape.tables(surface) if refines else {}, refines and surface.refine_moves
         sides = request.facing and layers > 1 and part.cull == "none" and not moves
@@ -399,7 +400,7 @@ class _Search:
         if pairs:
             given = rays, steps_of(self.camera, self.shape.view), self.cells, self.shape.view, self.tables
             samples, further = with_pairs(samples, self.surface, self.inputs, *given)
-        repacked = repack(samples, samples.row >= 0, self.shape.capacity, further)
+        repacked = repack(samples, samples.row >= 0, self.shape.capacity, further, self.shape.more)
         return repacked.replace(facing=facing, between=between, triangle=triangles_of(fragments, repacked))
 
     def moved(self) -> Samples:
