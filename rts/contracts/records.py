@@ -142,7 +142,8 @@ class Samples(_OnCells):
         params: (N, P) float32, such as barycentrics; in θ's own dtype if they were computed on the device.
         cells: the index of the sample in each cell.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
-        tables: further arrays of the surface by name, filled by its `refine`.
+        tables: further arrays of the surface by name, filled by its `refine`. If samples share one (see `by_sample`),
+            all `ids` are rows of it, so that samples can be joined.
         gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
         asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
@@ -178,7 +179,8 @@ class Request:
         points: (M, 2) float64, x and y in cells from the grid's upper left corner: the only points to sample, in place
             of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None for
             centres.
-        pairs: whether to compute `Samples.pair` of `points`, of surfaces that tell how their outlines move.
+        pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
+            move.
         triangles: whether to record `Cells.triangle`.
         uniform: whether all samples look alike, so that one row may stand for all cells.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.

@@ -14,10 +14,11 @@ from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.errors import InputError, InputWarning, warn
+from rts.errors import InputWarning, warn
+from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
-from rts.rendering.scene import Grid, Scene, has_sheets, shares_tables
+from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.segments import joined
@@ -39,20 +40,12 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         scene: the scene.
         grid: the cells.
         capacity: `Request.capacity`. Where values are traced, there is room for a quarter as many breaks, or for 8 a
-            row and a column of the grid, if that is more. `overflow` counts those beyond.
-
-    Raises:
-        InputError: samples of a surface share a table.
+            row and a column of the grid, if that is more, or for fewer if a shared table has no room for their samples.
+            `overflow` counts those beyond.
 
     Warns:
         InputWarning: a sampler cannot sample single points.
     """
-    for part in scene.parts:
-        if shares_tables(part.surface):
-            raise InputError(
-                f"samples of {part.surface!r} share a table, to which those beside outlines cannot be added; "
-                f"use table=False, or splatter='visible'"
-            )
     cells, known = sampled.cells, []
     if all(scene.opaque) or not scene.layered:
         sampled = replace(sampled, cells=cells.first(1))
@@ -63,7 +56,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     traced = any(map(is_traced, leaves(inputs)))
     if traced or scene.layered or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
-        found, more = _found_on_host(sampled, scene, grid, most, inputs)
+        found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:
         entered = [map_leaves(host_value, x) for *_, x in inputs[0]]
         centres = at_centres(map_leaves(host_value, inputs[3]), sampled.samples)
@@ -107,7 +100,8 @@ def taken_rows(samples: Samples, index: Array) -> Samples:
 
     own = taken({"ids": samples.ids, "params": samples.params})
     gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
-    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer)
+    tables = {**samples.tables, **taken({name: samples.tables[name] for name in samples.by_sample})}
+    return replace(samples, **own, tables=tables, gbuffer=gbuffer)
 
 
 def with_entries(scene: Scene, grid: Grid) -> Scene:
@@ -191,10 +185,13 @@ class Found(NamedTuple):
 
 
 def _found_on_host(
-    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, inputs: Tree
+    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, capacity: int | None, inputs: Tree
 ) -> tuple[Found, list[Samples]]:
     """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
-    owners = [_tables(own) for own in sampled.samples]
+    owners, layers = [_tables(own) for own in sampled.samples], sampled.row.shape[0]
+    # Where a break has a pair, its last sample is there once more.
+    rows = (_columns(layers)[0] + 1) * (most or 0)
+    room = [_rooms(*own, rows, capacity) for own in zip(scene.parts, sampled.samples, strict=True)]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         given = iter(arrays)
@@ -204,7 +201,11 @@ def _found_on_host(
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
         entered = [x for *_, x in of_parts]
         points = Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
-        (found,), more = found_in_views([points], [at_centres(cells, sampled.samples)], most)
+        centres, count = at_centres(cells, sampled.samples), most
+        (found,), more = found_in_views([points], [centres], count)
+        while count and not all(map(_has_room, more, room)):
+            count //= 2
+            (found,), more = found_in_views([points], [centres], count)
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
@@ -212,12 +213,13 @@ def _found_on_host(
             arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
         return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
 
-    layers = sampled.row.shape[0]
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
     specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
-    for x in (x for own in owners for x in own.values()):
-        dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
-        specs.append(ArraySpec((_columns(layers)[0] * (most or 0), *x.shape[1:]), dtype, packed=True))
+    for own, rooms in zip(owners, room, strict=True):
+        for (kind, name), x in own.items():
+            dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
+            count = rooms.get(name, rows) if kind == "tables" else rows
+            specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
     found = Found(*(next(results) for _ in Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
@@ -232,6 +234,20 @@ def real_of(scene: Scene) -> Any:
     """The dtype of a scene's floating arrays."""
     like = scene.context.like
     return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
+
+
+def _rooms(part: CheckedPart, samples: Samples, rows: int, capacity: int | None) -> dict[str, int]:
+    """The numbers of rows, by name, of tables that so many further samples of a part share."""
+    surface, names = part.surface, set(samples.tables) - set(samples.by_sample)
+    if not names or not isinstance(surface, TriangleSurface):
+        return {}
+    specs = surface.table_specs(rows, None if capacity is None else rows)
+    return {name: specs[name].shape[0] for name in names}
+
+
+def _has_room(samples: Samples, room: Mapping[str, int]) -> bool:
+    """True if tables have no more rows than there is room for."""
+    return all(samples.tables[name].shape[0] <= count for name, count in room.items())
 
 
 def _tables(samples: Samples) -> dict[tuple[str, str], Array]:
@@ -391,15 +407,19 @@ class Points:
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
 
-        They are added to the samples of parts. Triangles have no kinks within, and no pairs.
+        They are added to the samples of parts. Triangles that stand for no field have no pairs.
         """
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
         for own, known in enumerate(self._parts):
             at = np.flatnonzero(part == own)
-            if isinstance(known[0], TriangleSampler) or not len(at):
+            surface, points, triangles = self._scene.parts[own].surface, breaks.points, breaks.triangles
+            drawn = isinstance(known[0], TriangleSampler)
+            if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
                 continue
-            more = self.sample(own, breaks.points[at, breaks.near[at]], pairs=True)
+            chosen = at, breaks.near[at]
+            fragments = self.on_sheets(own, points[chosen], triangles[chosen]) if drawn else None
+            more = self.sample(own, points[chosen], fragments, pairs=True)
             if more.pair is not None:
                 found = host_value(more.pair).T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)

@@ -6,6 +6,7 @@ Only the triangles are drawn view by view.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -191,13 +192,11 @@ def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
 
 
 def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | None:
-    """One picture of views that were sampled one by one; None if their samples cannot share a table."""
+    """One picture of views that were sampled one by one; None if it is unknown which of their rows are in use."""
     first, engine = views[0], engine_of(views[0].row)
-    for view in views:
-        # With outlines, all rows pass for used.
-        unknown = engine.padded(view.row) and view.outlines is None
-        if unknown or any(set(s.by_sample) != set(s.tables) for s in view.samples):
-            return None
+    # With outlines, all rows pass for used.
+    if any(engine.padded(view.row) and view.outlines is None for view in views):
+        return None
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
     # Rows are numbered part by part, in each view and in the picture.
@@ -228,15 +227,20 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
-    """Samples of one part in several views as one table, view after view; cells are those of the first view alone."""
+    """Several samples of one part as one, with the cells of the first alone; `ids` become rows of a shared table."""
     if len(samples) == 1:
         return samples[0]
     first, xp = samples[0], namespace(samples[0].ids)
+    shared = [name for name in first.tables if name not in first.by_sample]
     tables = {name: xp.concat([s.tables[name] for s in samples]) for name in first.tables}
     gbuffer = None
     if first.gbuffer is not None:
         gbuffer = {name: xp.concat([(s.gbuffer or {})[name] for s in samples]) for name in first.gbuffer}
-    ids, params = xp.concat([s.ids for s in samples]), xp.concat([s.params for s in samples])
+    ids, start = [first.ids], 0
+    for before, own in itertools.pairwise(samples):
+        start += before.tables[shared[0]].shape[0] if shared else 0
+        ids.append(own.ids + start)
+    ids, params = xp.concat(ids), xp.concat([s.params for s in samples])
     return replace(first, ids=ids, params=params, tables=tables, gbuffer=gbuffer)
 
 

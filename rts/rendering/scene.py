@@ -9,7 +9,7 @@ from rts.arrays.engines import Context, context_of_scene, is_traced
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
-from rts.contracts.surface import Surface, TriangleSurface
+from rts.contracts.surface import TriangleSurface
 from rts.sampling.prepared import Prepared
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.sampling.winding import warn_of_winding
@@ -51,11 +51,6 @@ class Scene(NamedTuple):
         return all(map(has_sheets, self.parts, self.chosen()))
 
     @property
-    def joinable(self) -> bool:
-        """True if samples can be added to those of all parts: no surface has a table that its samples share."""
-        return not any(shares_tables(part.surface) for part in self.parts)
-
-    @property
     def read(self) -> list[dict[str, Tree]]:
         """The entries of each part's θ that its surface reads."""
         return [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in self.parts]
@@ -92,13 +87,6 @@ class Scene(NamedTuple):
         """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""
         context = context_of_scene(self.parts, self.camera, *others)
         return context if context.engine.differentiates else self.context
-
-
-def shares_tables(surface: Surface) -> bool:
-    """True if samples of a surface share a table, so that none can be added."""
-    if not (isinstance(surface, TriangleSurface) and surface.refines):
-        return False
-    return not all(spec.by_sample for spec in surface.table_specs(1, None).values())
 
 
 def has_sheets(part: CheckedPart, sampler: Sampler) -> bool:

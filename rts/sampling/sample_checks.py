@@ -270,6 +270,15 @@ def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> 
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
     tables = _checked_tables(refined.tables, lifted, who)
+    shared = [name for name in tables if name not in lifted.by_sample]
+    if shared:
+        lengths = {(len(tables[name]), len(lifted.tables[name])) for name in shared}
+        used, (count, _) = ids[row[covered]], next(iter(lengths))
+        if len(lengths) > 1 or used.min(initial=0) < 0 or used.max(initial=0) >= max(1, count):
+            raise InputError(
+                f"{who} gave ids from {used.min(initial=0)} to {used.max(initial=0)}, and tables {sorted(shared)} of "
+                f"{count} rows that samples share; expected tables of one length, and ids that are rows of them"
+            )
     return lifted.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 

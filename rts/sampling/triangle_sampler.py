@@ -21,6 +21,7 @@ from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.layer_order import on_surface, refined
 from rts.sampling.packing import lift, repack
+from rts.sampling.pairs import with_pairs
 from rts.sampling.points import at_points
 from rts.sampling.sample_checks import check_faces, check_fragments, checked_proxy
 from rts.scene.camera import Camera
@@ -180,17 +181,21 @@ class TriangleSampler(Sampler):
         surface, camera = _of_triangles(part.surface), camera.for_size(size)
         points, entry = request.points, request.entry
         cells = size if points is None else (1, points.shape[0])
-        shape, refines = Shape(layers, cells, request.capacity, size), surface.refines
-        tables, moves = shape.tables(surface) if refines else {}, refines and surface.refine_moves
+        refines, moves = surface.refines, surface.refines and surface.refine_moves
+        pairs = request.pairs and points is not None and refines and not moves
+        pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
+        shape = Shape(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
+        tables = shape.tables(surface) if refines else {}
         beside = {
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
+            **({"pair": ArraySpec((2, cells[1]), np.int32)} if pairs else {}),
             **({"triangle": ArraySpec((layers, *cells), np.int32)} if request.triangles and not moves else {}),
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *given: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(given[0], np.float64)[None] if given else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, entry, own)
-            samples = search.moved() if moves else search.in_place(request.uniform)
+            samples = search.moved() if moves else search.in_place(request.uniform, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
@@ -259,8 +264,8 @@ class _Search:
     entry: Entry | None
     points: np.ndarray | None
 
-    def in_place(self, uniform: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them; `uniform` as in `Request`."""
+    def in_place(self, uniform: bool, pairs: bool) -> Samples:
+        """Samples on the triangles, or refined by a surface that does not move them; arguments as in `Request`."""
         known, fragments, covered = self._drawn(self.shape.layers)
         ids, capacity = fragments.triangle_ids, self.shape.capacity
         if not self.surface.refines:
@@ -269,9 +274,11 @@ class _Search:
             packed = lift(fragments, known.proxy, capacity, covered)
             return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
         lifted = lift(fragments, known.proxy, None, covered)
-        given = self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.points
-        samples, _ = refined(*given)
+        surface, inputs, camera, view, points = self.surface, self.inputs, self.camera, self.shape.view, self.points
+        samples, _ = refined(surface, inputs, lifted, camera, self.tables, view, points)
         packed = repack(samples, samples.row >= 0, capacity)
+        if pairs and points is not None:
+            packed = with_pairs(packed, surface, inputs, camera, view, points, self.tables)
         return packed.replace(triangle=np.where(packed.row >= 0, ids, np.int32(-1)))
 
     def moved(self) -> Samples:
