@@ -20,7 +20,6 @@ from rts_compare.chart_style import (
     samples_label,
     side_length,
 )
-from rts_compare.compared_settings import finest, samples_of
 from rts_compare.pareto_front import Row, milliseconds
 
 if TYPE_CHECKING:
@@ -147,9 +146,9 @@ def _ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int | str, bool], list[Row]]:
-    """(Colour, symbol, `Setting.supersample`, True on the Pareto front) → the rows that look so."""
-    found: dict[tuple[str, str, int | str, bool], list[Row]] = {}
+def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int, bool], list[Row]]:
+    """(Colour, symbol, samples along a pixel's side, True on the Pareto front) → the rows that look so."""
+    found: dict[tuple[str, str, int, bool], list[Row]] = {}
     for row in rows:
         settings = row["settings"]
         symbol = looks.samplers[settings["sampler"]] + looks.engines[settings["engine"]]
@@ -162,8 +161,8 @@ def _places(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
     return [milliseconds(row) for row in rows], [row["error"] for row in rows]
 
 
-def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str, Any]]:
-    """Keyword arguments of matplotlib's lines that draw a symbol: its shape, its dot, the bar of adaptive samples."""
+def _marks(symbol: str, color: str, supersample: int = 1) -> list[dict[str, Any]]:
+    """Keyword arguments of matplotlib's lines that draw a symbol: its shape, and its dot."""
     shape, hollow, dot = symbol.removesuffix("-dot").removesuffix("-open"), "-open" in symbol, symbol.endswith("-dot")
     size = 0.72 * side_length(supersample)  # Points of 1/72 inch.
     mark = {"marker": MARKERS[shape], "markersize": size, "linestyle": "none", "markeredgewidth": 0.9}
@@ -171,14 +170,7 @@ def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str
     if dot:
         inner = color if hollow else "white"
         marks.append({**mark, "marker": ".", "markersize": 0.6 * size, "color": inner, "markeredgewidth": 0})
-    if isinstance(supersample, str):
-        marks.append({**mark, "marker": "_", "markersize": 1.8 * size, "markeredgecolor": color})
     return marks
-
-
-def _order(supersample: int | str) -> tuple[bool, int, str]:
-    """The sorting key of a `Setting.supersample` in the legend: numbers first, then adaptive ones, by fineness."""
-    return isinstance(supersample, str), finest(samples_of(supersample)), str(supersample)
 
 
 DIRECTIONS = ((-0.7, -0.7), (-1.0, -0.2), (-0.2, -1.0))
@@ -234,7 +226,7 @@ def _legend(figure: Figure, rows: Sequence[Row], looks: Looks) -> None:
     from matplotlib.legend_handler import HandlerTuple
     from matplotlib.lines import Line2D
 
-    sides = sorted({row["settings"]["supersample"] for row in rows if "peer" not in row}, key=_order)
+    sides = sorted({row["settings"]["supersample"] for row in rows if "peer" not in row})
     sections = {
         "splatter": {name: _marks("circle", color) for name, color in looks.splatters.items()},
         "sampler": {name: _marks(symbol, PALE) for name, symbol in looks.samplers.items()},
