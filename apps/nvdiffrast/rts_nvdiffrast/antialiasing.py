@@ -205,7 +205,8 @@ def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, drawn: Drawn) 
     if drawn.layer:
         still = part.replace(shader=_Colors(shaded, color.detach()))
         return _peeled(part, still, camera, background, drawn)
-    sampled = rts.sample(part, camera, color.shape[:2], sampler="raster", splatter="edges", supersample=drawn.samples)
+    size, samples = (color.shape[0], color.shape[1]), drawn.samples
+    sampled = rts.sample(part, camera, size, sampler="raster", splatter="edges", supersample=samples)
     return _over(rts.render_samples(sampled, part, camera, splatter="edges"), background)
 
 
@@ -219,7 +220,7 @@ def _peeled(
     """
     more, first = max(PEELED, drawn.samples), drawn.layer
     options = {"sampler": "raster", "splatter": None, "supersample": more, "layers": first + 2}
-    sampled = rts.sample(part, camera, background.shape[:2], **options)
+    sampled = rts.sample(part, camera, (background.shape[0], background.shape[1]), **options)
     layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n, None)) is not None}
     sampled = sampled.replace(**layers)
     value = _over(rts.render_samples(sampled, part, camera, splatter="none"), background)
