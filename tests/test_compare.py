@@ -636,7 +636,7 @@ class TestMisuse:
             (dict(scene=nothing, parameters={"a": "b"}), "parameters holds 'b'; expected arrays of real numbers"),
             (dict(scene=lambda p: 1 / 0, parameters=np.zeros(2)), "fails: ZeroDivisionError"),
             (dict(scene="thin wires", samplers=[]), "samplers is .*; expected a list of names"),
-            (dict(scene="thin wires", splatters="edges"), "splatters is 'visible'; expected a list of names"),
+            (dict(scene="thin wires", splatters="edges"), "splatters is 'edges'; expected a list of names"),
             (dict(scene="thin wires", directions={}), "only functions of parameters have them"),
             (
                 dict(scene=nothing, parameters=np.zeros(2), directions={"a": np.zeros(3)}),

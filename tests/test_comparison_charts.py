@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PROPERTIES
 
-import rts
 from rts import InputError, PluginError
 from rts_compare import chart_style
 from rts_compare.html_page import write_page
