@@ -45,8 +45,8 @@ INK, PALE = "#1f2937", "#6b7280"
 COLUMNS = 2
 PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
 """Inches; `LINE_HEIGHT` is the height of a text line in the list under a panel."""
-CHARACTER_WIDTH = 0.075
-"""Width of a character in the text below all panels, inches."""
+CHARACTER_WIDTH, TITLE_CHARACTER_WIDTH = 0.075, 0.1
+"""Width of a character in the text below all panels, and of one above them, inches."""
 LONGEST = 84
 """The most characters of a text line in the list under a panel."""
 
@@ -96,11 +96,12 @@ def draw(comparison: Mapping[str, Any], path: Path) -> None:
 
 
 def _texts(figure: Figure, comparison: Mapping[str, Any]) -> None:
-    """Write the scene's name, size and note above the panels, and the environment below them."""
-    scene = comparison["scene"]
-    title = f"{scene['name']}, {' × '.join(map(str, scene['size']))}"
-    note = f"\n{scene['note']}" if scene.get("note") else ""
-    figure.suptitle(title + note, fontsize=13, color=INK, parse_math=False)
+    """Write the scene's name, size and note above the panels, left of the legend, and the environment below them."""
+    scene, width = comparison["scene"], figure.get_figwidth() - LEGEND_WIDTH
+    lines = [f"{scene['name']}, {' × '.join(map(str, scene['size']))}"]
+    lines += textwrap.wrap(scene.get("note", ""), int(width / TITLE_CHARACTER_WIDTH))
+    middle = width / figure.get_figwidth() / 2
+    figure.suptitle("\n".join(lines), x=middle, fontsize=13, color=INK, parse_math=False)
     where = textwrap.fill(environment_line(comparison["environment"]), int(figure.get_figwidth() / CHARACTER_WIDTH))
     figure.supxlabel(where, fontsize=8, color=PALE, parse_math=False)
 
