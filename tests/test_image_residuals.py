@@ -216,9 +216,7 @@ def test_supersampled_images_are_swept_to_the_normal_equations_of_their_jacobian
 @targets
 def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
     goal, weights = fields(3)
-    residuals = rts.ImageResiduals(
-        scene, CAMERA, SIZE, goal, weights=weights, supersample=3, splatter="visible", layers=2
-    )
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, supersample=3, layers=2)
     whole = residuals.normal_equations(start(target))
     sweeps = count_sweeps(monkeypatch)
     monkeypatch.setattr(settings, "BAND", 3000)

@@ -217,7 +217,7 @@ def test_triangles_that_are_not_there_are_refused_beside_exits(wrong, target):
     part = card(0.0)
     part = part.replace(theta=arrays(target, dict(part.theta)), cull="back")
     with refused(f"triangle {wrong}"):
-        rts.render(part, CAMERA, SIZE, sampler=Wrong(), splatter="visible", layers=2)
+        rts.render(part, CAMERA, SIZE, sampler=Wrong())
 
 
 def test_triangles_that_are_not_there_are_refused_when_they_are_packed():

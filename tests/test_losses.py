@@ -273,7 +273,6 @@ def test_every_way_has_the_same_number():
     several = rts.ImageResiduals(
         *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2),
         weights=[weights] * 2,
-        splatter="visible",
         layers=2,
         **options,
     )

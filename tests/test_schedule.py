@@ -35,7 +35,7 @@ def turned(size, *, channels=1, camera=CAMERA, **options):
     """Residuals of a block's pose, whose target is the block at POSE."""
     part, options = block("silhouette" if channels == 1 else "unlit"), {"splatter": "visible", "layers": 2} | options
     moved = lambda p: part.replace(transform=rts.rigid(p))  # noqa: E731
-    goal = rts.render(moved(POSE), camera, size, splatter="visible", layers=2)
+    goal = rts.render(moved(POSE), camera, size)
     return rts.ImageResiduals(moved, camera, size, goal[..., 3] if channels == 1 else goal[..., :channels], **options)
 
 
