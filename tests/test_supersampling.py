@@ -8,7 +8,7 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, ic
 
 import rts
 from rts.rendering import settings
-from rts.splatting import Visible
+from rts.splatting import Edges
 
 pytestmark = pytest.mark.splatting
 
@@ -86,13 +86,13 @@ def test_bands_work_under_jit_and_torch_func(narrow_bands):
 def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
     calls = []
 
-    class Counting(Visible):
+    class Counting(Edges):
         def image(self, splats):
             calls.append(splats.row.shape)
             return super().image(splats)
 
     bands = len(settings.RenderSettings(None, 2, 3, None).bands(SIZE))
-    gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting(), layers=2).sum(), arrays(TORCH[0], CORNERS))
+    gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))
     assert len(calls) == 2 * bands
 
 
@@ -122,7 +122,7 @@ def test_between_forward_and_backward_bands_keep_next_to_nothing(monkeypatch):
     assert banded < 0.25 * whole  # What splatters have decided of each cell, four bytes.
 
 
-@pytest.mark.parametrize("splatter", ["multi", "visible"])
+@pytest.mark.parametrize("splatter", ["multi", "edges"])
 def test_bands_of_a_closed_surface_have_no_seams(splatter, monkeypatch):
     vertices, faces = icosphere(1)
     part = rts.Part(MESH(faces), {"vertices": vertices, "colors": (vertices + 1) / 2}, "unlit")
