@@ -52,11 +52,6 @@ class Scene(NamedTuple):
         return [bool(part.shader.opaque) for part in self.parts]
 
     @property
-    def layered(self) -> bool:
-        """True if outlines can be found between stacks of layers: all samples lie on triangles."""
-        return all(map(has_sheets, self.parts, self.chosen()))
-
-    @property
     def joinable(self) -> bool:
         """True if samples can be added to those of all parts: no surface has a table that its samples share."""
         return not any(shares_tables(part.surface) for part in self.parts)

@@ -73,16 +73,15 @@ class RenderSettings:
     def of(self, scene: Scene) -> RenderSettings:
         """The settings for a scene: with a splatter, and a number of layers where values are traced.
 
-        "auto" is "edges", but "visible" where light passes through surfaces whose outlines are not found layer by
-        layer, or no samples can be added.
+        "auto" is "edges", but "visible" where no samples can be added.
         """
         splatter, layers, opaque = self.splatter, self.layers, all(scene.opaque)
         if splatter == "auto":
-            splatter = splatter_of("auto", outlines=scene.joinable and (opaque or scene.layered))
+            splatter = splatter_of("auto", outlines=scene.joinable)
         if layers == "auto" and scene.traced:
             layers = TRACED_LAYERS[opaque]
         settings = replace(self, splatter=splatter, layers=layers)
-        return settings._of_most(splatter.layers) if splatter and (opaque or not scene.layered) else settings
+        return settings._of_most(splatter.layers) if splatter and opaque else settings
 
     def _of_most(self, most: int | None) -> RenderSettings:
         """The settings with no more layers than are read; None for all."""
