@@ -36,9 +36,9 @@ TRUSTED = np.radians(60.0)
 WAYS = {
     "none": ("none", 1),
     "multi": ("multi", 1),
-    "visible": ("visible", 1),
+    "edges": ("edges", 1),
     "none, 2 × 2": ("none", 2),
-    "visible, 2 × 2": ("visible", 2),
+    "edges, 2 × 2": ("edges", 2),
 }
 """Name → splatter, and samples a pixel along each axis."""
 COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red"

@@ -33,7 +33,7 @@ from rts_compare.failures import table_columns as failures
 from rts_compare.kept_measurements import KeptMeasurements
 
 PHOTOGRAPHS = ("IMG-1842.jpg", "IMG-1843.jpg", "IMG-1844.jpg")
-METHODS = {m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "visible")}
+METHODS = {m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "edges")}
 """Options of `rts.render`. The hand is culled, so that its second layer is what lies behind it."""
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0, 15.0, 20.0, 30.0)
 QUICK_FACTORS = (0.3, 3.0, 10.0, 20.0)

@@ -25,7 +25,6 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.raster.between import between
 from rts_backends.raster.cells import EVERYTHING, Blocks, touching
 from rts_backends.raster.clusters import BACKS, FRONTS, SIZE, Clusters
 from rts_backends.raster.drawing import BAND_ROWS, LISTED, clear, draw, draw_cells
@@ -77,7 +76,7 @@ class Raster(TriangleSampler):
         A subclass that overrides a method that draws gets `prepared` itself, too.
         """
         many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
-        draws = self._draws and type(self).rasterize_exits == Raster.rasterize_exits
+        draws = self._draws
         return Clusters.of(prepared) if many and draws else prepared
 
     def rasterize(
@@ -100,29 +99,6 @@ class Raster(TriangleSampler):
         blocks = Blocks.of(cells, size)
         with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
             return mesh.draw_cells(mesh.select()[0], layers, cells, blocks)
-
-    def rasterize_exits(
-        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
-    ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """See `TriangleSampler.rasterize_exits`: one pass lists triangles of both orientations.
-
-        In a subclass that overrides `rasterize` or `rasterize_cells`, these two methods draw.
-        """
-        if not self._draws:
-            return super().rasterize_exits(prepared, camera, size, layers, beside)
-        with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
-            fronts, backs = mesh.select()
-            fragments = mesh.draw(fronts, layers)
-            cells = beside(fragments)
-            return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
-
-    def between(
-        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
-    ) -> np.ndarray | None:
-        """See `TriangleSampler.between`; triangles that the near or the far plane cuts are left out."""
-        if not self._draws:  # A subclass that prepares something else.
-            return None
-        return between(prepared, camera, size, facing(camera, cull), depth)
 
     @property
     def _draws(self) -> bool:

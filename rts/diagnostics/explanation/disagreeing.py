@@ -12,7 +12,6 @@ from rts.diagnostics.explanation.baseline import nearest
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
-from rts.diagnostics.explanation.thin_features import on_host
 from rts.diagnostics.explanation.vanishing import why_constant
 from rts.diagnostics.smoothing import low_pass
 
@@ -214,29 +213,6 @@ def _bounded(case: _Case, touched: Touched) -> None:
     )
 
 
-def _crossing(case: _Case, touched: Touched) -> None:
-    """Add a finding on lines where parts pass through one another, if much of the error is beside these lines."""
-    subject = case.subject
-    if len(subject.parts) < 2:
-        return
-    sampled = subject.sampled(layers=2)
-    apron, part = sampled.apron, on_host(sampled.part)
-    front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
-    mask = np.zeros(front.shape, bool)
-    for axis in (0, 1):
-        a, b = (tuple(slice(s, n) if i == axis else slice(None) for i in (0, 1)) for s, n in ((0, -1), (1, None)))
-        swaps = (front[a] != front[b]) & (front[a] == second[b]) & (second[a] == front[b]) & (second[a] >= 0)
-        mask[a] |= swaps
-        mask[b] |= swaps
-    _by_pixels(
-        case,
-        mask[apron:-apron, apron:-apron],
-        "crossing",
-        "parts pass through one another there, and their line of crossing moves otherwise than either",
-        'Take the splatter "edges", whose lines of crossing move, or more samples; or part them.',
-    )
-
-
 def _colors(case: _Case, touched: Touched) -> None:
     """Add a finding on colours finer than pixels, if the error lies inside of surfaces, and more samples halve it."""
     subject, number = case.subject, case.number
@@ -347,7 +323,6 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _transparent,
     _outlines,
     _layers,
-    _crossing,
     _bounded,
     _colors,
     _samples,

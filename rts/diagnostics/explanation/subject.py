@@ -21,7 +21,6 @@ from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves
 from rts.rendering.image import render
 from rts.rendering.samples import sample
-from rts.sampling.adaptive import finest
 from rts.sampling.prepared import Prepared
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -329,8 +328,8 @@ class Subject:
 
     @cached_property
     def supersample(self) -> int:
-        """Samples along each axis of a pixel; with `rts.Adaptive`, of an active pixel."""
-        return finest(self.options.get("supersample", 1))
+        """Samples along each axis of a pixel."""
+        return int(self.options.get("supersample", 1))
 
     @cached_property
     def fineness(self) -> Fineness:
