@@ -153,7 +153,7 @@ def _parts(scene, values, prepared=None):
 
 def _images(parts, cameras, size, way, options):
     if "specified" in way and "views" not in way:  # On the very samples of the compiled splatter.
-        sampled = [rts.sample(parts, c, size, splatter="visible", settles=True, **options) for c in cameras]
+        sampled = [rts.sample(parts, c, size, settles=True, **options) for c in cameras]
         parts = parts if isinstance(parts, list) else list(parts.parts)
         pairs = zip(sampled, cameras, strict=True)
         images = [rts.render_samples(own, parts, camera, splatter=Visible()) for own, camera in pairs]

@@ -18,8 +18,9 @@ pytestmark = pytest.mark.sampling
 
 pytest.importorskip("numba")
 
-from rts_backends.raster import sampler as raster_sampler  # noqa: E402
 from rts_backends.raster.cells import Blocks  # noqa: E402
+
+from rts_backends.raster import sampler as raster_sampler  # noqa: E402
 from rts_backends.raster.clusters import BACKS, FRONTS, Clusters  # noqa: E402
 from rts_backends.raster.sampler import Raster  # noqa: E402
 from rts_backends.triangles import facing, pixel_matrix  # noqa: E402

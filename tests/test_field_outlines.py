@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, quick, to_numpy
+from rts.sampling.exits import outline_cells
 
 import rts
 from rts import Camera, Part
 from rts.plugin_api.records import Request
-from rts.sampling.exits import outline_cells
 from rts_surfaces.implicit.casting import deepest
 from rts_surfaces.implicit.narrow_band import NarrowBand
 

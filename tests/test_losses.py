@@ -8,15 +8,14 @@ import numba
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, icosphere, quad, quick, to_numpy
+from rts_backends.fused.losses import NUMBERS, cost_and_weight, curvature, in_numbers
 from scipy.optimize import least_squares
 
 import rts
-from rts import splatting
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts.fitting.losses import FORMS, _Form
-from rts_backends.fused.losses import NUMBERS, cost_and_weight, curvature, in_numbers
 
 pytestmark = pytest.mark.fitting
 
@@ -42,7 +41,7 @@ def moving(pose, shader="silhouette"):
 
 def residuals(shader="silhouette", channels=1, **options):
     image, weights = goal(channels)
-    given = {"weights": weights, "splatter": "visible", "layers": 2, **options}
+    given = {"weights": weights, **options}
     return rts.ImageResiduals(lambda pose: moving(pose, shader), CAMERA, SIZE, image, **given)
 
 
@@ -236,12 +235,11 @@ def test_the_gradient_is_that_of_finite_differences(name):
     [
         {},
         {"supersample": 2},
-        {"supersample": rts.Adaptive(2)},
         {"background": (0.2, 0.7, 0.1)},
         {"splatter": "single", "layers": 1},
-        {"splatter": splatting.Visible()},
+        {"splatter": "multi", "layers": 2},
     ],
-    ids=["plain", "finer", "adaptive", "background", "single", "array code"],
+    ids=["plain", "finer", "background", "single", "multi"],
 )
 def test_normal_equations_are_those_of_the_jacobian(name, options):
     torch = pytest.importorskip("torch")
@@ -273,13 +271,10 @@ def test_every_way_has_the_same_number():
     several = rts.ImageResiduals(
         *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2),
         weights=[weights] * 2,
-        splatter="visible",
-        layers=2,
         **options,
     )
     ways = [
         mean_loss(residuals("lambert", 4, **options))(POSE),
-        mean_loss(residuals("lambert", 4, splatter=splatting.Visible(), **options))(torch.tensor(POSE)),
         mean_loss(residuals("lambert", 4, **options).at_stage(rts.Stage()))(torch.tensor(POSE)),
         mean_loss(several)(torch.tensor(POSE)),
         several.normal_equations(torch.tensor(POSE))[0],
