@@ -509,10 +509,8 @@ class Points:
         at = (y * width + x).astype(np.int64)
         check_samples(samples, (height, width), sampler)
         found, depth = (host_value(z).reshape(len(z), -1)[:, at] for z in (samples.row, samples.depth))
-        constant, number = (
-            engine_of(samples.row).constant,
-            np.where(found >= 0, np.arange(found.size).reshape(found.shape), -1),
-        )
+        constant = engine_of(samples.row).constant
+        number = np.where(found >= 0, np.arange(found.size).reshape(found.shape), -1)
         taken = taken_rows(samples, constant(np.maximum(found, 0).reshape(-1).astype(np.int32), samples.row))
         row = constant(number.astype(np.int32)[:, None], samples.row)
         return taken.replace(row=row, depth=constant(depth[:, None], samples.depth))
