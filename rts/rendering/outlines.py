@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
@@ -32,8 +33,7 @@ from rts.scene.camera import Camera
 def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
     """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
 
-    Where light passes through, the outlines are those of all layers that it reaches, if the scene is `layered`; else
-    those of the first layer.
+    Where light passes through, the outlines are those of all layers that it reaches; else those of the first layer.
 
     Args:
         sampled: the samples at centres.
@@ -47,14 +47,14 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         InputWarning: a sampler cannot sample single points.
     """
     cells, known = sampled.cells, []
-    if all(scene.opaque) or not scene.layered:
+    if all(scene.opaque):
         sampled = replace(sampled, cells=cells.first(1))
     for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True):
         # Functions of surfaces want the arrays that they are given.
         known.append((part.transform, read, _proxy_inputs(part) if entry is None else None))
     inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or scene.layered or any(map(_batched, leaves(inputs))):
+    if traced or all(map(has_sheets, scene.parts, scene.chosen())) or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:
@@ -325,6 +325,7 @@ class _Broken(NamedTuple):
         parts: (B, R), the parts of samples, or −1.
         points: (B, R, 2), where they are.
         triangles: (B, R), on which they are; −1 where none is known.
+        numbers: (B, R), how many layers of the same part are in front; 0 where triangles are known.
         sides: see `Found.sides`.
         left: number of breaks left out.
     """
@@ -333,6 +334,7 @@ class _Broken(NamedTuple):
     parts: np.ndarray
     points: np.ndarray
     triangles: np.ndarray
+    numbers: np.ndarray
     sides: np.ndarray
     left: int
 
@@ -354,8 +356,10 @@ def found_in_views(
         together = None
         if None not in fragments:
             together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
-        samples.append(views[0].sample(part, np.concatenate(points), together))
-        ends, numbers = np.cumsum([len(x) for x in points]), host_value(samples[-1].row)[0, 0]
+        numbers = np.concatenate([own.numbers[here] for own, here in zip(broken, asked, strict=True)])
+        own, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
+        ends = np.cumsum([len(x) for x in points])
+        samples.append(own)
         for own, here, number in zip(rows, asked, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
             own[here] = number
     return [view.found(own, at, samples) for view, own, at in zip(views, broken, rows, strict=True)], samples
@@ -390,7 +394,7 @@ class Points:
 
     def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Found:
         """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
-        breaks, parts, points, _, sides, left = broken
+        breaks, parts, points, _, _, sides, left = broken
         layered = sides.shape[-1] > 0
         if not layered:
             pairs, of_pairs = self._pairs(breaks, samples)
@@ -435,34 +439,56 @@ class Points:
             others = [x[:most] for x in others]
         return _Broken(breaks, *others, left)
 
-    def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """All breaks, and the other arrays of `_Broken`."""
-        sheets = [own for *_, own in self._parts if own is not None]
-        if len(layers.part) > 1:
-            opaque = np.array(self._scene.opaque)
+        sheets, opaque = [own for *_, own in self._parts if own is not None], np.array(self._scene.opaque)
+        known, count = len(sheets) == len(self._parts), len(layers.part)
+        if count == 1 and known:
+            breaks, stacks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width), None
+        elif known:
             breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
-            parts = np.concatenate([stacks.last, stacks.parts], 1)
-            points = np.concatenate([breaks.points, stacks.points], 1)
-            return breaks, parts, points, np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1), stacks.sides
-        fronts = Fronts(*(x[0] for x in layers))
-        if len(sheets) == len(self._parts):
-            breaks = breaks_of_triangles(fronts, sheets, self._width)
         else:
-            breaks = find_breaks(fronts, Oracle(self._fronts, self._width))
-        # For each break the two last samples, and the two that tell colours.
-        parts, points = (
-            np.concatenate([breaks.parts, breaks.parts], 1),
-            np.concatenate([breaks.points, breaks.inner], 1),
-        )
-        return breaks, parts, points, breaks.triangles, np.empty((len(parts), 2, 0), np.int32)
+            oracle = Oracle(functools.partial(self._layers, count=count), self._width)
+            breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
+        if count == 1 or stacks is None:
+            # For each break the two last samples, and the two that tell colours.
+            parts = np.concatenate([breaks.parts, breaks.parts], 1)
+            points = np.concatenate([breaks.points, breaks.inner], 1)
+            return breaks, parts, points, breaks.triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
+        parts = np.concatenate([stacks.last, stacks.parts], 1)
+        points = np.concatenate([breaks.points, stacks.points], 1)
+        triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)
+        return breaks, parts, points, triangles, stacks.numbers, stacks.sides
 
     def on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
         """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
         sheets = self._parts[part][-1]
         return sheets.at(triangles, points)[0] if sheets is not None and (triangles >= 0).all() else None
 
-    def sample(self, part: int, points: np.ndarray, fragments: Fragments | None = None, pairs: bool = False) -> Samples:
-        """One layer of samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
+    def of_layers(
+        self, part: int, points: np.ndarray, numbers: np.ndarray, fragments: Fragments | None
+    ) -> tuple[Samples, np.ndarray]:
+        """Samples of one layer of a part at each point (M, 2), given their `numbers` (M,); and their rows (M,)."""
+        most, count = numbers.max(initial=0), len(points)
+        samples = self.sample(part, points, fragments, layers=1 + most)
+        row = host_value(samples.row)[:, 0]
+        if not most:
+            return samples, row[0, :count]
+        row = row[numbers, np.arange(count)]
+        used, own = np.unique(row, return_inverse=True)
+        none = int(used[0] < 0)
+        used = used[none:].astype(np.int32) if len(used) > none else np.zeros(1, np.int32)
+        return taken_rows(samples, engine_of(samples.row).constant(used, samples.row)), own.reshape(-1) - none
+
+    def sample(
+        self,
+        part: int,
+        points: np.ndarray,
+        fragments: Fragments | None = None,
+        pairs: bool = False,
+        layers: int = 1,
+    ) -> Samples:
+        """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
         sampler, camera, entry, sheets = self._parts[part]
         if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
             # Surfaces may want a ray at least; nothing names its sample.
@@ -470,7 +496,7 @@ class Points:
         if fragments is not None:
             sampler = _OnTriangles(fragments)
         request = Request(points=points, pairs=pairs, entry=entry)
-        samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
+        samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, layers, request)
         if "points" in samples.followed:
             return samples
         warn(
@@ -482,30 +508,33 @@ class Points:
         x, y = (np.clip(np.floor(points[:, axis]), 0, count - 1) for axis, count in ((0, width), (1, height)))
         at = (y * width + x).astype(np.int64)
         check_samples(samples, (height, width), sampler)
-        found, depth = (host_value(z)[0].reshape(-1)[at] for z in (samples.row, samples.depth))
-        constant, number = engine_of(samples.row).constant, np.where(found >= 0, np.arange(len(found)), -1)
-        taken = taken_rows(samples, constant(np.maximum(found, 0).astype(np.int32), samples.row))
-        row = constant(number.astype(np.int32)[None, None], samples.row)
-        return taken.replace(row=row, depth=constant(depth[None, None], samples.depth))
+        found, depth = (host_value(z).reshape(len(z), -1)[:, at] for z in (samples.row, samples.depth))
+        constant = engine_of(samples.row).constant
+        number = np.where(found >= 0, np.arange(found.size).reshape(found.shape), -1)
+        taken = taken_rows(samples, constant(np.maximum(found, 0).reshape(-1).astype(np.int32), samples.row))
+        row = constant(number.astype(np.int32)[:, None], samples.row)
+        return taken.replace(row=row, depth=constant(depth[:, None], samples.depth))
 
-    def _fronts(self, points: np.ndarray) -> Fronts:
-        """The nearest samples of all parts at points (M, 2); of equal ones the first part's."""
-        part, depth = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
-        for index in range(len(self._parts)):
-            samples = self.sample(index, points)
-            seen, z = host_value(samples.row)[0, 0] >= 0, host_value(samples.depth)[0, 0]
-            nearer = seen & (z < depth)
-            part[nearer], depth[nearer] = index, z[nearer]
-        return Fronts(part, np.full(len(part), -1, np.int32), np.where(part >= 0, depth, 0.0))
+    def _layers(self, points: np.ndarray, count: int) -> Fronts:
+        """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
+        part, depth = np.full((count, len(points)), -1, np.int32), np.full((count, len(points)), np.inf)
+        for index, opaque in enumerate(self._scene.opaque):
+            samples = self.sample(index, points, layers=1 if opaque else count)
+            row, z = host_value(samples.row)[:, 0], host_value(samples.depth)[:, 0]
+            part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
+            depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])
+            order = np.argsort(depth, axis=0, kind="stable")[:count]
+            part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
+        return _lit(Fronts(part, np.full(part.shape, -1, np.int32), depth), np.array(self._scene.opaque))
 
 
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
-    """The surfaces seen at centres (K, H, W), without what lies behind an opaque layer."""
+    """The surfaces seen at points (K, ...), without what lies behind an opaque layer."""
     part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
     for own in part:
         own[hidden] = -1
         hidden |= (own >= 0) & opaque[own]
-    return layers._replace(part=part)
+    return layers._replace(part=part, depth=np.where(part >= 0, layers.depth, 0.0))
 
 
 class _OnTriangles(TriangleSampler):

@@ -46,11 +46,6 @@ class Scene(NamedTuple):
         return [bool(part.shader.opaque) for part in self.parts]
 
     @property
-    def layered(self) -> bool:
-        """True if outlines can be found between stacks of layers: all samples lie on triangles."""
-        return all(map(has_sheets, self.parts, self.chosen()))
-
-    @property
     def read(self) -> list[dict[str, Tree]]:
         """The entries of each part's θ that its surface reads."""
         return [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in self.parts]

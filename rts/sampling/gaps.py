@@ -1,7 +1,8 @@
-"""Breaks in gaps: the places between neighbouring centres where one front ends and another begins.
+"""Breaks in gaps: the places between neighbouring centres where a layer that is seen ends, or two cross.
 
-Where triangles do not tell, the fronts at two neighbouring centres are one surface if their depths differ about as much
-as beside. Else the line between the centres is halved until each break is known.
+Where triangles do not tell, the layers at two neighbouring centres are the same surfaces if their depths differ about
+as much as beside. Else the line between the centres is halved until each break is known. Of opaque surfaces there is
+one layer, the front.
 """
 
 from __future__ import annotations
@@ -21,17 +22,17 @@ BESIDE = 0.05
 """Distance from a crossing, in cells, of the samples that tell how depths change."""
 
 STEEP, RISE = 1.5, 0.1
-"""Two fronts of a part may be two surfaces if their depths differ by more than so many times the least difference
+"""Two layers of a part may be two surfaces if their depths differ by more than so many times the least difference
 beside them, plus this share of a cell's width."""
 
 
 class Fronts(NamedTuple):
-    """The fronts at M points of the image. Host arrays.
+    """The surfaces seen at M points of the image. Host arrays, (M,) for fronts, (K, M) for K layers, front to back.
 
     Attributes:
-        part: (M,) int32, −1 where nothing is seen.
-        triangle: (M,) int32, −1 where nothing is seen, or where no triangle is known.
-        depth: (M,) float64, linear; 0 where nothing is seen.
+        part: int32, −1 where nothing is seen.
+        triangle: int32, −1 where nothing is seen, or where no triangle is known.
+        depth: float64, linear; 0 where nothing is seen.
     """
 
     part: np.ndarray
@@ -39,24 +40,28 @@ class Fronts(NamedTuple):
     depth: np.ndarray
 
     def at(self, index: np.ndarray) -> Fronts:
-        """The fronts with some indices."""
-        return Fronts(*(x[index] for x in self))
+        """What is seen at the points with some indices."""
+        return Fronts(*(x[..., index] for x in self))
+
+    def of_layer(self, layer: np.ndarray) -> Fronts:
+        """The layers (M,) with a number of its own at each point."""
+        return Fronts(*(x[layer, np.arange(len(layer))] for x in self))
 
     @classmethod
     def of(cls, several: Sequence[Fronts]) -> Fronts:
-        """Several fronts, one after the other."""
-        return cls(*(np.concatenate(x) for x in zip(*several, strict=True)))
+        """What is seen at several sets of points, one after the other."""
+        return cls(*(np.concatenate(x, axis=-1) for x in zip(*several, strict=True)))
 
 
 class Oracle(NamedTuple):
     """A scene that can be sampled at any point.
 
     Attributes:
-        fronts: points (M, 2) → their fronts.
+        layers: points (M, 2) → the K layers there, nothing behind an opaque one.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
 
-    fronts: Callable[[np.ndarray], Fronts]
+    layers: Callable[[np.ndarray], Fronts]
     width: np.ndarray
 
     def widths(self, depth: np.ndarray) -> np.ndarray:
@@ -94,8 +99,28 @@ class Breaks(NamedTuple):
     tangent: np.ndarray
 
 
+class Stacks(NamedTuple):
+    """The stacks beside breaks. Host arrays.
+
+    Attributes:
+        last: (B, 2) int32, the parts of the last samples before and behind each break; −1 on sides that do not move it.
+        parts: (B, K + 1) int32, the parts of the layers at each break, front to back, or −1.
+        triangles: (B, K + 1) int32, their triangles; −1 where none is known.
+        points: (B, K + 1, 2) float64, x and y of their samples.
+        sides: (B, 2, K) int32, the stacks before and behind each break, as indices of these samples, or −1.
+        numbers: (B, 2 + K + 1) int32, of the last samples and of these: how many layers of the same part are in front.
+    """
+
+    last: np.ndarray
+    parts: np.ndarray
+    triangles: np.ndarray
+    points: np.ndarray
+    sides: np.ndarray
+    numbers: np.ndarray
+
+
 class _Intervals(NamedTuple):
-    """Intervals of gaps whose ends are not on one surface: the gap's index, two places along it, and their fronts."""
+    """Intervals of gaps whose ends see other surfaces: the gap's index, two places along it, and the layers there."""
 
     gap: np.ndarray
     low: np.ndarray
@@ -127,73 +152,75 @@ class _Lines(NamedTuple):
         return self.start[gap] + place[:, None] * self.step[gap]
 
 
-def find_breaks(fronts: Fronts, oracle: Oracle) -> Breaks:
-    """The breaks between the fronts at the centres of all cells, whose arrays are (H, W)."""
-    height, width = fronts.part.shape
+def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
+    """The breaks between the layers at the centres of all cells, whose arrays are (K, H, W), and the stacks there."""
+    _, height, width = layers.part.shape
     axis, y, x = np.mgrid[:2, :height, :width].reshape(3, -1)
     gap = np.column_stack([y, x, axis])[(x + axis < width) & (y + 1 - axis < height)].astype(np.int32)
-    one, other, start, step = _ends(gap, fronts)
-    same, seen = (one.part == other.part) & (one.part >= 0), (one.part >= 0) | (other.part >= 0)
+    one, other, start, step = _ends(gap, layers)
+    same, seen = (one.part == other.part).all(0), (one.part[0] >= 0) | (other.part[0] >= 0)
     joined = np.zeros((2, height, width), bool)
-    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = same
-    at = np.flatnonzero(seen & ~(same & _smooth(fronts, oracle, *gap.T)))
+    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = same & seen
+    at = np.flatnonzero(seen & ~(same & _smooth(layers, oracle, *gap.T)))
     gap, gaps = gap[at], _Lines(start[at], step[at])
     ends = np.arange(len(at)), np.zeros(len(at)), np.ones(len(at))
     found = _halved(_Intervals(*ends, one.at(at), other.at(at)), gaps, oracle)
     found = found.at(np.lexsort((found.low, found.gap)))
-    near, slope, kept = _classified(found, gaps, oracle)
-    found, number = found.at(kept), found.gap[kept]
+    number, low, high = found.gap, found.low, found.high
     joined[1 - gap[number, 2], gap[number, 0], gap[number, 1]] = False
     first, last = np.diff(number, prepend=-1) != 0, np.diff(number, append=-1) != 0
-    low, high = found.low, found.high
     inner = [
         low - np.minimum(INNER, (low - np.where(first, 0.0, np.roll(high, 1))) / 2),
         high + np.minimum(INNER, (np.where(last, 1.0, np.roll(low, -1)) - high) / 2),
     ]
-    return Breaks(
+    points, beside = (np.stack([gaps.points(number, at) for at in two], 1) for two in ((low, high), inner))
+    change = _Change.of(found, oracle)
+    near, slope = change.classified(found, gaps, oracle)
+    breaks = Breaks(
         gap[number],
         gaps.points(number, (low + high) / 2),
-        near[kept],
-        slope[kept],
+        near,
+        slope,
         np.stack([first, last], 1),
-        np.stack([gaps.points(number, low), gaps.points(number, high)], 1),
-        np.stack([gaps.points(number, at) for at in inner], 1),
-        np.stack([found.before.part, found.behind.part], 1),
+        points,
+        beside,
+        change.parts(near),
         joined,
         np.full((len(number), 4), -1, np.int32),
         np.zeros((len(number), 2)),
     )
+    return breaks, change.stacks(near, points, beside)
 
 
-def _ends(gap: np.ndarray, fronts: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
-    """The fronts at both centres of gaps (M, 3), the first centres (M, 2), and steps (M, 2) to the others."""
+def _ends(gap: np.ndarray, layers: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
+    """The layers at both centres of gaps (M, 3), the first centres (M, 2), and steps (M, 2) to the others."""
     y, x, axis = gap.T
     step = np.column_stack([axis == 1, axis == 0])
-    first, second = (Fronts(*(table[y + k * step[:, 1], x + k * step[:, 0]] for table in fronts)) for k in (0, 1))
+    first, second = (Fronts(*(table[:, y + k * step[:, 1], x + k * step[:, 0]] for table in layers)) for k in (0, 1))
     return first, second, np.column_stack([x, y]) + 0.5, step.astype(float)
 
 
-def _smooth(fronts: Fronts, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def _smooth(layers: Fronts, oracle: Oracle, y: np.ndarray, x: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Do depths from cells to the next ones along an axis change about as beside? (M,) bool; see `STEEP`."""
-    depth = np.where(fronts.part >= 0, fronts.depth, np.nan)
-    steps = [np.abs(np.diff(depth, axis=0, append=np.nan)), np.abs(np.diff(depth, axis=1, append=np.nan))]
-    change = np.where(axis == 1, steps[1][y, x], steps[0][y, x])
-    h, w = depth.shape
-    after = np.where(axis == 1, steps[1][y, np.minimum(x + 1, w - 1)], steps[0][np.minimum(y + 1, h - 1), x])
-    before = np.where(axis == 1, steps[1][y, np.maximum(x - 1, 0)], steps[0][np.maximum(y - 1, 0), x])
+    depth = np.where(layers.part >= 0, layers.depth, np.nan)
+    steps = [np.abs(np.diff(depth, axis=1, append=np.nan)), np.abs(np.diff(depth, axis=2, append=np.nan))]
+    change = np.where(axis == 1, steps[1][:, y, x], steps[0][:, y, x])
+    _, h, w = depth.shape
+    after = np.where(axis == 1, steps[1][:, y, np.minimum(x + 1, w - 1)], steps[0][:, np.minimum(y + 1, h - 1), x])
+    before = np.where(axis == 1, steps[1][:, y, np.maximum(x - 1, 0)], steps[0][:, np.maximum(y - 1, 0), x])
     beside = np.nan_to_num(np.fmin(before, after))
-    return change <= STEEP * beside + RISE * oracle.widths(fronts.depth[y, x])
+    steep = change > STEEP * beside + RISE * oracle.widths(layers.depth[:, y, x])
+    return np.logical_not(steep.any(0))
 
 
-def _one_surface(found: _Intervals, oracle: Oracle) -> np.ndarray:
-    """(M,) True for intervals whose ends see one part at nearly one depth, or both see nothing."""
-    a, b = found.before, found.behind
+def _level(a: Fronts, b: Fronts, oracle: Oracle) -> np.ndarray:
+    """True for layers of one part, or none, at nearly one depth; see `RISE`."""
     level = np.abs(a.depth - b.depth) <= RISE * oracle.widths(a.depth)
     return (a.part == b.part) & ((a.part < 0) | level)
 
 
 def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
-    """Intervals halved until they are `FINE`; a half whose ends are on one surface is dropped."""
+    """Intervals halved until they are `FINE`; a half whose ends see the same surfaces is dropped."""
     finished = []
     while True:
         fine = found.high - found.low <= FINE
@@ -202,46 +229,124 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
         if not len(found.gap):
             break
         middle = (found.low + found.high) / 2
-        told = oracle.fronts(gaps.points(found.gap, middle))
+        told = oracle.layers(gaps.points(found.gap, middle))
         halves = [
             _Intervals(found.gap, found.low, middle, found.before, told),
             _Intervals(found.gap, middle, found.high, told, found.behind),
         ]
-        # Within one part the half in which the depth changes more has the break.
-        alike = (found.before.part == told.part) & (told.part == found.behind.part)
-        changes = [np.abs(half.before.depth - half.behind.depth) for half in halves]
-        drop = [_one_surface(half, oracle) for half in halves]
+        # Within the same parts the half in which a depth changes more has the break.
+        alike = ((found.before.part == told.part) & (told.part == found.behind.part)).all(0)
+        changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
+        drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
         drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
         found = _Intervals.of([half.at(np.flatnonzero(~d)) for half, d in zip(halves, drop, strict=True)])
     return _Intervals.of(finished)
 
 
-def _classified(found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`near` (M,) and `slope` (M, 2, 2) of breaks, and the indices of intervals that hold one."""
-    a, b = found.before, found.behind
-    both, apart = (a.part >= 0) & (b.part >= 0), b.depth - a.depth
-    meets = both & (np.abs(apart) <= 10 * FINE * oracle.widths(np.maximum(a.depth, b.depth)))
-    near = np.where(both, apart < 0, a.part < 0).astype(np.int32)
-    slope, crosses = np.zeros((len(near), 2, 2)), np.flatnonzero(meets & (a.part != b.part))
-    if len(crosses):
-        found_slopes = _sampled_slopes(found.at(crosses), gaps, oracle)
-        turn = np.abs(found_slopes[:, 1] - found_slopes[:, 0]).sum(-1)
-        there = turn > 1e-4 * oracle.widths(a.depth[crosses])  # False for NaN.
-        near[crosses[there]], slope[crosses[there]] = 2, found_slopes[there]
-    return near, slope, np.flatnonzero(~(meets & (a.part == b.part)))
+class _Change(NamedTuple):
+    """What changes in fine intervals.
+
+    Attributes:
+        sides: the layers (K, B) before and behind.
+        goes_on: for each side (K, B) int, the layer of the other side that is the same surface, or −1.
+        first: (B,) the first layer in which the sides differ.
+        ends: for each side (B,) its first layer that does not go on; `first` where all do, in another order.
+        near: (B,) int32, the side whose such layer is nearer.
+    """
+
+    sides: tuple[Fronts, Fronts]
+    goes_on: tuple[np.ndarray, np.ndarray]
+    first: np.ndarray
+    ends: tuple[np.ndarray, np.ndarray]
+    near: np.ndarray
+
+    @classmethod
+    def of(cls, found: _Intervals, oracle: Oracle) -> _Change:
+        """The changes in intervals."""
+        sides, index = (found.before, found.behind), np.arange(len(found.before.part))
+        a, b = (Fronts(*(np.expand_dims(x, axis) for x in side)) for side, axis in zip(sides, (1, 0), strict=True))
+        apart = np.where(_level(a, b, oracle) & (a.part >= 0), np.abs(a.depth - b.depth), np.inf)
+        one = (apart == apart.min(0)) & (apart == apart.min(1)[:, None]) & np.isfinite(apart)
+        behind, before = (np.where(one.any(axis), one.argmax(axis), -1) for axis in (1, 0))
+        first = (~one[index, index] & ((found.before.part >= 0) | (found.behind.part >= 0))).argmax(0)
+        lone = [(side.part >= 0) & (other < 0) for side, other in zip(sides, (behind, before), strict=True)]
+        swapped = ~(lone[0].any(0) | lone[1].any(0))
+        ends = np.where(swapped, first, lone[0].argmax(0)), np.where(swapped, first, lone[1].argmax(0))
+        depths = [
+            np.where(own.any(0) | swapped, side.of_layer(at).depth, np.inf)
+            for own, side, at in zip(lone, sides, ends, strict=True)
+        ]
+        return cls(sides, (behind, before), first, ends, (depths[1] < depths[0]).astype(np.int32))
+
+    def moves(self, near: np.ndarray) -> list[np.ndarray]:
+        """For each side the layer (B,) that moves the break if the other does not; those that cross if `near` is 2."""
+        return [np.where(near == 2, self.first, at) for at in self.ends]
+
+    def parts(self, near: np.ndarray) -> np.ndarray:
+        """(B, 2) int32, the part that moves the break and what is seen behind it, or those that cross, by sides."""
+        at = np.where(near == 2, self.first, np.where(near == 1, self.ends[1], self.ends[0]))
+        return np.stack([side.of_layer(at).part for side in self.sides], 1)
+
+    def classified(self, found: _Intervals, gaps: _Lines, oracle: Oracle) -> tuple[np.ndarray, np.ndarray]:
+        """`near` (B,) and `slope` (B, 2, 2) of breaks."""
+        near, slope = self.near.copy(), np.zeros((len(self.near), 2, 2))
+        a, b = (side.of_layer(self.first) for side in self.sides)
+        level = np.abs(b.depth - a.depth) <= 10 * FINE * oracle.widths(np.maximum(a.depth, b.depth))
+        meets = np.flatnonzero((a.part >= 0) & (b.part >= 0) & (a.part != b.part) & level)
+        if len(meets):
+            slopes = _sampled_slopes(found.at(meets), a.at(meets), b.at(meets), gaps, oracle)
+            turn = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
+            there = turn > 1e-4 * oracle.widths(a.depth[meets])  # False for NaN.
+            near[meets[there]], slope[meets[there]] = 2, slopes[there]
+        return near, slope
+
+    def stacks(self, near: np.ndarray, points: np.ndarray, inner: np.ndarray) -> Stacks:
+        """The stacks; layers that go on are sampled once, at `points` (B, 2, 2), others at `inner` (B, 2, 2)."""
+        (a, b), (behind, before), layers = self.sides, self.goes_on, len(self.goes_on[0])
+        lone = (b.part >= 0) & (before < 0)
+        there = np.concatenate([a.part >= 0, lone])
+        depth = np.where(there, np.concatenate([a.depth, b.depth]), np.inf)
+        order = np.argsort(depth, axis=0, kind="stable")
+        place = np.argsort(order, axis=0)
+        place = np.where(there & (place <= layers), place, -1)
+        order = order[: layers + 1]
+        own = place[:layers], np.where(lone, place[layers:], np.take_along_axis(place, np.maximum(before, 0), 0))
+        sides = np.stack([own[0].T, np.where(b.part >= 0, own[1], -1).T], 1)
+        part = np.where(there, np.concatenate([a.part, b.part]), -1)
+        at = np.where((behind >= 0)[..., None], points[:, 0], inner[:, 0])
+        at = np.concatenate([at, np.broadcast_to(inner[:, 1], (layers, *inner[:, 1].shape))])
+        numbers = [_numbers(side.part) for side in self.sides]
+        moves = np.stack([np.take_along_axis(n, m[None], 0)[0] for n, m in zip(numbers, self.moves(near), strict=True)])
+        numbers = np.concatenate([moves, np.take_along_axis(np.concatenate(numbers), order, 0)])
+        last = np.where((near[:, None] == 2) | (near[:, None] == [0, 1]), self.parts(near), -1)
+        part = np.take_along_axis(part, order, 0)
+        at = np.take_along_axis(at, order[..., None], 0)
+        return Stacks(last, part.T, np.full(part.T.shape, -1), at.transpose(1, 0, 2), sides, numbers.T)
 
 
-def _sampled_slopes(found: _Intervals, gaps: _Lines, oracle: Oracle) -> np.ndarray:
-    """Slopes of depth (M, 2, 2) on both sides of intervals, by samples on each side; NaN where there are none."""
+def _numbers(part: np.ndarray) -> np.ndarray:
+    """For layers (K, M), how many of the same part are in front."""
+    return np.stack([(part[:k] == own).sum(0) for k, own in enumerate(part)])
+
+
+def _sampled_slopes(found: _Intervals, a: Fronts, b: Fronts, gaps: _Lines, oracle: Oracle) -> np.ndarray:
+    """Slopes of depth (M, 2, 2) on both sides of intervals, of the surfaces seen at their ends; NaN where unknown."""
     slopes = np.full((len(found.gap), 2, 2), np.nan)
-    for side, (fronts, place, way) in enumerate(((found.before, found.low, -1), (found.behind, found.high, 1))):
+    for side, (front, place, way) in enumerate(((a, found.low, -1), (b, found.high, 1))):
         at, step = gaps.points(found.gap, place), gaps.step[found.gap]
         inward, across = way * BESIDE * step, BESIDE * step[:, ::-1]
-        told = [oracle.fronts(at + inward), oracle.fronts(at + inward + across), oracle.fronts(at + inward - across)]
-        same = [t.part == fronts.part for t in told]
-        along = np.where(same[0], (told[0].depth - fronts.depth) / (way * BESIDE), np.nan)
-        both = np.where(same[1] & same[2], (told[1].depth - told[2].depth) / (2 * BESIDE), np.nan)
-        one = np.where(same[1], told[1].depth - told[0].depth, told[0].depth - told[2].depth) / BESIDE
-        beside = np.where(np.isfinite(both), both, np.where(same[0] & (same[1] | same[2]), one, np.nan))
+        told = [_depth_of(front, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
+        same = [np.isfinite(t) for t in told]
+        along = (told[0] - front.depth) / (way * BESIDE)
+        both = (told[1] - told[2]) / (2 * BESIDE)
+        one = np.where(same[1], told[1] - told[0], told[0] - told[2]) / BESIDE
+        beside = np.where(np.isfinite(both), both, one)
         slopes[:, side] = along[:, None] * step + beside[:, None] * step[:, ::-1]
     return slopes
+
+
+def _depth_of(front: Fronts, layers: Fronts) -> np.ndarray:
+    """The depth (M,) of the layer of the same part as a front that is the nearest to it; NaN where there is none."""
+    apart = np.where(layers.part == front.part, np.abs(layers.depth - front.depth), np.inf)
+    at = apart.argmin(0)
+    return np.where(np.isfinite(apart.min(0)), layers.of_layer(at).depth, np.nan)

@@ -7,32 +7,13 @@ is a break of its own, which moves with the one layer that ends there, or with t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import INNER, Breaks, Fronts
+from rts.sampling.gaps import INNER, Breaks, Fronts, Stacks
 from rts.sampling.sheets import Gaps, Sheets
 from rts.sampling.spans import flat_apart, slopes_at, spans_on, tangents
-
-
-class Stacks(NamedTuple):
-    """The stacks beside breaks. Host arrays.
-
-    Attributes:
-        last: (B, 2) int32, the parts of the last samples before and behind each break; −1 on sides that do not move it.
-        parts: (B, K + 1) int32, the parts of the layers at each break, front to back, or −1.
-        triangles: (B, K + 1) int32, their triangles.
-        points: (B, K + 1, 2) float64, x and y of their samples.
-        sides: (B, 2, K) int32, the stacks before and behind each break, as indices of these samples, or −1.
-    """
-
-    last: np.ndarray
-    parts: np.ndarray
-    triangles: np.ndarray
-    points: np.ndarray
-    sides: np.ndarray
 
 
 def breaks_of_stacks(
@@ -64,7 +45,8 @@ def breaks_of_stacks(
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
     ends, own = whole[:, 4:] == 1, (points[:, :2], points[:, :2], whole[:, 2:4])
     breaks = Breaks(gap, at, near, slope, ends, *own, joined, triangles, tangent)
-    return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides)
+    numbers = np.zeros(samples.shape[:2], np.int32)
+    return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides, numbers)
 
 
 def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray) -> np.ndarray:
