@@ -221,8 +221,7 @@ def _peeled(
     more, first = max(PEELED, drawn.samples), drawn.layer
     options = {"sampler": "raster", "splatter": None, "supersample": more, "layers": first + 2}
     sampled = rts.sample(part, camera, (background.shape[0], background.shape[1]), **options)
-    layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n, None)) is not None}
-    sampled = sampled.replace(**layers)
+    sampled = sampled.replace(row=sampled.row[first:], depth=sampled.depth[first:])
     value = _over(rts.render_samples(sampled, part, camera, splatter="none"), background)
     motion = _over(rts.render_samples(sampled, still, camera, splatter="multi"), background.detach())
     return value + CALIBRATION * (motion - motion.detach()).nan_to_num()  # Infinite colours do not move.
