@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -11,13 +10,9 @@ import torch
 
 from rts import GBuffer, TriangleSurface
 from rts.plugin_api.arrays import Tree
-from rts.plugin_api.checks import fingerprint
 from rts.plugin_api.operations import interpolate
 from rts.plugin_api.records import Proxy, Samples
 from rts_nvdiffrast.clip_space import Seen, seen
-
-KEPT = 8
-"""Tables of triangles whose topology is kept from call to call."""
 
 
 class Topology:
@@ -26,22 +21,13 @@ class Topology:
     `antialias_construct_topology_hash` gives it.
     """
 
-    _kept: OrderedDict[Any, Topology] = OrderedDict()
-
     def __init__(self, faces: np.ndarray):
         self.faces = faces
 
     @classmethod
     def of(cls, tri: torch.Tensor) -> Topology:
-        """The topology of `tri` (T, 3); that of the last few tables is kept."""
-        faces = np.array(tri.detach().cpu().numpy(), np.int32)
-        key = faces.shape, fingerprint(faces)
-        if key not in cls._kept:
-            cls._kept[key] = cls(faces)
-        cls._kept.move_to_end(key)
-        while len(cls._kept) > KEPT:
-            cls._kept.popitem(last=False)
-        return cls._kept[key]
+        """The topology of `tri` (T, 3)."""
+        return cls(np.array(tri.detach().cpu().numpy(), np.int32))
 
 
 class Triangles(TriangleSurface):
