@@ -248,11 +248,6 @@ def test_two_layers_ask_for_no_second_sample():
     assert sampled.row.shape[0] == 1
 
 
-def test_adaptive_samples_are_refused():
-    with pytest.raises(InputError, match="splatter .* finds outlines without further samples"):
-        edges(card(flat(SQUARE + 12)), supersample=rts.Adaptive(4))
-
-
 def test_no_colour_leaves_the_range_of_those_that_are_seen():
     """Light that turns away at the limb: the sample at a centre is dark, that beside the outline bright, or the other
     way around."""

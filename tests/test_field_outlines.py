@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, quick, to_numpy
-from rts.sampling.exits import outline_cells
 
 import rts
 from rts import Camera, Part
@@ -136,15 +135,6 @@ def test_outlines_shift_with_the_surface(name, way):
     ).numpy()[:, 0]
     assert abs(moment - area) < 0.02 * area
     assert abs(grown) < 0.02 * area
-
-
-@pytest.mark.parametrize(("way", "name"), [("sdf", "box, turned"), ("lattice", "torus across")])
-def test_fine_samples_at_outlines_have_pairs_too(way, name):
-    torch = pytest.importorskip("torch")
-    f, q, eye, expected = SHAPES[name]
-    image, shift = coverage(f, eye, way, supersample=rts.Adaptive(4)), torch.tensor([SHIFT, SHIFT, SHIFT])
-    found = torch.func.jacfwd(lambda q: image(q, shift).sum() * PIXEL**2)(torch.tensor(q)).numpy()
-    np.testing.assert_allclose(found, expected(q), rtol=0.01, atol=0.01 * max(expected(q)))
 
 
 @pytest.mark.thorough

@@ -23,8 +23,6 @@ OPTIONS = (
     {},
     {"layers": "auto"},
     {"supersample": 2},
-    {"supersample": rts.Adaptive(2)},
-    {"supersample": rts.Adaptive(2, contrast=0.2)},
     {"background": (0.2, 0.4, 1.0)},
     {"splatter": "multi", "sampler": "reference"},
 )

@@ -23,15 +23,6 @@ def take(rows: Array, index: Array) -> Array:
     return TAKE(rows, index)
 
 
-def take_shifted(rows: Array, index: Array, shift: Array) -> Array:
-    """Rows (M, C) of an array (V, C), by their indices (M,), plus a shift (M, C) that has no derivative.
-
-    Raises:
-        InputError: on the host, an index names no row.
-    """
-    return SHIFTED(rows, index, shift)
-
-
 def _specification(rows: Array, index: Array) -> Array:
     value = known_value(index)
     if value is not None:
@@ -81,30 +72,3 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 _PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
 TAKE = Operation("rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, **_PACKED)
-
-
-def _specified_shift(rows: Array, index: Array, shift: Array) -> Array:
-    xp, still = namespace(rows, index), engine_of(shift).stop_gradient(shift)
-    return _specification(rows, index) + xp.astype(still, rows.dtype)
-
-
-def _shifted_shape(rows: tuple[int, ...], index: tuple[int, ...], shift: tuple[int, ...]) -> tuple[int, ...]:
-    return shift
-
-
-def _shifted(operands: Arrays, out: np.ndarray) -> None:
-    rows, index, shift = operands
-    _put(rows, index, shift, out)
-
-
-SHIFTED = Operation(
-    "rts.take_shifted",
-    _specified_shift,
-    (2, 1, 2),
-    _shifted_shape,
-    _shifted,
-    _push,
-    _pull,
-    packed=(1, 2),
-    packed_result=True,
-)
