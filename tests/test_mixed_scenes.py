@@ -16,9 +16,9 @@ pytest.importorskip("numba")
 FIRST, SHARED = 10, (10, 2, 3, 4, 6)
 """The scene of `make test`, of jax and of pairs of ways; and those of all other ways."""
 
-KNOWN = {
-    (n, name): "" for n, name in []
-}
+KNOWN = {(n, name): "" for n, name in []}
+
+
 def cases():
     """Scenes and single ways; then each pair of ways, on one scene."""
     singles = [(n, way) for way in SINGLES for n in SHARED if n == FIRST or not way & {"jax", "jit"}]

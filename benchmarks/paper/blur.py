@@ -39,9 +39,11 @@ WAYS = {
     "visible": ("visible", 1),
     "none, 2 × 2": ("none", 2),
     "visible, 2 × 2": ("visible", 2),
+    "edges": ("edges", 1),
+    "edges, 2 × 2": ("edges", 2),
 }
 """Name → splatter, and samples a pixel along each axis."""
-COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red"
+COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red", "tab:green", "tab:olive"
 """The colours of their lines."""
 
 
