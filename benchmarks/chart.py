@@ -2,8 +2,7 @@
 
 Writes a JSON a scene to benchmarks/results, and a picture of each to docs/images/results. summary.md says which
 settings stay within 10 %, 3 % and 1 % of error. chart.html, a page of all scenes, is not kept: `--draw` makes it of the
-JSON files. Measurements are kept in a folder of their own, and a run that is interrupted goes on. Afterwards
-`python -m benchmarks.pages` brings docs/results up to date:
+JSON files. Measurements are kept in a folder of their own, and a run that is interrupted goes on:
 
     python -m benchmarks.chart                                 # most of two hours on two cores
     python -m benchmarks.chart --scenes "thin wires" -o /tmp/wires
@@ -20,11 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import table
-from rts import Adaptive
 from rts_compare import compare
 from rts_compare.builtin_scenes import BUILTIN
 from rts_compare.chart_style import label, samples_label, side_length
-from rts_compare.comparison import SUPERSAMPLE, file_name
+from rts_compare.comparison import file_name
 from rts_compare.html_page import write_page
 from rts_compare.moving_scenes import MODES
 from rts_compare.pareto_front import LEVELS, best_within, timed
@@ -32,8 +30,6 @@ from rts_compare.png_chart import draw
 
 RESULTS = Path(__file__).parent / "results"
 IMAGES = Path(__file__).parent.parent / "docs/images/results"
-MORE = {"thin wires": [Adaptive(4, thin=True), Adaptive(8, thin=True)]}
-"""Values of `supersample` that are measured on some scenes alone, by scene."""
 
 
 def options() -> argparse.Namespace:
@@ -56,9 +52,7 @@ def main() -> None:
         path = args.output / f"{file_name(scene)}.json"
         if not args.draw:
             print(scene, flush=True)
-            data = compare(
-                scene, supersample=[*SUPERSAMPLE, *MORE.get(scene, [])], output=args.kept, truths=args.kept
-            ).data
+            data = compare(scene, output=args.kept, truths=args.kept).data
             path.write_text(json.dumps(rounded(data), separators=(",", ":")) + "\n")
         found.append(json.loads(path.read_text()))
         draw(found[-1], images / f"{path.stem}.png")

@@ -1,4 +1,4 @@
-"""Found edges beside `visible`: errors of images and of their derivatives, each against area-sampled images.
+"""Found edges beside the paper's splatter: errors of images and of their derivatives, each against area-sampled images.
 
 Truth is a central difference over ±0.15 pixels of images with 32 × 32 samples a pixel. A row has, for each method, the
 relative L2 error of the derivative image, in each pixel and after a Gaussian of 2 pixels, its gain, and the error of
@@ -35,8 +35,7 @@ QUAD = np.array([[-0.62, -0.55, 0], [0.55, -0.5, 0], [0.6, 0.47, 0], [-0.58, 0.5
 SceneAt = Callable[[torch.Tensor], Sequence[rts.Part]]
 
 METHODS: dict[str, dict] = {
-    "visible": {"splatter": "visible"},
-    "Adaptive(4)": {"splatter": "visible", "supersample": rts.Adaptive(4)},
+    "multi": {"splatter": "multi", "layers": 2},
     "edges": {"splatter": "edges"},
 }
 

@@ -1,4 +1,4 @@
-"""Losses near the truth, fits by L-BFGS and poses by Levenberg–Marquardt: found edges beside `visible`.
+"""Losses near the truth, fits by L-BFGS and poses by Levenberg–Marquardt: found edges beside the paper's splatter.
 
 *Lines*: the mean square between the image at the truth and at a distance from it, in steps of 1/1000 pixel up to
 0.6 pixels on either side of it: for a card of 48², turned by 5°, and for spot and the teapot, lit, of 128², shifted
@@ -37,7 +37,7 @@ from benchmarks.pose_recovery import VIEWS, eye, line
 from benchmarks.report import table
 from rts_compare.chart_style import PEER_COLORS, SPLATTER_COLORS
 
-SPLATTERS = {"visible": SPLATTER_COLORS["visible"], "edges": PEER_COLORS["Mitsuba"]}
+SPLATTERS = {"multi": SPLATTER_COLORS["multi"], "edges": PEER_COLORS["Mitsuba"]}
 REACH, FINE = 0.6, 1000
 """Pixels on either side of the truth, and steps a pixel."""
 STARTS = np.array([[1.3, -0.7], [-1.6, 0.4], [0.3, 1.8], [-0.9, -1.1], [1.9, 0.6]])

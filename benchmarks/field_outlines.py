@@ -308,8 +308,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fields", nargs="+", choices=list(FIELDS), default=list(FIELDS))
     parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
-    parser.add_argument("--adaptive", action="store_true", help="with rts.Adaptive(4)")
-    parser.add_argument("--edges", action="store_true", help="by found edges")
     parser.add_argument("--time", type=int, metavar="ROUNDS", help="time steps with and without pairs, in turns")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/field_outlines.md"))
     args = parser.parse_args()
@@ -317,8 +315,7 @@ def main() -> None:
         print(table(["shader", "ms with pairs", "without", "ratio"], times(args.time)))
         return
     lines = []
-    options: dict[str, Any] = {"supersample": rts.Adaptive(4)} if args.adaptive else {}
-    for line in rows(args.fields, args.ways, {**options, **({"splatter": "edges"} if args.edges else {})}):
+    for line in rows(args.fields, args.ways, {}):
         print(*line, sep=" | ", flush=True)
         lines.append(line)
     args.output.parent.mkdir(parents=True, exist_ok=True)

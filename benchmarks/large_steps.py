@@ -30,7 +30,7 @@ from rich.progress import track
 import rts
 from benchmarks.camera import camera
 from benchmarks.meshes import mesh, welded
-from benchmarks.outline_fits import around, strip
+from benchmarks.pose_recovery import eye
 from benchmarks.report import table
 from benchmarks.timing import in_turn
 from rts.compiling.threads import thread_count
@@ -50,6 +50,11 @@ class Shape(NamedTuple):
 
     file: str
     views: list[rts.Camera]
+
+
+def around(count: int, first: float) -> list[rts.Camera]:
+    """Cameras all around, in turn above and below."""
+    return [camera(eye(first + 360 * i / count, 30.0 * (-1) ** i)) for i in range(count)]
 
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)]) * 3 + 0.3
@@ -211,6 +216,15 @@ def solvers() -> dict[str, Any]:
             lines.append([name, str(len(vertices)), way, f"{made[way]['ms']:.0f}", f"{times[way]['ms']:.2f}"])
     print(table(["mesh", "vertices", "solver", "factorised, ms", "solve, ms"], lines))
     return found
+
+
+def strip(pictures: list[np.ndarray], path: Path) -> None:
+    """Pictures side by side on white, as PNG."""
+    from PIL import Image
+
+    rgb = [p[..., :3] + 1 - p[..., 3:] for p in pictures]
+    image = np.round(255 * np.concatenate(rgb, axis=1).clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    Image.fromarray(image).resize((2 * image.shape[1], 2 * image.shape[0])).save(path)
 
 
 def main() -> None:

@@ -84,8 +84,8 @@ def by_pairs(faces: torch.Tensor = FACES) -> Render:
     return render
 
 
-def by_rts(samples: int = 3, splatter: str = "auto", faces: torch.Tensor = FACES) -> Render:
-    """`rts.render`, with samples at outlines; with no splatter, with as many everywhere."""
+def by_rts(samples: int = 1, splatter: str = "auto", faces: torch.Tensor = FACES) -> Render:
+    """`rts.render`, by default with found outlines and one sample a pixel."""
     camera = rts.Camera(np.eye(4), PROJECTION.double().numpy())
 
     def unlit(theta, gbuffer, camera):
@@ -97,8 +97,7 @@ def by_rts(samples: int = 3, splatter: str = "auto", faces: torch.Tensor = FACES
     def render(vertices, colors, rows, modelview, size):
         surface = surfaces.setdefault(id(rows), rts.Mesh(faces.numpy(), {"side": rows.numpy()}))
         part = rts.Part(surface, {"vertices": vertices, "side": colors}, unlit, transform=modelview)
-        more = rts.Adaptive(samples) if splatter == "auto" else samples
-        return rts.render(part, camera, (size, size), supersample=more, splatter=splatter)[..., :3]
+        return rts.render(part, camera, (size, size), supersample=samples, splatter=splatter)[..., :3]
 
     return render
 

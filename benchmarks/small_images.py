@@ -23,7 +23,7 @@ import rts
 from benchmarks.report import table
 
 SIZES, SEEDS, STEPS = (4, 8, 16), 4, 3000
-SAMPLES: dict[str, Any] = {"1": 1, "2 x 2": 2, "4 x 4": 4, "Adaptive(4)": rts.Adaptive(4)}
+SAMPLES = {"1": 1, "2 x 2": 2, "4 x 4": 4}
 RATE, DECAY, OFF = 0.01, 10**-1.5, 0.25
 """Adam's rate at the start; its factor at the end; how far corners are off at most along each axis, in edges."""
 CAMERA = rts.Camera.look_at((0, 0, 2.8), (0, 0, 0), fov_y=45)

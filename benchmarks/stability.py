@@ -40,7 +40,7 @@ def hand_row(kept: KeptMeasurements) -> Row:
         f"the best rate; the highest rate at which no seed ends above {hand.STALLED} of the error at the start. "
         "Degraded where another method stands a higher one."
     )
-    why = "`single` does not know what an outline that moves brings to light; `multi` and `visible` do."
+    why = "`single` does not know what an outline that moves brings to light; `multi` and `edges` do."
     return Row(HAND, note, partial(_hand, kept), why)
 
 

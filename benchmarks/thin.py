@@ -1,17 +1,12 @@
-"""Things thinner than pixels: errors of derivatives by what is sampled, and what it costs to look between samples.
+"""Things thinner than pixels: errors of derivatives by the number of samples a pixel, beside Mitsuba.
 
 Errors are of `rts_compare.stability` (low-passed relative L2 of the derivative image), against derivatives of 24 × 24
 points a pixel, since 8 × 8 of that table are themselves off by 0.08, 0.14 and 0.23 for wires. Times are processor time
-of a render and its derivative. Costs are processor time of pose iterations, with `thin` and without, in turns. False
-marks are pixels of meshes without thin things that `thin` makes active. The cube is one of 2 × 2 pixels in images of
-8², fitted as `benchmarks.small_images` does.
+of a render and its derivative.
 
     python -m benchmarks.thin
     python -m benchmarks.thin --mitsuba 4 16 64
     python -m benchmarks.thin --truths 8 16
-    python -m benchmarks.thin --cost
-    python -m benchmarks.thin --false-marks
-    python -m benchmarks.thin --cube
 """
 
 from __future__ import annotations
@@ -24,13 +19,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 import rts
-from benchmarks.camera import camera
-from benchmarks.meshes import MESHES, kept_mesh
 from benchmarks.report import table
-from benchmarks.small_images import fitted
 from rts_compare import scene_shapes
 from rts_compare.failures import failure_scenes
 from rts_compare.failures.method_renderers import renderer
@@ -39,15 +30,7 @@ from rts_compare.failures.table_cells import Context
 from rts_compare.failures.table_columns import Method
 from rts_compare.moving_scenes import Scene
 
-SAMPLES = {
-    "1": 1,
-    "2 × 2": 2,
-    "4 × 4": 4,
-    "8 × 8": 8,
-    "Adaptive(4)": rts.Adaptive(4),
-    "Adaptive(4, thin)": rts.Adaptive(4, thin=True),
-    "Adaptive(8, thin)": rts.Adaptive(8, thin=True),
-}
+SAMPLES = {"1": 1, "2 × 2": 2, "4 × 4": 4, "8 × 8": 8}
 POINTS = 24
 """The square root of the number of points a pixel of true derivatives, on each of two grids."""
 PIXEL = scene_shapes.pixel(scene_shapes.DISTANCE, failure_scenes.SIZE[0])
@@ -134,9 +117,7 @@ def cell(scene: Scene, method: Method, context: Context) -> str:
 def errors(output: Path, spp: list[int]) -> str:
     """The table of errors; `spp` are Mitsuba's samples a pixel."""
     context = Context(samples=POINTS, folder=output / "truths")
-    ours = {"splatter": "visible", "layers": 2}
-    methods = {name: Method(name, {**ours, "supersample": s}) for name, s in SAMPLES.items()}
-    methods["edges"] = Method("edges", {"splatter": "edges"})
+    methods = {name: Method(name, {"splatter": "edges", "supersample": s}) for name, s in SAMPLES.items()}
     methods |= {f"Mitsuba, {n} spp": Method("Mitsuba", {"spp": n}, "Mitsuba") for n in spp}
     made = {name: make() for name, make in SCENES.items()}
     rows = [[name, *(cell(scene, m, context) for scene in made.values())] for name, m in methods.items()]
@@ -145,7 +126,7 @@ def errors(output: Path, spp: list[int]) -> str:
 
 def noise(output: Path, points: list[int]) -> str:
     """The table of estimated errors of true derivatives, of so many points a pixel along each side."""
-    plain, rows = Method("1", {"splatter": "visible", "layers": 2}), []
+    plain, rows = Method("1", {"splatter": "edges"}), []
     for n in points:
         context = Context(samples=n, folder=output / "truths")
         found = [Derivative(make).numbers(plain, context)["truth_error"] for make in SCENES.values()]
@@ -160,7 +141,7 @@ def draw(path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    shown = ["1", "Adaptive(4)", "Adaptive(4, thin)", "8 × 8"]
+    shown = list(SAMPLES)
     parts = [scene_shapes.wires(failure_scenes.SIZE[0], [0.25] * 7), cones(), hair(), fence()]
     figure, axes = plt.subplots(len(parts), len(shown), figsize=(12, 12))
     for row, part in zip(axes, parts, strict=True):
@@ -173,59 +154,6 @@ def draw(path: Path) -> None:
     plt.close(figure)
 
 
-def cost(output: Path, rounds: int) -> str:
-    """The table of what `thin` costs a pose iteration of a mesh, with and without back faces."""
-    rows = []
-    for name in ("bunny", "nefertiti"):
-        vertices, faces = kept_mesh(name, output)
-        theta = {"vertices": torch.tensor(vertices), "color": torch.tensor([1.0, 0.5, 0.2])}
-        for side in (256, 512):
-            for cull in ("none", "back"):
-                pose = torch.zeros(6, requires_grad=True)
-                mesh, times = rts.Mesh(faces), {False: [], True: []}
-                for n in range(2 * rounds + 4):
-                    thin = bool(n % 2)
-                    start = time.process_time()
-                    part = rts.Part(mesh, theta, "unlit", cull=cull, transform=rts.rigid(pose))
-                    image = rts.render(part, camera(), (side, side), supersample=rts.Adaptive(4, thin=thin))
-                    image.square().mean().backward()
-                    if n >= 4:
-                        times[thin].append(time.process_time() - start)
-                without, told = (1e3 * statistics.median(times[thin]) for thin in (False, True))
-                rows.append([f"{len(faces):,}", str(side), cull, f"{without:.1f}", f"{told - without:+.1f}"])
-                rows[-1].append(f"{100 * (told / without - 1):+.0f} %")
-    return table(["faces", "image", "cull", "Adaptive(4), ms", "thin, ms", "thin"], rows)
-
-
-def false_marks(output: Path, sizes: tuple[int, ...] = (128, 256, 512)) -> str:
-    """The table of active pixels of the benchmarks' meshes, without `thin`, and of those that it adds."""
-    rows = []
-    for name in MESHES:
-        vertices, faces = kept_mesh(name, output)
-        for cull in ("none", "back"):
-            part, cells = rts.Part(rts.Mesh(faces), {"vertices": vertices}, cull=cull), []
-            for side in sizes:
-                plain, thin = (
-                    rts.sample(part, camera(), (side, side), supersample=rts.Adaptive(4, thin=thin), layers=1).fine
-                    for thin in (False, True)
-                )
-                assert plain is not None and thin is not None
-                added = np.count_nonzero((thin.pixel >= 0) & (plain.pixel < 0))
-                cells.append(f"{np.count_nonzero(plain.pixel >= 0)}, +{added}")
-            rows.append([f"{len(faces):,}", cull, *cells])
-    return table(["faces", "cull", *(f"{side}²" for side in sizes)], rows)
-
-
-def cube(steps: int, seeds: int) -> str:
-    """The table of how far corners of a cube of 2 × 2 pixels are off after a fit, in edges."""
-    distance = 8 / (4 * np.tan(np.radians(22.5)))
-    far, rows = rts.Camera.look_at((0, 0, distance), (0, 0, 0), fov_y=45), []
-    for name in ("Adaptive(4)", "Adaptive(4, thin)"):
-        found = [fitted(8, SAMPLES[name], seed, steps, far) for seed in range(seeds)]
-        rows.append([name, *(f"{np.mean(x):.3f}" for x in zip(*found, strict=True))])
-    return table(["samples", "off at the start", "at the end"], rows)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/thin"))
@@ -233,23 +161,10 @@ def main() -> None:
     parser.add_argument(
         "--truths", type=int, nargs="*", default=[], metavar="POINTS", help="errors of the truth itself"
     )
-    parser.add_argument("--cost", action="store_true")
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--false-marks", action="store_true")
-    parser.add_argument("--cube", action="store_true")
-    parser.add_argument("--steps", type=int, default=1500, help="of a fit of the cube")
-    parser.add_argument("--seeds", type=int, default=2, help="of fits of the cube")
     given = parser.parse_args()
     (given.output / "truths").mkdir(parents=True, exist_ok=True)
-    if given.truths or given.cost or given.false_marks or given.cube:
-        if given.truths:
-            print(noise(given.output, given.truths))
-        if given.cost:
-            print(cost(given.output, given.rounds))
-        if given.false_marks:
-            print(false_marks(given.output))
-        if given.cube:
-            print(cube(given.steps, given.seeds))
+    if given.truths:
+        print(noise(given.output, given.truths))
         return
     print(errors(given.output, given.mitsuba))
     draw(given.output / "thin.png")

@@ -21,12 +21,8 @@ import torch
 
 import rts
 from benchmarks.report import table
-from benchmarks.timing import in_turn
-from rts.contracts.records import Splats
 from rts.diagnostics.example_shapes import icosphere
 from rts.diagnostics.smoothing import low_pass
-from rts.rendering.scene import Scene
-from rts.rendering.splats import to_splats
 from rts_compare.other_renderers.mitsuba_renderer import emitter, flat, mitsuba, positions_of, sensor, set_flat
 
 CAMERA = rts.Camera.look_at((0.1, 0.2, 6), (0, 0, 0), (0.21, 1, 0), fov_y=30)
@@ -35,7 +31,7 @@ SIZE, LAYERS, AREA = (128, 128), 6, 16
 """AREA² samples a pixel make the truth."""
 PIXEL = 3.2 / SIZE[0]
 UNLIT = rts.plugin("shaders", "unlit")
-METHODS = tuple((name, s) for name in ("visible", "edges", "multi", "none") for s in (1, 2))
+METHODS = tuple((name, s) for name in ("edges", "multi", "none") for s in (1, 2))
 MODES = "position", "colour", "alpha"
 
 
@@ -161,7 +157,7 @@ def edges_rows() -> Iterator[list[str]]:
             change.image(torch.tensor(s), splatter="none", supersample=AREA)[..., :3].numpy() for s in (-0.25, 0, 0.25)
         ]
         true, cells = (area[2] - area[0]) / 0.5, []
-        for splatter in ("visible", "edges"):
+        for splatter in ("multi", "edges"):
             found = change.derivative(splatter, 1)
             image = change.image(torch.zeros(()), splatter=splatter)[..., :3].numpy()
             apart = np.linalg.norm(found - true) / np.linalg.norm(true)
@@ -205,49 +201,6 @@ def peer_rows(samples: int = 64) -> Iterator[list[str]]:
         if parts is cards:
             change = Change(parts(), index, "position")
             yield [name, score(by_mitsuba(change, samples, 0), change.truth())]
-
-
-# --------------------------------------------------------------------------------------------------------- time
-
-
-def pane_splats(layers: int, alpha: float) -> Splats:
-    """Splats at 256² of layers − 1 panes of random sizes before a backdrop."""
-    rng, parts = np.random.default_rng(0), [backdrop(-1)]
-    for i in range(layers - 1):
-        color, sides = rng.random(3), (np.sort(rng.uniform(-1.3, 1.3, 2)) + [-0.3, 0.3] for _ in range(2))
-        (left, right), (bottom, top) = sides
-        parts.append(card(0.8 - 0.2 * i, color, alpha, left, right, bottom, top))
-    scene = Scene.of(parts, CAMERA, "raster", "torch").at((256, 256))
-    sampled = rts.sample(parts, CAMERA, (256, 256), splatter=None, layers=layers, sampler="raster", engine="torch")
-    return to_splats(sampled, scene.parts, scene.camera, scene.camera, scene.context)
-
-
-def splatting(splats: Splats, backward: bool) -> Callable[[], object]:
-    """The image of splats, and the gradient of a sum of squares in positions and colours."""
-    splatter = rts.plugin("splatters", "visible")()
-    positions, rgba = (x.detach().clone().requires_grad_(backward) for x in (splats.positions, splats.rgba))
-    given = splats.replace(positions=positions, rgba=rgba)
-
-    def call() -> None:
-        image = splatter.cropped(given)
-        if backward:
-            torch.autograd.grad(image.square().sum(), [positions, rgba])
-
-    return call
-
-
-def time_rows(rounds: int) -> Iterator[list[str]]:
-    for layers in (4, 8):
-        functions = {
-            (alpha, backward): splatting(pane_splats(layers, alpha), backward)
-            for alpha in (1.0, 0.5)
-            for backward in (False, True)
-        }
-        times = {key: row["ms"] for key, row in in_turn(functions, rounds).items()}
-        for backward in (False, True):
-            opaque, translucent = times[1.0, backward], times[0.5, backward]
-            what = "image and gradient" if backward else "image"
-            yield [str(layers), what, f"{opaque:.1f}", f"{translucent:.1f}", f"{translucent / opaque:.2f}"]
 
 
 # --------------------------------------------------------------------------------------------------------- fits
@@ -350,7 +303,7 @@ def off(task: Task, numbers: torch.Tensor) -> str:
 def fit_rows(steps: int) -> Iterator[list[str]]:
     for name, task in tasks().items():
         yield [name, "at first", off(task, task.start)]
-        for splatter in ("visible", "edges", "multi", "none"):
+        for splatter in ("edges", "multi", "none"):
             yield [name, splatter, off(task, task.found(splatter, steps))]
 
 
@@ -362,15 +315,13 @@ def pictures(folder: Path) -> None:
     from matplotlib.figure import Figure
 
     chosen = list(SCENES)[0], list(SCENES)[2], list(SCENES)[4]
-    titles = "image", "derivative, truth", "'visible'", "'multi'", "'none'"
+    titles = "image", "derivative, truth", "'edges'", "'multi'", "'none'"
     figure = Figure(figsize=(2.6 * 5, 2.6 * len(chosen) + 0.3), layout="constrained")
     for n, (axes, name) in enumerate(zip(figure.subplots(len(chosen), 5), chosen, strict=True)):
         parts, index = SCENES[name]
         change = Change(parts(), index, "position")
         shown = [change.image(torch.zeros(()), splatter="none", supersample=4)[..., :3].numpy()]
-        shown += [
-            0.5 + 3 * x for x in (change.truth(), *(change.derivative(s, 1) for s in ("visible", "multi", "none")))
-        ]
+        shown += [0.5 + 3 * x for x in (change.truth(), *(change.derivative(s, 1) for s in ("edges", "multi", "none")))]
         for axis, picture, title in zip(axes, shown, titles, strict=True):
             axis.imshow(picture.clip(0, 1))
             axis.set(xticks=[], yticks=[], title="" if n else title)
@@ -385,7 +336,7 @@ def fit_pictures(folder: Path, steps: int) -> None:
     figure = Figure(figsize=(2.6 * 4, 2.6 * 2 + 0.3), layout="constrained")
     for n, (axes, (name, task)) in enumerate(zip(figure.subplots(2, 4), tasks().items(), strict=True)):
         shown = {"picture": task.goal, "start": task.start}
-        shown |= {f"'{splatter}'": task.found(splatter, steps) for splatter in ("visible", "none")}
+        shown |= {f"'{splatter}'": task.found(splatter, steps) for splatter in ("edges", "none")}
         options: dict[str, Any] = {"layers": LAYERS, "supersample": 2, "background": np.float32([1, 1, 1])}
         for axis, (title, numbers) in zip(axes, shown.items(), strict=True):
             picture = rts.render(task.scene(numbers), task.cameras[0], SIZE, **options)[..., :3]
@@ -397,8 +348,7 @@ def fit_pictures(folder: Path, steps: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=["derivatives", "edges", "peers", "time", "fits", "pictures"])
-    parser.add_argument("--rounds", type=int, default=15, help="turns of each call that is timed")
+    parser.add_argument("--only", nargs="+", choices=["derivatives", "edges", "peers", "fits", "pictures"])
     parser.add_argument("--steps", type=int, default=300, help="of each fit")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/translucent"))
     args = parser.parse_args()
@@ -406,9 +356,8 @@ def main() -> None:
     warnings.simplefilter("ignore", rts.errors.LayersWarning)  # Of `multi`, which is measured on purpose.
     sections = {
         "derivatives": (["scene", "changes", *(f"{name}, {s} × {s}" for name, s in METHODS)], derivative_rows()),
-        "edges": (["what moves", "visible", "edges"], edges_rows()),
+        "edges": (["what moves", "multi", "edges"], edges_rows()),
         "peers": (["scene", "Mitsuba, prb_projective, 64 spp"], peer_rows()),
-        "time": (["K", "", "opaque, ms", "translucent, ms", "ratio"], time_rows(args.rounds)),
         "fits": (["fit", "splatter", "result"], fit_rows(args.steps)),
     }
     chosen = args.only or [name for name in (*sections, "pictures") if name != "peers" or find_spec("mitsuba")]

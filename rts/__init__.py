@@ -44,11 +44,11 @@ from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
+from rts.rendering.arguments import Adaptive as Adaptive
 from rts.rendering.batched import render_views
 from rts.rendering.image import render, render_samples
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
-from rts.sampling.adaptive import Adaptive
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -82,7 +82,6 @@ def __dir__() -> list[str]:
 __version__ = "0.3.0.dev0"
 
 __all__ = [
-    "Adaptive",
     "Camera",
     "Engine",
     "EngineError",

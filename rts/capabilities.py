@@ -36,7 +36,7 @@ VARIABLES: Mapping[str, tuple[str, ...]] = {
     "rts.engines": ("differentiates",),
     "rts.samplers": ("concurrent",),
     "rts.shaders": ("opaque", "uniform", "takes_views", "reads"),
-    "rts.splatters": ("layers", "reach", "reads", "fills_interiors", "translucent"),
+    "rts.splatters": ("layers", "reach", "reads", "translucent"),
 }
 """Group → class variables of its base class that are reported as capabilities."""
 

@@ -20,7 +20,6 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
     "uniform": ("__call__",),
     "takes_views": ("__call__",),
     "reads": ("__call__", "base_color"),
-    "fills_interiors": ("image", "accumulate"),
     "translucent": ("image", "accumulate"),
 }
 """Promise → the methods whose behaviour it describes; a class may lack some of them."""

@@ -10,13 +10,9 @@ from rts import Camera, InputError, Part, RaySurface, Sampler, engine_of, namesp
 from rts.plugin_api.arrays import Array, constants, exemplar, map_leaves, shape_of
 from rts.plugin_api.checks import check_camera
 from rts.plugin_api.records import ArraySpec, Cells, RayHits, Request, Samples
-from rts.plugin_api.splats import outline_cells
 
 REACH = 3.0
 """Distance from a ray, in pixels, up to which an outline counts: beyond, deepest points do not tell how it moves."""
-
-ROOM = 16
-"""Rows of a capacity for which one pair of rows, at outlines, is allotted beside the capacity."""
 
 
 class Rays(Sampler):
@@ -42,18 +38,12 @@ class Rays(Sampler):
         rays = camera.rays(size, request.points)
         directions = xp.reshape(rays.directions, (-1, 3))
         origins = xp.reshape(rays.origins, (-1, 3))
-        listed, view = True, size
-        if request.cells is not None:
-            index: Array = xp.reshape(constants(request.cells, engine, like), (-1,))
-            size, listed = tuple(request.cells.shape), index[None] >= 0
-            index = xp.where(index >= 0, index, 0)
-            directions, origins = xp.take(directions, index, axis=0), xp.take(origins, index, axis=0)
-        elif request.points is not None:
+        if request.points is not None:
             size = 1, request.points.shape[0]
         origins = origins + near * directions
         hits = _checked_hits(surface.intersect(theta, origins, directions, layers), surface, layers, size)
         depth = near + hits.distance
-        hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far) & listed, (layers, *size))
+        hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far), (layers, *size))
 
         every, capacity = layers * size[0] * size[1], request.capacity
         rows = every if capacity is None else capacity
@@ -76,85 +66,43 @@ class Rays(Sampler):
         else:
             ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
-        followed = tuple(name for name in ("cells", "points") if getattr(request, name) is not None)
-        facing = None
-        if request.facing and hits.entering is not None:
-            facing = _facing(xp.reshape(hits.entering, (layers, *size)), row)
-        samples = Samples(ids, params, Cells(row, depth, facing), overflow, followed=followed)
-        asked = request.exits and hits.entering is not None
-        if not (asked and type(surface).deepest is not RaySurface.deepest):
+        followed = () if request.points is None else ("points",)
+        samples = Samples(ids, params, Cells(row, depth), overflow, followed=followed)
+        asked = request.pairs and request.points is not None and hits.entering is not None
+        if not asked or type(surface).deepest is RaySurface.deepest:
             return samples
-        width = rays.spread[0] + rays.spread[1] * depth[0, ...]
+        width = xp.reshape(rays.spread[0] + rays.spread[1] * depth[0, ...], (-1,))
         start = origins + xp.reshape(hits.distance[0, ...], (-1, 1)) * directions
-        begins = xp.reshape(hits.entering, hit.shape)[0, ...] & (row[0, ...] >= 0)
-        reach = REACH * xp.reshape(width, (-1,))
-        cells = None if request.cells is None else constants(request.cells, engine, like)
-        if request.points is not None:
-            view = None
-        return _with_deepest(samples, surface, theta, begins, (start, directions, reach), capacity, cells, view)
+        return _with_deepest(samples, surface, theta, hits.entering[0, ...], start, directions, REACH * width)
 
 
 def _with_deepest(
-    samples: Samples,
-    surface: RaySurface,
-    theta: Any,
-    begins: Array,
-    rays: tuple[Array, ...],
-    capacity: int | None,
-    listed: Array | None,
-    view: tuple[int, int] | None,
+    samples: Samples, surface: RaySurface, theta: Any, begins: Array, points: Array, directions: Array, reach: Array
 ) -> Samples:
-    """Samples with two further rows for cells at outlines, beside the deepest points of their rays; see `Cells.exit`.
+    """Samples of points with two further rows for each, beside the deepest points of their rays; see `Samples.pair`.
 
     Args:
         samples: the samples.
         surface: the surface.
         theta: its θ, constant.
-        begins: (H, W) or (L, C) bool, cells whose ray enters a solid at the front.
-        rays: points of the surface (M, 3), directions (M, 3), and reach (M,), of all M cells, as `RaySurface.deepest`
-            takes them for some.
-        capacity: see `Request`. A sixteenth of it, rounded up, is the room for pairs; cells beyond it have none. None
-            for as much room as there are cells.
-        listed: (L, C), `Request.cells`; None for all cells of the grid.
-        view: (height, width) of the grid; None for points, all of which count as cells at outlines.
+        begins: (M,) bool, points whose ray enters a solid at the front.
+        points: (M, 3), see `RaySurface.deepest`.
+        directions: (M, 3), likewise.
+        reach: (M,), likewise.
     """
-    engine, xp, rows = engine_of(samples.ids, begins), namespace(begins), samples.ids.shape[0]
-    room = begins.shape[0] * begins.shape[1] if capacity is None else -(-capacity // ROOM)
-
-    def find(row: np.ndarray, depth: np.ndarray, begins: np.ndarray, *own: np.ndarray) -> tuple[np.ndarray, ...]:
-        cells = np.flatnonzero(row[0] >= 0) if view is None else outline_cells(row >= 0, depth, *own, size=view)
-        cells = cells[begins.reshape(-1)[cells]][:room]
-        number = np.full(begins.shape, -1, np.int32)
-        number.reshape(-1)[cells] = np.arange(len(cells), dtype=np.int32)
-        listed = np.zeros(max(1, len(cells)) if capacity is None else room, np.int32)
-        listed[: len(cells)] = cells
-        return listed, number
-
-    specs = ArraySpec((room,), np.int32, packed=capacity is None), ArraySpec(tuple(begins.shape), np.int32)
-    found, number = engine.call_host(
-        find, specs, samples.row, samples.depth, begins, *([] if listed is None else [listed])
-    )
-    result = surface.deepest(theta, *(xp.take(x, found, axis=0) for x in rays))
+    xp, engine, rows = namespace(samples.ids), engine_of(samples.ids), samples.ids.shape[0]
+    result = surface.deepest(theta, points, directions, reach)
     assert result is not None
     params, there = result
-    flat = xp.reshape(number, (-1,))
-    there = (number >= 0) & xp.reshape(xp.take(there, xp.where(flat >= 0, flat, 0), axis=0), number.shape)
-    first = rows + 2 * number
-    exits = xp.where(there[None, ...], xp.stack([first, first + 1]), -1)
+    count = params.shape[0]
+    first = engine.constant(np.arange(rows, rows + 2 * count, 2, dtype=np.int32), samples.ids)
+    pair = xp.where((there & begins & (samples.row[0, 0, :] >= 0))[None, :], xp.stack([first, first + 1]), -1)
     params = xp.reshape(params, (-1, params.shape[-1]))
     return samples.replace(
         ids=xp.concat([samples.ids, xp.astype(params[:, : samples.ids.shape[1]], samples.ids.dtype)]),
         params=xp.concat([samples.params, xp.astype(params, samples.params.dtype, copy=False)]),
-        exit=xp.astype(exits, xp.int32, copy=False),
+        pair=pair,
     )
-
-
-def _facing(entering: Array, row: Array) -> Array:
-    """`Cells.facing` of a solid of one piece, from `RayHits.entering` and `Cells.row`, all (K, H, W)."""
-    xp = namespace(row)
-    more = xp.concat([xp.zeros_like(row[:-1]), xp.full_like(row[-1:], Cells.MORE_BEHIND)])
-    sides = xp.where(entering, 1 + more, -1 - more)
-    return xp.astype(xp.where(row >= 0, sides, xp.zeros_like(sides)), xp.int16)
 
 
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:

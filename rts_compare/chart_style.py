@@ -11,11 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rts_compare.compared_settings import finest, in_python, samples_of
 from rts_compare.pareto_front import Row, milliseconds, timed
 
 SPLATTER_COLORS = {
-    "visible": "#D55E00",
+    "edges": "#D55E00",
     "multi": "#0072B2",
     "single": "#009E73",
     "none": "#5C6068",
@@ -100,21 +99,18 @@ def time_label(milliseconds: float) -> str:
     return f"{seconds:.3g} s" if seconds < 999.5 else f"{seconds:.0f} s"
 
 
-def side_length(supersample: int | str) -> float:
+def side_length(supersample: int) -> float:
     """The side of a row's symbol, screen pixels; it grows with samples along a pixel's side, up to 6 of these."""
-    return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
+    return 5.0 + 2.5 * min(supersample, 6)
 
 
-def samples_label(supersample: int | str) -> str:
-    """Samples a pixel in few words: "4×4", or "adaptive 4×4" where they are at outlines alone."""
-    side = finest(samples_of(supersample))
-    if not isinstance(supersample, str):
-        return f"{side}×{side}"
-    return " ".join([f"adaptive {side}×{side}", *supersample.split(":")[2:]])
+def samples_label(supersample: int) -> str:
+    """Samples a pixel: "4×4"."""
+    return f"{supersample}×{supersample}"
 
 
 def label(row: Row) -> str:
-    """A row's settings in few words, such as "visible K=2 2×2 raster torch tolerance=0.4"; 1×1 is left out."""
+    """A row's settings in few words, such as "edges K=1 2×2 raster torch tolerance=0.4"; 1×1 is left out."""
     settings = row["settings"]
     if "peer" in row:
         return " ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
@@ -131,9 +127,8 @@ def arguments(row: Row) -> str:
     settings = row["settings"]
     if "peer" in row:
         return "# " + ", ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
-    names = ("sampler", "splatter", "layers")
+    names = ("sampler", "splatter", "layers", "supersample")
     given = ", ".join(f"{name}={json.dumps(settings[name], ensure_ascii=False)}" for name in names)
-    given += f", supersample={in_python(settings['supersample'])}"
     return f"{given}  # " + ", ".join(filter(None, [settings["engine"], settings["rate"]]))
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rts import Adaptive
+from rts.diagnostics.command_tools import supersample_of
 
 if TYPE_CHECKING:
     from rts_compare.comparison import Comparison
@@ -48,7 +48,7 @@ def compare(
     splatters: Annotated[list[str] | None, typer.Option("--splatter", help="May be repeated. All by default.")] = None,
     engines: Annotated[list[str] | None, typer.Option("--engine", help="May be repeated. All by default.")] = None,
     supersample: Annotated[
-        list[str] | None, typer.Option(help="As in rts render. May be repeated. 1, 2, 4 and adaptive:4 by default.")
+        list[str] | None, typer.Option(help="As in rts render. May be repeated. 1, 2 and 4 by default.")
     ] = None,
     peers: Annotated[bool, typer.Option(help="DEODR and Mitsuba, where they are installed.")] = True,
     fresh: Annotated[bool, typer.Option("--fresh", help="Forget what earlier runs have measured.")] = False,
@@ -66,7 +66,7 @@ def compare(
         return
     wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
     options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
-    options["supersample"] = [Adaptive.of_text(text) for text in supersample or []] or None
+    options["supersample"] = [supersample_of(text) for text in supersample or []] or None
     shape = None if size is None else _size(size)
     if (missing := _missing_charts()) is not None:
         _say(escape(missing))

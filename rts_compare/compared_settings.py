@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rts import Adaptive, Engine, plugin, plugins
+from rts import Engine, plugin, plugins
 from rts.diagnostics.command_tools import engine_named
 from rts.errors import InputError, PluginError
 from rts.plugin_api.checks import quoted
@@ -15,9 +14,8 @@ from rts_compare.pareto_front import LEVELS
 FIRST = "torch"
 """The engine that measures errors where it is installed: all engines give the same ones, and it compiles nothing."""
 
-
-SHARE = 1.5
-"""Mean number of samples a pixel of an `rts.Adaptive`, about, as a multiple of its `samples`."""
+OTHER_NAMES = ("auto", "visible")
+"""Names that stand for another plugin of their group; they take part where they are given."""
 
 ALIKE = 1.1
 """A dearer setting is worth timing if its error is smaller by more than this factor, or within one more of `LEVELS`."""
@@ -29,7 +27,7 @@ class Setting(NamedTuple):
     Attributes:
         splatter: its name.
         layers: K, or "auto".
-        supersample: samples along each side of a pixel; or `as_text` of an `rts.Adaptive`, such as "adaptive:4".
+        supersample: samples along each side of a pixel.
         rate: how finely surfaces are sampled, such as "tolerance=0.4" (`Surface.rates`); "" for surfaces as given.
         sampler: its name; in settings whose errors alone are measured "", unless errors differ from the usual ones.
         engine: its name; "" in settings whose errors alone are measured.
@@ -37,7 +35,7 @@ class Setting(NamedTuple):
 
     splatter: str
     layers: int | str
-    supersample: int | str
+    supersample: int
     rate: str = ""
     sampler: str = ""
     engine: str = ""
@@ -45,48 +43,8 @@ class Setting(NamedTuple):
     @property
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `rts.render`: splatter, layers, supersample, and the sampler unless it is ""."""
-        found = {"splatter": self.splatter, "layers": self.layers, "supersample": samples_of(self.supersample)}
+        found = {"splatter": self.splatter, "layers": self.layers, "supersample": self.supersample}
         return {"sampler": self.sampler, **found} if self.sampler else found
-
-    @property
-    def side(self) -> float:
-        """Samples along a side of a pixel; for `rts.Adaptive`, the side of a full grid that costs about as much."""
-        found = samples_of(self.supersample)
-        return math.sqrt(SHARE * found.samples) if isinstance(found, Adaptive) else found
-
-
-def samples_of(supersample: int | str) -> int | Adaptive:
-    """The `supersample` of `rts.render` for `Setting.supersample`: a number, or an `rts.Adaptive`."""
-    return Adaptive.of_text(supersample) if isinstance(supersample, str) else int(supersample)
-
-
-def as_text(supersample: Adaptive) -> str:
-    """`Setting.supersample` of an `rts.Adaptive`: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
-    given = {"dilated": supersample.dilated, "contrast": supersample.contrast, "thin": supersample.thin or None}
-    return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
-
-
-def combine(splatter: str, supersample: int | str) -> bool:
-    """False for an `rts.Adaptive` beside a splatter that finds outlines without further samples.
-
-    Args:
-        splatter: its name.
-        supersample: as `Setting.supersample`.
-    """
-    return isinstance(supersample, int) or "outlines" not in plugin("rts.splatters", splatter)().reads
-
-
-def finest(supersample: Any) -> Any:
-    """Samples along a side of a pixel: of an `rts.Adaptive` those where they are finest; all else is returned as is."""
-    return supersample.samples if isinstance(supersample, Adaptive) else supersample
-
-
-def in_python(supersample: int | str) -> str:
-    """Python code for a `Setting.supersample`, as a user writes it: "2", or "rts.Adaptive(4)"."""
-    if not isinstance(supersample, str):
-        return str(supersample)
-    _, side, *options = supersample.split(":")
-    return f"rts.Adaptive({', '.join([side, *options])})"
 
 
 def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
@@ -94,7 +52,7 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
 
     Args:
         group: such as "rts.splatters".
-        chosen: names; None for all but "auto".
+        chosen: names; None for all but `OTHER_NAMES`.
 
     Raises:
         InputError: `chosen` is empty, no list, or has a name that is unknown.
@@ -105,7 +63,7 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
     if chosen is not None and (not isinstance(chosen, (list, tuple)) or not chosen):
         raise InputError(f"{group.removeprefix('rts.')} is {quoted(chosen)}; expected a list of names, or None for all")
     for name in plugins(group) if chosen is None else chosen:
-        if name == "auto" and chosen is None:
+        if name in OTHER_NAMES and chosen is None:
             continue
         try:
             loaded = plugin(group, name)

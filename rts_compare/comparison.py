@@ -11,13 +11,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rts import Adaptive, Engine
+from rts import Engine
 from rts.diagnostics.command_tools import output_folder, writing
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import is_count, quoted
-from rts_compare.compared_settings import Setting, as_text, combine, finest, usable, worth_timing
+from rts_compare.compared_settings import Setting, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
 from rts_compare.interleaved_timing import ROUNDS, Calls, InterleavedTiming
@@ -31,7 +31,7 @@ from rts_compare.skip_reasons import one_line
 from rts_compare.true_derivatives import SAMPLES
 
 LAYERS = (1, 2, 4, "auto")
-SUPERSAMPLE = (1, 2, 4, Adaptive(4))
+SUPERSAMPLE = (1, 2, 4)
 QUICK_CELLS = 40
 """Largest number of settings that are measured with `quick`."""
 PEER_ROUNDS = 2
@@ -115,7 +115,7 @@ class Plan(NamedTuple):
             `Measurements.kinds`.
         engines: engines with derivatives; the first measures errors.
         layers: numbers K, or "auto".
-        supersample: as `Setting.supersample`.
+        supersample: samples along each side of a pixel.
         rates: whether the rates that surfaces offer are tried.
         most: the most settings to measure; None for all.
         peers: other renderers.
@@ -125,7 +125,7 @@ class Plan(NamedTuple):
     samplers: Mapping[str, str]
     engines: Sequence[Engine]
     layers: Sequence[int | str]
-    supersample: Sequence[int | str]
+    supersample: Sequence[int]
     rates: bool
     most: int | None
     peers: Sequence[Peer]
@@ -142,7 +142,7 @@ def compare(
     splatters: Sequence[str] | None = None,
     engines: Sequence[str] | None = None,
     layers: Sequence[int | str] | None = None,
-    supersample: Sequence[int | Adaptive] | None = None,
+    supersample: Sequence[int] | None = None,
     peers: bool = True,
     quick: bool = False,
     surface: str = "mesh",
@@ -172,7 +172,7 @@ def compare(
         splatters: names; None for all.
         engines: names; None for all. Errors are measured with the first.
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
-        supersample: samples along each side of a pixel, or `rts.Adaptive`; None for 1, 2, 4 and `rts.Adaptive(4)`.
+        supersample: samples along each side of a pixel; None for 1, 2 and 4.
         peers: whether other renderers take part.
         quick: one mode, engine and sampler, and 1 and 2 layers, unless named; at most 40 settings, with surfaces as
             they are given; no other renderers.
@@ -194,15 +194,10 @@ def compare(
     kept = None if truths is None else output_folder(truths)
     found = some_modes(found, list(found.directions)[:1] if quick and modes is None else modes)
     layers = _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",))
-    samples_a_pixel = _samples(supersample)
+    samples_a_pixel = _counts("supersample", supersample, SUPERSAMPLE)
     if not is_count(truth_samples):
         raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     names, without = usable("rts.splatters", splatters)
-    if names and not any(combine(name, samples) for name in names for samples in samples_a_pixel):
-        raise InputError(
-            f"supersample is {quoted(supersample)}, and {', '.join(names)} finds outlines without further samples; "
-            f"give whole numbers, too, or another splatter"
-        )
     possible, missing = usable("rts.samplers", samplers)
     used, failing = engines_for(found, engines)
     earlier = _earlier(folder, found, fresh)
@@ -231,14 +226,6 @@ def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()
         expected = " or ".join(["integers of at least 1", *map(repr, others)])
         raise InputError(f"{name} is {quoted(given)}; expected {expected}")
     return [n if isinstance(n, str) else int(n) for n in numbers]
-
-
-def _samples(given: Any) -> list[int | str]:
-    """Values of `Setting.supersample` for the argument `supersample` of `compare`."""
-    wanted = list(SUPERSAMPLE) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
-    if not wanted or not all(is_count(finest(s)) for s in wanted):
-        raise InputError(f"supersample is {quoted(given)}; expected integers of at least 1 or rts.Adaptive")
-    return [as_text(s) if isinstance(s, Adaptive) else int(s) for s in wanted]
 
 
 def _unthinned() -> list[str]:

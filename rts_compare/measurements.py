@@ -14,7 +14,7 @@ from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError, RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
-from rts_compare.compared_settings import Setting, combine
+from rts_compare.compared_settings import Setting
 from rts_compare.derivative_scores import loss_weights, relative_l2, scores
 from rts_compare.interleaved_timing import LONGEST, Calls, InterleavedTiming
 from rts_compare.kept_measurements import KeptMeasurements
@@ -289,19 +289,17 @@ class Measurements:
         group: str,
         splatters: Iterable[str],
         layers: Iterable[int | str],
-        samples: Iterable[int | str],
+        samples: Iterable[int],
         kinds: Iterable[str] = ("",),
         rates: bool = True,
     ) -> list[Setting]:
         """All combinations of these options, without layers "auto" where "auto" fails.
 
-        Splatters that find outlines take no `Adaptive`.
-
         Args:
             group: the name of a group of modes; the rates depend on the parameters that these change.
             splatters: names.
             layers: numbers, or "auto".
-            samples: as `Setting.supersample`.
+            samples: numbers of samples along each side of a pixel.
             kinds: samplers whose errors differ from the usual one's, and "" for all others.
             rates: whether settings include the rates that surfaces offer.
         """
@@ -311,7 +309,6 @@ class Measurements:
             for rate in (self.at_rates(group) if rates else [""])
             for supersample in samples
             for splatter in splatters
-            if combine(splatter, supersample)
             for count in layers
         )
         return [setting for setting in all_of if self.counting(group, setting) is not None]
@@ -396,11 +393,8 @@ class Measurements:
         "auto" counts as half a layer more than it takes.
         """
         layers = self.counting(group, setting) or 0
-        return (
-            layers + (0.5 if setting.layers == "auto" else 0.0),
-            setting.side,
-            self.at_rates(group)[setting.rate].work,
-        )
+        layers += 0.5 if setting.layers == "auto" else 0.0
+        return layers, setting.supersample, self.at_rates(group)[setting.rate].work
 
     def call(self, group: str, setting: Setting) -> Callable[[], Any]:
         """A function that computes an image of the scene and a loss's gradient by the parameters of a group's modes.

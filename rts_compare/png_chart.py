@@ -20,7 +20,6 @@ from rts_compare.chart_style import (
     samples_label,
     side_length,
 )
-from rts_compare.compared_settings import finest, samples_of
 from rts_compare.pareto_front import Row, milliseconds
 
 if TYPE_CHECKING:
@@ -46,8 +45,8 @@ INK, PALE = "#1f2937", "#6b7280"
 COLUMNS = 2
 PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
 """Inches; `LINE_HEIGHT` is the height of a text line in the list under a panel."""
-CHARACTER_WIDTH = 0.075
-"""Width of a character in the text below all panels, inches."""
+CHARACTER_WIDTH, TITLE_CHARACTER_WIDTH = 0.075, 0.1
+"""Width of a character in the text below all panels, and of one above them, inches."""
 LONGEST = 84
 """The most characters of a text line in the list under a panel."""
 
@@ -97,11 +96,12 @@ def draw(comparison: Mapping[str, Any], path: Path) -> None:
 
 
 def _texts(figure: Figure, comparison: Mapping[str, Any]) -> None:
-    """Write the scene's name, size and note above the panels, and the environment below them."""
-    scene = comparison["scene"]
-    title = f"{scene['name']}, {' × '.join(map(str, scene['size']))}"
-    note = f"\n{scene['note']}" if scene.get("note") else ""
-    figure.suptitle(title + note, fontsize=13, color=INK, parse_math=False)
+    """Write the scene's name, size and note above the panels, left of the legend, and the environment below them."""
+    scene, width = comparison["scene"], figure.get_figwidth() - LEGEND_WIDTH
+    lines = [f"{scene['name']}, {' × '.join(map(str, scene['size']))}"]
+    lines += textwrap.wrap(scene.get("note", ""), int(width / TITLE_CHARACTER_WIDTH))
+    middle = width / figure.get_figwidth() / 2
+    figure.suptitle("\n".join(lines), x=middle, fontsize=13, color=INK, parse_math=False)
     where = textwrap.fill(environment_line(comparison["environment"]), int(figure.get_figwidth() / CHARACTER_WIDTH))
     figure.supxlabel(where, fontsize=8, color=PALE, parse_math=False)
 
@@ -147,9 +147,9 @@ def _ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int | str, bool], list[Row]]:
-    """(Colour, symbol, `Setting.supersample`, True on the Pareto front) → the rows that look so."""
-    found: dict[tuple[str, str, int | str, bool], list[Row]] = {}
+def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int, bool], list[Row]]:
+    """(Colour, symbol, samples along a pixel's side, True on the Pareto front) → the rows that look so."""
+    found: dict[tuple[str, str, int, bool], list[Row]] = {}
     for row in rows:
         settings = row["settings"]
         symbol = looks.samplers[settings["sampler"]] + looks.engines[settings["engine"]]
@@ -162,8 +162,8 @@ def _places(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
     return [milliseconds(row) for row in rows], [row["error"] for row in rows]
 
 
-def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str, Any]]:
-    """Keyword arguments of matplotlib's lines that draw a symbol: its shape, its dot, the bar of adaptive samples."""
+def _marks(symbol: str, color: str, supersample: int = 1) -> list[dict[str, Any]]:
+    """Keyword arguments of matplotlib's lines that draw a symbol: its shape, and its dot."""
     shape, hollow, dot = symbol.removesuffix("-dot").removesuffix("-open"), "-open" in symbol, symbol.endswith("-dot")
     size = 0.72 * side_length(supersample)  # Points of 1/72 inch.
     mark = {"marker": MARKERS[shape], "markersize": size, "linestyle": "none", "markeredgewidth": 0.9}
@@ -171,14 +171,7 @@ def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str
     if dot:
         inner = color if hollow else "white"
         marks.append({**mark, "marker": ".", "markersize": 0.6 * size, "color": inner, "markeredgewidth": 0})
-    if isinstance(supersample, str):
-        marks.append({**mark, "marker": "_", "markersize": 1.8 * size, "markeredgecolor": color})
     return marks
-
-
-def _order(supersample: int | str) -> tuple[bool, int, str]:
-    """The sorting key of a `Setting.supersample` in the legend: numbers first, then adaptive ones, by fineness."""
-    return isinstance(supersample, str), finest(samples_of(supersample)), str(supersample)
 
 
 DIRECTIONS = ((-0.7, -0.7), (-1.0, -0.2), (-0.2, -1.0))
@@ -234,7 +227,7 @@ def _legend(figure: Figure, rows: Sequence[Row], looks: Looks) -> None:
     from matplotlib.legend_handler import HandlerTuple
     from matplotlib.lines import Line2D
 
-    sides = sorted({row["settings"]["supersample"] for row in rows if "peer" not in row}, key=_order)
+    sides = sorted({row["settings"]["supersample"] for row in rows if "peer" not in row})
     sections = {
         "splatter": {name: _marks("circle", color) for name, color in looks.splatters.items()},
         "sampler": {name: _marks(symbol, PALE) for name, symbol in looks.samplers.items()},

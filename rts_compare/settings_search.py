@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 from rts.diagnostics.progress import Phase
 from rts.errors import InputError, ToleranceWarning, warn
-from rts_compare.compared_settings import Setting, in_python
+from rts_compare.compared_settings import Setting
 from rts_compare.interleaved_timing import Calls
 from rts_compare.measurements import TOGETHER, Measurements
 
 LAYERS = (1, 2, 4, 8)
-SUPERSAMPLE = (1, 2, "adaptive:4", 3, 4)
+SUPERSAMPLE = (1, 2, 4)
 HOPELESS = 2.0
 """A splatter is tried further if its error is within the tolerance, or at most this many times the best one's."""
 ALIKE = 0.9
@@ -30,8 +30,6 @@ ENOUGH = 3
 NEARLY = 1.2
 """A setting is skipped if even the most layers and finest surface, with its samples, err by more than this many
 times the tolerance."""
-FAR = 1.5
-"""A setting is skipped if errors with fewer samples predict more than this many times the tolerance for it."""
 
 
 class Found(NamedTuple):
@@ -120,7 +118,7 @@ class Search:
         splatters: Sequence[str],
         kind: str,
         layers: Sequence[int] = LAYERS,
-        supersample: Sequence[int | str] = SUPERSAMPLE,
+        supersample: Sequence[int] = SUPERSAMPLE,
         rates: bool = True,
     ) -> list[Setting]:
         """All settings whose sampler has errors of one kind, a value of `samplers`; the least work first."""
@@ -155,30 +153,29 @@ class Search:
         return layers, supersample**2, rate
 
     def _within(self, cells: Sequence[Setting]) -> list[Setting]:
-        """Settings whose error is within the tolerance, without settings that are `_needless` beside a cheaper one."""
-        done = self.phase("errors", len(cells))
-        accurate: list[Setting] = []
-        passed: list[Setting] = []
-        for setting in cells:
-            done()
-            if self._needless(setting, accurate):
-                continue
-            if self._far(setting) or self._in_vain(setting, cells, accurate):
-                passed.append(setting)
-            elif not self._looked_at(setting, accurate):
-                break
-        for setting in [] if accurate else passed:
-            if not self._needless(setting, accurate) and not self._looked_at(setting, accurate):
-                break
-        return accurate
+        """Settings whose error is within the tolerance, without settings that are `_needless` beside a cheaper one.
 
-    def _looked_at(self, setting: Setting, accurate: list[Setting]) -> bool:
-        """Try a setting, and add it to `accurate` if it is accurate enough; False if time is up."""
-        if self._over():
-            return False
-        if self._bound(setting) <= self.tolerance:
-            accurate.append(setting)
-        return True
+        Of a splatter, sampler and samples the cheapest is tried first, then that of the most layers and finest surface:
+        the others are not, if this one is too inaccurate.
+        """
+        levels: dict[tuple, list[Setting]] = {}
+        for setting in cells:
+            levels.setdefault((setting.splatter, setting.sampler, setting.supersample), []).append(setting)
+        done, accurate = self.phase("errors", len(levels)), []
+        for level in levels.values():
+            done()
+            best = max(level, key=lambda s: self._work(s)[::-1])
+            for setting in dict.fromkeys([level[0], best, *level]):
+                if self._over():
+                    return accurate
+                if self._needless(setting, accurate):
+                    continue
+                error = self._bound(setting)
+                if error <= self.tolerance:
+                    accurate.append(setting)
+                elif setting == best and error > NEARLY * self.tolerance:
+                    break
+        return accurate
 
     def _needless(self, setting: Setting, accurate: Sequence[Setting]) -> bool:
         """True if an accurate setting costs far less, or no more in any respect with the same splatter and sampler."""
@@ -191,39 +188,10 @@ class Search:
             for s in accurate
         )
 
-    def _far(self, setting: Setting) -> bool:
-        """True if errors with fewer samples, extrapolated as a power of the number, predict an error far too large."""
-        if isinstance(setting.supersample, str):
-            return False  # The error of "adaptive" is that of as many samples everywhere.
-        numbers = [n for n in SUPERSAMPLE if not isinstance(n, str) and n < setting.supersample]
-        fewer = {n: self._cell(setting._replace(supersample=n)) for n in numbers}
-        known = [(n, self.bounds[cell]) for n, cell in fewer.items() if cell in self.bounds]
-        if len(known) < 2:
-            return False
-        (coarse, larger), (fine, smaller) = known[-2:]
-        if not 0 < smaller < math.inf or not 0 < larger < math.inf:
-            return False
-        power = math.log(smaller / larger) / math.log(fine / coarse)
-        return smaller * (setting.supersample / fine) ** power > FAR * self.tolerance
-
     def _cost(self, setting: Setting) -> float:
         """The approximate cost of a setting: hidden layers have few samples, and faces cost less than pixels."""
         layers, samples, rate = self._work(setting)
         return math.sqrt(layers * rate) * samples
-
-    def _in_vain(self, setting: Setting, cells: Sequence[Setting], accurate: list[Setting]) -> bool:
-        """True if this splatter and samples are too inaccurate even with the most layers and finest surface.
-
-        That setting is tried here, once any other setting of this splatter, sampler and samples was tried. If it is
-        accurate enough, it is added to `accurate`.
-        """
-        level = [s for s in cells if s._replace(layers=0, rate="") == setting._replace(layers=0, rate="")]
-        best = max(level, key=lambda s: (self._work(s)[2], self._work(s)[0]))
-        if setting == best or not any(self._cell(s) in self.bounds for s in level) or self._over():
-            return False
-        if self._cell(best) not in self.bounds:
-            self._looked_at(best, accurate)
-        return self.bounds.get(self._cell(best), 0.0) > NEARLY * self.tolerance
 
     def _best(self, cells: Sequence[Setting]) -> Setting:
         """The setting with the least error of all that the search tried; without any error, the first of `cells`.
@@ -364,7 +332,7 @@ def _value(setting: Setting, name: str) -> str:
     value = getattr(setting, name)
     if name == "rate":
         return value or "the surfaces as they are given"
-    return f"{name}={in_python(value) if name == 'supersample' else repr(value)}"
+    return f"{name}={value!r}"
 
 
 def _percent(error: float) -> str:

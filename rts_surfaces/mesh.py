@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from rts import GBuffer, InputError, Part, Rate, TriangleSurface, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, exemplar, unit
-from rts.plugin_api.checks import fingerprint, index_table, pieces, quoted
+from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import filled_up, interpolate, take, with_room
 from rts.plugin_api.records import Proxy, Samples
 from rts.plugin_api.threads import read_only
@@ -63,7 +63,6 @@ class Mesh(TriangleSurface):
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
-        self._pieces: np.ndarray | None = None
         self._reads: dict[tuple, tuple[str, ...]] = {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -140,12 +139,6 @@ class Mesh(TriangleSurface):
     def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
         """The mesh itself, its vertices in float32."""
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
-
-    def pieces(self, proxy: Proxy) -> np.ndarray:
-        """For each face the number (T,) int16 of its piece of one orientation, see `TriangleSurface.pieces`; kept."""
-        if self._pieces is None:
-            self._pieces = pieces(self.faces)
-        return self._pieces
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Interpolated positions and attributes; see the class for their names."""

@@ -147,30 +147,31 @@ class Sheets(rts.TriangleSurface):
 
 
 class Crowded(Sheets):
-    """Sheets whose samples find x and y in a table that has room for some: a sample is its sheet and its entry."""
+    """Sheets whose samples find x, y and their sheet in a table that has room for some: a sample is its entry."""
 
-    sample_widths = (2, 0)
+    sample_widths = (1, 0)
 
     def __init__(self, room):
         self.room = room
 
     def table_specs(self, rows, capacity):
-        return {"places": ArraySpec((self.room, 2), np.float32, packed=capacity is None)}
+        return {"places": ArraySpec((self.room, 3), np.float32, packed=capacity is None)}
 
     def refine(self, inputs, samples, rays):
         entry = np.arange(len(samples.ids), dtype=np.int32)[:, None]
         row = np.where(samples.row < self.room, samples.row, -1)
         return samples.replace(
-            ids=np.concatenate([samples.ids, np.minimum(entry, self.room - 1)], axis=1),
+            ids=np.minimum(entry, self.room - 1),
             params=samples.params[:, :0],
             row=row,
             overflow=samples.overflow + ((samples.row >= 0) & (row < 0)).sum(),
-            tables={"places": samples.params[: self.room]},
+            tables={"places": np.column_stack([samples.params, samples.ids])[: self.room]},
         )
 
     def evaluate(self, theta, samples):
-        places = samples.tables["places"]
-        return self.at(theta, rts.namespace(places).take(places, samples.ids[:, 1], axis=0), samples.ids[:, 0])
+        xp = rts.namespace(samples.ids)
+        places = xp.take(samples.tables["places"], samples.ids[:, 0], axis=0)
+        return self.at(theta, places[:, :2], xp.astype(places[:, 2], samples.ids.dtype))
 
 
 class Torus(rts.RaySurface):

@@ -227,6 +227,6 @@ def crooked_block(folder):
     return path
 
 
-def splats_of(positions, rgba, row, part=None, facing=None, exit=None, settled=None, **more):
+def splats_of(positions, rgba, row, part=None, **more):
     """Splats of arrays of samples and of cells."""
-    return Splats(positions, rgba, Cells(row, None, facing, exit, settled), part, **more)
+    return Splats(positions, rgba, Cells(row), part, **more)

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from example_surfaces import Bezier, Crowded
-from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, gradient, to_numpy
+from example_surfaces import Bezier
+from helpers import DIFFERENTIABLE, FRONT, arrays, gradient, to_numpy
 from seen import CAMERA, SIZE, VIEWS, WEIGHTS, close, loss_of, rays_spread, stages
 
 import rts
-from rts import splatting
 from rts.testing import SurfaceConformance
 from rts.testing.compatibility import APRON
 from rts.testing.derivatives import claim_slope, directions
@@ -79,53 +78,6 @@ def test_coarse_and_fine_triangles_lead_to_the_same_roots():
     assert same.mean() > 0.95
 
 
-def unpruned(splatter):
-    return type("Whole", (type(splatter),), {"needed": rts.Splatter.needed})()
-
-
-@pytest.mark.parametrize("layers", [2, 3, 4])
-def test_the_image_is_the_same_without_what_is_not_needed(layers):
-    for splatter in (rts.plugin("splatters", "visible")(), splatting.Visible()):
-        whole = unpruned(splatter)
-        images = [rts.render(BEZIER, CAMERA, SIZE, layers=layers, splatter=s) for s in (splatter, whole)]
-        np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
-        sampled = [rts.sample(BEZIER, CAMERA, SIZE, layers=layers, splatter=s) for s in (splatter, whole)]
-        counts = [int((s.row >= 0).sum()) for s in sampled]
-        assert 200 < counts[0] < counts[1]
-
-
-def test_with_another_part_and_prepared_the_image_is_the_same_without_what_is_not_needed():
-    parts = [BEZIER, rts.Part(Crowded(2000), {"heights": np.array([-0.3, 0.3, -0.7], np.float32)}, shader="depth")]
-    splatter = splatting.Visible()
-    images = [rts.render(parts, CAMERA, SIZE, layers=4, splatter=s) for s in (splatter, unpruned(splatter))]
-    prepared = rts.prepare(parts, "raster")
-    images.append(rts.render(prepared, CAMERA, SIZE, layers=4, splatter=splatter))
-    for image in images[1:]:
-        np.testing.assert_allclose(image, images[0], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_which_samples_are_needed_is_asked_with_their_final_depths(target):
-    asked = []
-
-    class Spy(splatting.Visible):
-        def needed(self, covered, depth):
-            asked.append((covered.copy(), depth.copy()))
-            return super().needed(covered, depth)
-
-    part = BEZIER.replace(theta=arrays(target, BEZIER.theta))
-    whole = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4, splatter=None))
-    found = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4, splatter=Spy()))
-    ((covered, depth),) = asked
-    np.testing.assert_array_equal(covered, whole.row >= 0)
-    np.testing.assert_array_equal(depth, whole.depth)
-    kept = splatting.Visible().needed(covered, depth)
-    np.testing.assert_array_equal(found.row >= 0, kept)
-    own, all_of_them = found.samples[0], whole.samples[0]
-    np.testing.assert_array_equal(own.ids[found.row[kept]], all_of_them.ids[whole.row[kept]])
-    np.testing.assert_array_equal(own.params[found.row[kept]], all_of_them.params[whole.row[kept]])
-
-
 @pytest.fixture(scope="module")
 def slopes_by_torch():
     """Values and gradients of the Bézier scene and of another one, in control points."""
@@ -139,7 +91,7 @@ def slopes_by_torch():
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_gradients_at_frozen_samples_are_finite_differences(target):
     # Of frozen samples the image has no derivative but theirs.
-    splatter = rts.plugin("splatters", "visible")(rims=False)
+    splatter = "multi"
     sampled = rts.sample(BEZIER, CAMERA, SIZE, layers=3, splatter=splatter)
     points = BEZIER.theta["points"].astype(np.float64)
 

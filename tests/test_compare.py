@@ -20,7 +20,7 @@ from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
 from rts_compare import compare, compared_settings, interleaved_timing, measurements, true_derivatives
 from rts_compare.commands import summary
-from rts_compare.compared_settings import Setting, _no_worse, as_text, engines, finest, worth_timing
+from rts_compare.compared_settings import Setting, _no_worse, engines, worth_timing
 from rts_compare.comparison import Comparison
 from rts_compare.derivative_scores import loss_weights, scores
 from rts_compare.kept_measurements import KeptMeasurements
@@ -53,7 +53,6 @@ def scene(*modes):
 
 
 TRUTH = dict(truth_samples=6, progress=False)
-EVERY = [1, 2, 3, 4, rts.Adaptive(4)]
 SMALL = dict(**TRUTH, engines=["torch"], samplers=["raster"], supersample=[1, 2], layers=[1, 2], peers=False)
 
 
@@ -140,7 +139,7 @@ class TestWorthTiming:
 
     @given(settings)
     def test_front(self, drawn):
-        errors = {Setting("visible", k, s, str(i)): e for i, (k, s, e) in enumerate(drawn)}
+        errors = {Setting("edges", k, s, str(i)): e for i, (k, s, e) in enumerate(drawn)}
 
         def work(setting):
             return setting.layers, setting.supersample
@@ -161,7 +160,7 @@ class TestWorthTiming:
 
     def test_levels(self):
         """A setting just within 3 % is not dropped for one just beyond."""
-        cheap, dear, dearer = (Setting("visible", k, 1) for k in (1, 2, 4))
+        cheap, dear, dearer = (Setting("edges", k, 1) for k in (1, 2, 4))
         assert worth_timing({cheap: 0.0305, dear: 0.0295, dearer: 0.029}, lambda s: (s.layers,)) == [cheap, dear]
 
 
@@ -232,12 +231,12 @@ class TestCompare:
     def test_rows(self, found):
         comparison, _ = found
         names = {r["settings"]["splatter"] for r in comparison.rows}
-        assert names == {"none", "single", "multi", "visible", "edges"}
+        assert names == {"none", "single", "multi", "edges"}
         assert set(comparison.modes) == {"translation", "shape"}
         for mode in comparison.modes:
             errors = {tuple(r["settings"].values())[:3]: r["error"] for r in comparison.rows if r["mode"] == mode}
             assert errors["none", 1, 1] == pytest.approx(1, abs=1e-3)  # It has no derivative here.
-            assert errors["visible", 2, 2] < errors["visible", 2, 1] < errors["single", 1, 1] < 1
+            assert errors["edges", 1, 2] < errors["edges", 1, 1] < errors["multi", 2, 1] < errors["single", 1, 1] < 1
             assert 0 < comparison.modes[mode]["truth_error"] < 0.1
 
     def test_front(self, found):
@@ -266,10 +265,10 @@ class TestCompare:
 
         def image(t):
             parts, camera = cards.at(cards.moved("translation", t, measured.engine))
-            return rts.render(parts, camera, (SIDE, SIDE), splatter="visible", layers=2)[..., :3]
+            return rts.render(parts, camera, (SIDE, SIDE), splatter="edges", layers=1)[..., :3]
 
         derivative = torch.func.jvp(image, (torch.zeros(()),), (torch.tensor(pixel),))[1].numpy()
-        wanted = {"splatter": "visible", "layers": 2, "supersample": 1}
+        wanted = {"splatter": "edges", "layers": 1, "supersample": 1}
         rows = [r for r in comparison.rows if r["mode"] == "translation" and wanted.items() <= r["settings"].items()]
         true = measured.truth("translation").derivative
         assert [r["error"] for r in rows] == [pytest.approx(scores(derivative, true)["error"], rel=1e-4)]
@@ -327,22 +326,14 @@ class TestCompare:
             transform = rts.rigid(parameters["pose"])
             return [p.replace(transform=transform) for p in two_cards()[0]], CAMERA
 
-        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["visible"]}
+        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["edges"]}
         start = {"pose": np.zeros(6)}
         comparison = compare(pose, start, size=(SIDE, SIDE), modes=["pose[3]"], truths=kept, **options)
         (row,) = comparison.rows
         assert row["error"] < 0.5 and row["ms"]["median"] > 0
 
-    def test_samples_at_outlines(self, kept):
-        options = {**SMALL, "layers": [2], "splatters": ["visible"]}
-        samples = [1, 4, rts.Adaptive(4), rts.Adaptive(4, dilated=False)]
-        comparison = compare(scene("translation"), truths=kept, **{**options, "supersample": samples})
-        errors = {row["settings"]["supersample"]: row["error"] for row in comparison.rows}
-        assert list(errors) == [1, 4, "adaptive:4", "adaptive:4:dilated=False"]
-        assert errors["adaptive:4"] == pytest.approx(errors[4], rel=0.2) and errors["adaptive:4"] < 0.6 * errors[1]
-
     def test_auto_layers(self, kept):
-        options = {**SMALL, "supersample": [1], "layers": ["auto", 4, 1], "splatters": ["visible"]}
+        options = {**SMALL, "supersample": [1], "layers": ["auto", 4, 1], "splatters": ["multi"]}
         comparison = compare(scene("translation"), truths=kept, **options)
         errors = {r["settings"]["layers"]: r["error"] for r in comparison.rows}
         assert errors["auto"] == errors[4] < errors[1]
@@ -355,7 +346,7 @@ class TestCompare:
             return [parts[0].replace(transform=rts.rigid(pose)), parts[1]], camera
 
         start = {"x": np.zeros(()), "y": np.zeros(())}
-        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["visible"], "size": (SIDE, SIDE)}
+        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["edges"], "size": (SIDE, SIDE)}
         comparison = compare(still, start, truths=kept, **options)
         assert list(comparison.modes) == ["x"]
         assert comparison.left_out[0].startswith(
@@ -380,7 +371,7 @@ class TestCompare:
             pose = torch.cat([torch.zeros(3), parameters])
             return card().replace(transform=rts.rigid(pose)), CAMERA
 
-        options = {**SMALL, "engines": None, "supersample": [1], "layers": 1, "splatters": ["visible"], "peers": True}
+        options = {**SMALL, "engines": None, "supersample": [1], "layers": 1, "splatters": ["edges"], "peers": True}
         start = torch.zeros(3, requires_grad=True)
         comparison = compare(shifted, start, size=(SIDE, SIDE), modes=["parameters[0]"], truths=kept, **options)
         assert {r["settings"]["engine"] for r in comparison.rows if "peer" not in r} == {"torch"}
@@ -392,7 +383,7 @@ class TestCompare:
             pose = jnp.concatenate([jnp.zeros(3), parameters])
             return card().replace(transform=rts.rigid(pose)), CAMERA
 
-        options = {**SMALL, "engines": None, "supersample": [1], "layers": 1, "splatters": ["visible"]}
+        options = {**SMALL, "engines": None, "supersample": [1], "layers": 1, "splatters": ["edges"]}
         start = {"size": (SIDE, SIDE), "modes": ["parameters[0]"], "truths": kept}
         for start_at in (jnp.zeros(3), np.zeros(3)):
             comparison = compare(shifted, start_at, **start, **options)
@@ -415,14 +406,14 @@ class TestStrangers:
                 return found._replace(**{k: np.roll(v, 1, axis=2) for k, v in found._asdict().items()})
 
         monkeypatch.setitem(registry._defaults, ("rts.samplers", "reference"), Askew())
-        options = {**SMALL, "samplers": ["raster", "reference"], "supersample": [1], "splatters": ["visible"]}
+        options = {**SMALL, "samplers": ["raster", "reference"], "supersample": [1], "splatters": ["multi"]}
         rows = compare(scene("translation"), truths=kept, **options).rows
         errors = {(r["settings"]["sampler"], r["settings"]["layers"]): r["error"] for r in rows}
         assert errors["reference", 2] > 1.5 * errors["raster", 2]
 
     def test_sampler(self, kept):
         pytest.importorskip("rts_plugin_example")
-        options = {**SMALL, "samplers": ["raster", "toy"], "supersample": [1], "splatters": ["visible"]}
+        options = {**SMALL, "samplers": ["raster", "toy"], "supersample": [1], "splatters": ["edges"]}
         comparison = compare(scene("translation"), truths=kept, **options, quick=True)
         assert "toy" in {r["settings"]["sampler"] for r in comparison.rows if r["ms"]}
 
@@ -435,7 +426,7 @@ class TestStrangers:
         monkeypatch.setitem(registry._entry_points, "rts.splatters", entries)
         comparison = compare(scene("translation"), truths=kept, **{**SMALL, "supersample": [1]})
         timed = {r["settings"]["splatter"] for r in comparison.rows if r["ms"]}
-        assert {"gauss5", "visible"} <= timed
+        assert {"gauss5", "edges"} <= timed
 
     def test_splatter_that_fails(self, kept, monkeypatch):
         class Broken(rts.Splatter):
@@ -455,7 +446,7 @@ class TestStrangers:
 
         monkeypatch.setattr(measurements, "PATIENCE", 0.1)
         monkeypatch.setitem(registry._defaults, ("rts.samplers", "reference"), Slow())
-        options = {**SMALL, "samplers": ["raster", "reference"], "supersample": [1], "splatters": ["visible"]}
+        options = {**SMALL, "samplers": ["raster", "reference"], "supersample": [1], "splatters": ["edges"]}
         comparison = compare(scene("translation"), truths=kept, **options)
         assert {r["settings"]["sampler"] for r in comparison.rows if r["ms"]} == {"raster"}
         assert any("'reference': more than 0.1 s" in line for line in comparison.left_out)
@@ -467,11 +458,11 @@ class TestStrangers:
 @pytest.fixture
 def modelled(monkeypatch):
     """Times that are a formula of the setting, so that the fastest is known."""
-    costs = {"none": 0.8, "single": 0.9, "multi": 1.1, "visible": 1.2, "edges": 1.3}
+    costs = {"none": 0.8, "single": 0.9, "multi": 1.1, "edges": 1.3}
     samplers = {"raster": 1.0, "embree": 2.0, "opengl": 3.0, "reference": 5.0, "toy": 50.0}
 
     def cost(setting):
-        return costs[setting.splatter] * setting.layers**0.3 * setting.side**2 * samplers[setting.sampler]
+        return costs[setting.splatter] * setting.layers**0.3 * setting.supersample**2 * samplers[setting.sampler]
 
     def timed(self, name):
         assert callable(self.calls[name]())
@@ -481,11 +472,7 @@ def modelled(monkeypatch):
     return cost
 
 
-class TestFoundEdges:
-    def test_no_adaptive_samples_beside_them_alone(self):
-        with pytest.raises(InputError, match=r"edges finds outlines without further samples; give whole numbers"):
-            compare(scene("translation"), splatters=["edges"], supersample=[rts.Adaptive(4)], progress=False)
-
+class TestTune:
     @pytest.mark.thorough
     def test_programs_of_jax_are_timed_with_them(self, kept):
         pytest.importorskip("jax")
@@ -493,17 +480,15 @@ class TestFoundEdges:
         tuned = tune(scene("translation"), budget_s=5, tolerance=0.9, **options)
         assert tuned.settings["splatter"] == "edges" and tuned.seconds > 0
 
-
-class TestTune:
     @pytest.mark.parametrize("tolerance", [0.6, 0.1])
     @pytest.mark.thorough
     def test_cheapest(self, modelled, kept, tolerance):
         modes = ["translation", "shape"]
-        options = dict(splatters=["none", "single", "multi", "visible"], samplers=["raster", "reference"], truths=kept)
+        options = dict(splatters=["none", "single", "multi", "edges"], samplers=["raster", "reference"], truths=kept)
         tuned = tune(scene(*modes), tolerance=tolerance, **TRUTH, **options)
         whole = compare(
             scene(*modes),
-            **{**SMALL, "layers": [1, 2, 4], "supersample": EVERY, "splatters": options["splatters"]},
+            **{**SMALL, "layers": [1, 2, 4], "supersample": [1, 2, 4], "splatters": options["splatters"]},
             truths=kept,
         )
         worst = {}
@@ -512,9 +497,7 @@ class TestTune:
             worst[key] = max(worst.get(key, 0), row["error"])
         within = [Setting(*key, "raster", "torch") for key, error in worst.items() if error <= tolerance]
         best = min(modelled(s) for s in within)
-        samples = tuned.settings["supersample"]
-        samples = as_text(samples) if isinstance(samples, rts.Adaptive) else samples
-        chosen = Setting(**{**tuned.settings, "supersample": samples, "engine": "torch"})
+        chosen = Setting(**tuned.settings, engine="torch")
         assert modelled(chosen) == pytest.approx(best)
         assert tuned.error == pytest.approx(max(worst[tuple(chosen)[:4]], 0), rel=1e-6)
         assert tuned.seconds == pytest.approx(best / 1e3)
@@ -523,18 +506,12 @@ class TestTune:
     def test_nothing_is_within(self, modelled, kept):
         with pytest.warns(ToleranceWarning, match="nothing is within 0.0001 %: the least error that was found"):
             tuned = tune(scene("translation"), tolerance=1e-6, samplers=["raster"], truths=kept, **TRUTH)
-        assert tuned.settings["splatter"] in ("visible", "edges") and finest(tuned.settings["supersample"]) >= 3
+        assert tuned.settings["splatter"] == "edges" and tuned.settings["supersample"] == 4
         assert tuned.error > 1e-6
 
     def test_bounds_are_no_errors(self, monkeypatch, modelled, kept):
         """Where nothing is within the tolerance, the best is known by all of its modes."""
-        told = {
-            "visible": (0.3, 0.3),
-            "multi": (0.25, 5.0),
-            "single": (0.25, 6.0),
-            "none": (0.25, 7.0),
-            "edges": (0.25, 8.0),
-        }
+        told = {"edges": (0.3, 0.3), "multi": (0.25, 5.0), "single": (0.25, 6.0), "none": (0.25, 7.0)}
 
         def scores(self, mode, setting):
             return {"error": told[setting.splatter][mode == "shape"]}
@@ -542,7 +519,7 @@ class TestTune:
         monkeypatch.setattr(measurements.Measurements, "scores", scores)
         with pytest.warns(ToleranceWarning, match="the least error that was found is 30 %"):
             tuned = tune(scene("translation", "shape"), tolerance=0.1, samplers=["raster"], truths=kept, **TRUTH)
-        assert tuned.settings["splatter"] == "visible" and tuned.error == 0.3
+        assert tuned.settings["splatter"] == "edges" and tuned.error == 0.3
 
     def test_reasons(self, modelled, kept):
         tuned = tune(scene("translation"), tolerance=0.2, samplers=["raster", "reference"], truths=kept, **TRUTH)
@@ -571,23 +548,26 @@ class TestTune:
         rts.render(parts, camera, (32, 32), **tuned.settings).sum().backward()
         assert moved.grad < -10
 
-    def test_what_was_passed_over_is_found_once(self):
-        """Settings of equal work, passed over for the errors with fewer samples, do not rule each other out."""
+    def test_samples_that_do_not_suffice_are_tried_twice(self):
+        """With the least work, and with the most layers; settings between these are left out."""
+        tried = []
 
         class Measured:
             scene = SimpleNamespace(directions={"translation": None})
             engine = SimpleNamespace(name="torch")
 
             def work(self, group, setting):
-                return min(setting.layers, 3), setting.side, 1.0
+                return setting.layers, setting.supersample, 1.0
 
             def scores(self, mode, setting):
+                tried.append((setting.supersample, setting.layers))
                 return {"error": 0.05 if setting.supersample == 4 else 1.0}
 
         search = Search(Measured(), {"raster": ""}, 0.1, math.inf, lambda name, count: lambda: None)
-        cells = [Setting("visible", k, s) for s in (1, 2, 3, 4) for k in (4, 8)]
-        search.bounds.update((s, 1.0) for s in cells[:-2])
-        assert search._within(cells) == [Setting("visible", 4, 4)]
+        assert search._within([Setting("edges", k, s) for s in (1, 2, 4) for k in (1, 2, 4)]) == [
+            Setting("edges", 1, 4)
+        ]
+        assert tried == [(1, 1), (1, 4), (2, 1), (2, 4), (4, 1)]
 
     def test_budget(self, kept):
         """When the budget is spent, the choice is made from the settings known by then."""
@@ -656,7 +636,7 @@ class TestMisuse:
             (dict(scene=nothing, parameters={"a": "b"}), "parameters holds 'b'; expected arrays of real numbers"),
             (dict(scene=lambda p: 1 / 0, parameters=np.zeros(2)), "fails: ZeroDivisionError"),
             (dict(scene="thin wires", samplers=[]), "samplers is .*; expected a list of names"),
-            (dict(scene="thin wires", splatters="visible"), "splatters is 'visible'; expected a list of names"),
+            (dict(scene="thin wires", splatters="edges"), "splatters is 'edges'; expected a list of names"),
             (dict(scene="thin wires", directions={}), "only functions of parameters have them"),
             (
                 dict(scene=nothing, parameters=np.zeros(2), directions={"a": np.zeros(3)}),
@@ -714,7 +694,7 @@ class TestMisuse:
         with pytest.raises(InputError, match="other gave None"):
             compare(f"{path}:other", progress=False)
         path.write_text(MY_SCENE)
-        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["visible"], "size": (SIDE, SIDE)}
+        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["edges"], "size": (SIDE, SIDE)}
         assert list(compare(path, modes=["camera"], truths=tmp_path, **options).modes) == ["camera"]
         path.write_text("1 / 0\n")
         with pytest.raises(InputError, match="fails: ZeroDivisionError: division by zero"):
@@ -744,7 +724,7 @@ def model(tmp_path, monkeypatch, kept):
 
 class TestCommandLine:
     def test_compare(self, model, tmp_path):
-        samples = ["--supersample", "1", "--supersample", "adaptive:2"]
+        samples = ["--supersample", "1", "--supersample", "2"]
         code, told = run("compare", model, "--quick", "--size", SIDE, *samples, "-o", tmp_path / "out")
         assert code == 0, told
         assert "fastest settings by the error of derivatives" in told and "translation" in told
@@ -752,7 +732,7 @@ class TestCommandLine:
         rows = json.loads((tmp_path / "out" / "model.json").read_text())["rows"]
         assert {r["mode"] for r in rows} == {"translation"} and len(rows) <= 40
         assert {r["settings"]["engine"] for r in rows if r["ms"]} == {"torch"}
-        assert {r["settings"]["supersample"] for r in rows} == {1, "adaptive:2"}
+        assert {r["settings"]["supersample"] for r in rows} == {1, 2}
 
     def test_list(self):
         code, told = run("compare", "list")
@@ -778,10 +758,10 @@ class TestCommandLine:
 
     def test_times_are_written_without_powers_of_ten(self):
         for ms, text in {0.25: "0.25 ms", 47.53: "47.5 ms", 999.7: "1 s", 4750.0: "4.75 s", 4.75e6: "4750 s"}.items():
-            settings = Setting("visible", 2, 1, "", "raster", "torch")._asdict()
+            settings = Setting("edges", 2, 1, "", "raster", "torch")._asdict()
             row = {"mode": "x", "error": 0.0, "ms": {"median": ms}, "settings": settings}
             table = summary(Comparison({"name": "s"}, {}, {"x": {}}, [row], []))
-            assert [*table.columns[1].cells] == [f"visible K=2 raster torch\n{text}"]
+            assert [*table.columns[1].cells] == [f"edges K=2 raster torch\n{text}"]
 
     @pytest.mark.thorough
     def test_tune(self, model):
@@ -804,6 +784,10 @@ class TestCommandLine:
         [
             (["compare", "missing.obj"], "missing.obj does not exist; expected a model"),
             (["compare", "thin wires", "--mode", "sideways"], "expected some of translation"),
+            (
+                ["compare", "thin wires", "--supersample", "adaptive:4"],
+                "'adaptive:4' is no supersample; expected a number",
+            ),
             (["compare", "thin wires", "--sampler", "blender"], "no sampler named 'blender'"),
             (["tune", "thin wires", "--tolerance", "-1"], "tolerance is -1.0; expected a positive number"),
         ],

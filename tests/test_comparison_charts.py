@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PROPERTIES
 
-import rts
 from rts import InputError, PluginError
 from rts_compare import chart_style
 from rts_compare.html_page import write_page
@@ -28,7 +27,7 @@ pytestmark = pytest.mark.files
 NASTY = '</script><b>nasty</b> & "quoted" $x_$'
 
 
-def settings(sampler="raster", engine="torch", splatter="visible", layers=2, supersample=1, rate=""):
+def settings(sampler="raster", engine="torch", splatter="edges", layers=2, supersample=1, rate=""):
     return dict(locals())
 
 
@@ -43,7 +42,7 @@ def comparison(
     modes=("translation", "color"),
     samplers=("raster", "rays"),
     engines=("torch", "jax"),
-    splatters=("visible", "none"),
+    splatters=("edges", "none"),
     layers=(1, "auto"),
     sides=(1, 2),
     rates=("", "tolerance=0.4"),
@@ -135,13 +134,10 @@ def test_marking_leaves_the_comparison_as_it_was():
 
 def test_settings_are_named_in_short_and_as_arguments():
     ours = row("a", 1, 1.0, layers="auto", supersample=2, rate="tolerance=0.4")
-    assert chart_style.label(ours) == "visible K=auto 2×2 raster torch tolerance=0.4"
+    assert chart_style.label(ours) == "edges K=auto 2×2 raster torch tolerance=0.4"
     text = chart_style.arguments(ours)
-    assert text == 'sampler="raster", splatter="visible", layers="auto", supersample=2  # torch, tolerance=0.4'
-    assert eval(f"dict({text}\n)") == {"sampler": "raster", "splatter": "visible", "layers": "auto", "supersample": 2}
-    adaptive = row("a", 1, 1.0, supersample="adaptive:8:dilated=False")
-    assert chart_style.label(adaptive) == "visible K=2 adaptive 8×8 dilated=False raster torch"
-    assert eval(f"dict({chart_style.arguments(adaptive)}\n)")["supersample"] == rts.Adaptive(8, dilated=False)
+    assert text == 'sampler="raster", splatter="edges", layers="auto", supersample=2  # torch, tolerance=0.4'
+    assert eval(f"dict({text}\n)") == {"sampler": "raster", "splatter": "edges", "layers": "auto", "supersample": 2}
     peer = row("a", 1, 1.0, peer="Mitsuba", spp=16)
     assert (chart_style.label(peer), chart_style.arguments(peer)) == ("Mitsuba spp=16", "# Mitsuba, spp=16")
 
@@ -154,9 +150,9 @@ def test_charts_name_the_versions_of_other_packages_that_are_installed():
 
 def test_built_in_names_keep_their_looks_and_others_go_by_the_order_of_their_names():
     others = [f"toy{i}" for i in range(9)]
-    rows = [row("a", 1, 1.0, splatter=s, sampler=s, engine=s) for s in ("visible", *reversed(others))]
+    rows = [row("a", 1, 1.0, splatter=s, sampler=s, engine=s) for s in ("edges", *reversed(others))]
     looks = chart_style.Looks.of([*rows, row("a", 1, 1.0, peer="DEODR"), row("a", 1, 1.0)])
-    assert looks.splatters["visible"] == chart_style.SPLATTER_COLORS["visible"] and looks.samplers["raster"] == "circle"
+    assert looks.splatters["edges"] == chart_style.SPLATTER_COLORS["edges"] and looks.samplers["raster"] == "circle"
     assert [looks.splatters[name] for name in others] == [chart_style.OTHER_COLORS[i % 4] for i in range(9)]
     assert looks.engines["torch"] == "" and looks.peers == {"DEODR": chart_style.PEER_COLORS["DEODR"]}
 
@@ -179,7 +175,7 @@ def test_the_picture_has_a_panel_a_mode_and_all_colours(tmp_path):
     draw(comparison(), tmp_path / "two.png")
     two = pixels(tmp_path / "two.png")
     for color in (
-        chart_style.SPLATTER_COLORS["visible"],
+        chart_style.SPLATTER_COLORS["edges"],
         chart_style.SPLATTER_COLORS["none"],
         *chart_style.PEER_COLORS.values(),
     ):
@@ -371,7 +367,7 @@ def test_the_page_shows_what_its_menus_say(browse):
     assert read["second"]["hash"] == "#scene=ball&mode=color"
     others = ["other renderers", "DEODR", "Mitsuba", "lines", "Pareto front", "error of the truth"]
     for view, first in (
-        ("first", ["splatter", "visible", "none"]),
+        ("first", ["splatter", "edges", "none"]),
         ("third", ["splatter", "multi", NASTY]),
         ("byRate", ["rate", "as given", "tolerance=0.4"]),
     ):

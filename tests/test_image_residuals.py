@@ -1,38 +1,31 @@
 """Image residuals: values by `render`, normal equations against those formed from the whole Jacobian."""
 
 import contextlib
-import itertools
-import tracemalloc
 
-import helpers
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
 
 import rts
 import rts.fitting.least_squares
-from rts import splatting
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts.rendering import settings
-from rts_backends.fused import normal_equations as fused_normal
-from rts_backends.fused import splatters as fused
-from rts_backends.fused.cells import Cells
+from rts.splatting import edges_weights
 
 pytestmark = pytest.mark.fitting
 
 SIZE = (26, 31)
 CAMERA = rts.Camera.look_at((0.7, 0.9, 3.2), (0, 0, 0), fov_y=45, aspect=31 / 26)
-KINDS = ("single", "multi", "visible")
 POSE = np.array([0.2, -0.3, 0.1, 0.05, -0.07, 0.1])
 TOLERANCE = {np.float32: 1e-5, np.float64: 1e-10}
 CASES = [
-    *((kind, *case, "torch-cpu", dtype) for kind in KINDS for case in ((1, 2), (3, 1), (4, 3)) for dtype in TOLERANCE),
-    ("multi", 3, 1, "jax", np.float32),
-    ("visible", 4, 3, "jax", np.float64),
+    *((channels, "torch-cpu", dtype) for channels in (1, 3, 4) for dtype in TOLERANCE),
+    (3, "jax", np.float32),
+    (4, "jax", np.float64),
 ]
-"""Splatter, channels, layers, engine and dtype."""
+"""Channels, engine and dtype."""
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 torch_targets = pytest.mark.parametrize("target", [t for t in DIFFERENTIABLE if t != "jax"])
 """For what takes the same way in every engine: jax compiles for seconds."""
@@ -83,13 +76,13 @@ def fields(channels, seed=1):
 
 def count_sweeps(monkeypatch):
     calls = []
-    whole = fused_normal.normal_equations
+    whole = edges_weights.normal_equations
 
     def counted(*args, **options):
         calls.append(args)
         return whole(*args, **options)
 
-    monkeypatch.setattr(fused_normal, "normal_equations", counted)
+    monkeypatch.setattr(edges_weights, "normal_equations", counted)
     return calls
 
 
@@ -123,36 +116,13 @@ def check(residuals, parameters, tolerance, *, compiling=False):
 # ----------------------------------------------------------------------------------------------- normal equations
 
 
-@pytest.mark.parametrize(("kind", "channels", "layers", "target", "dtype"), CASES)
-def test_normal_equations_are_those_of_the_jacobian(kind, channels, layers, target, dtype, monkeypatch):
+@pytest.mark.parametrize(("channels", "target", "dtype"), CASES)
+def test_normal_equations_are_those_of_the_jacobian(channels, target, dtype, monkeypatch):
     sweeps = count_sweeps(monkeypatch)
     goal, weights = fields(channels)
     with precision(target, dtype):
-        residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, splatter=kind, layers=layers)
+        residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights)
         check(residuals, start(target, dtype), TOLERANCE[dtype], compiling=dtype == np.float32)
-    assert len(sweeps) == 1
-
-
-@pytest.mark.parametrize(
-    ("channels", "supersample", "loss", "target"),
-    [
-        (1, 1, "linear", "torch-cpu"),
-        (3, 2, "linear", "torch-cpu"),
-        (4, 1, "huber", "torch-cpu"),
-        (4, 2, "linear", "jax"),
-    ],
-)
-def test_normal_equations_of_found_edges_are_those_of_the_jacobian(channels, supersample, loss, target, monkeypatch):
-    from rts.splatting import edges_weights
-
-    sweeps, whole = [], edges_weights.normal_equations
-    monkeypatch.setattr(edges_weights, "normal_equations", lambda *own: sweeps.append(own) or whole(*own))
-    goal, weights = fields(channels)
-    with precision(target, np.float64):
-        background = None if channels == 1 else np.random.default_rng(4).random(3)
-        options = {"weights": weights, "background": background, "loss": loss}
-        residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, splatter="edges", supersample=supersample, **options)
-        check(residuals, start(target, np.float64), 1e-8, compiling=False)
     assert len(sweeps) == 1
 
 
@@ -190,23 +160,22 @@ def test_jitted_and_with_few_rows(target):
 
 
 FINE_CASES = [
-    *((kind, *case, "torch-cpu", np.float64) for kind in KINDS for case in ((1, 2, 2), (3, 1, 3), (4, "auto", 4))),
-    ("visible", 4, 2, 2, "torch-cpu", np.float32),
-    ("visible", 1, 2, 3, "jax", np.float32),
-    ("multi", 3, 2, 2, "jax", np.float64),
+    *((*case, "torch-cpu", np.float64) for case in ((1, 2), (3, 3), (4, 4))),
+    (4, 2, "torch-cpu", np.float32),
+    (1, 3, "jax", np.float32),
 ]
-"""Splatter, channels, layers, samples a pixel along each axis, engine and dtype."""
+"""Channels, samples a pixel along each axis, engine and dtype."""
 
 
 @pytest.mark.filterwarnings("ignore::rts.errors.LayersWarning")
-@pytest.mark.parametrize(("kind", "channels", "layers", "fine", "target", "dtype"), FINE_CASES)
+@pytest.mark.parametrize(("channels", "fine", "target", "dtype"), FINE_CASES)
 def test_supersampled_images_are_swept_to_the_normal_equations_of_their_jacobian(
-    kind, channels, layers, fine, target, dtype, monkeypatch
+    channels, fine, target, dtype, monkeypatch
 ):
     sweeps = count_sweeps(monkeypatch)
     goal, weights = fields(channels)
     behind = np.random.default_rng(4).random((*SIZE, 4))
-    options = {"weights": weights, "splatter": kind, "layers": layers, "supersample": fine, "background": behind}
+    options = {"weights": weights, "supersample": fine, "background": behind}
     with precision(target, dtype):
         residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, **options)
         check(residuals, start(target, dtype), TOLERANCE[dtype], compiling=dtype == np.float32)
@@ -216,14 +185,12 @@ def test_supersampled_images_are_swept_to_the_normal_equations_of_their_jacobian
 @targets
 def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
     goal, weights = fields(3)
-    residuals = rts.ImageResiduals(
-        scene, CAMERA, SIZE, goal, weights=weights, supersample=3, splatter="visible", layers=2
-    )
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, supersample=3, layers=2)
     whole = residuals.normal_equations(start(target))
     sweeps = count_sweeps(monkeypatch)
     monkeypatch.setattr(settings, "BAND", 3000)
     found = check(residuals, start(target), 1e-4)
-    assert len(sweeps) == 6 and {len(args[3]) for args in sweeps} == {4, 5}  # Rows of unlike number.
+    assert len(sweeps) == 6 and {len(args[1][2]) for args in sweeps} == {4, 5}  # Rows of unlike number.
     for a, b in zip(map(to_numpy, found), map(to_numpy, whole), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=3e-5 * np.abs(b).max())
 
@@ -313,7 +280,7 @@ def test_nothing_in_view_has_zero_derivatives(target):
 @pytest.mark.parametrize(
     ("options", "target"),
     [
-        ({"splatter": splatting.Visible()}, "torch-cpu"),
+        ({"splatter": "multi"}, "torch-cpu"),
         ({"splatter": "none"}, "torch-cpu"),
         pytest.param({"supersample": 33}, "torch-cpu", marks=pytest.mark.thorough),
     ],
@@ -323,102 +290,6 @@ def test_what_no_sweep_knows_is_done_by_the_jacobian(options, target, monkeypatc
     goal, weights = fields(3)
     check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, **options), start(target), 1e-5)
     assert not sweeps
-
-
-def test_half_precision_is_done_by_the_jacobian(monkeypatch):
-    torch = pytest.importorskip("torch")
-    sweeps = count_sweeps(monkeypatch)
-    splats = [torch.zeros(n, dtype=torch.bfloat16) for n in ((5, 3), (5, 4))]
-    row = torch.zeros((1, 3, 3), dtype=torch.int32)
-    tangents = torch.zeros((2, 5, 3), dtype=torch.bfloat16)
-    goal = torch.zeros((3, 3, 1))
-    assert fused.Visible().normal_equations(helpers.splats_of(*splats, row), tangents, None, goal) is None
-    elsewhere = [x.float().to("meta") for x in (*splats, row, tangents)]
-    assert fused.Visible().normal_equations(helpers.splats_of(*elsewhere[:3]), elsewhere[3], None, goal) is None
-    assert not sweeps
-
-
-# -------------------------------------------------------------------------------------------------------- sweeps
-
-
-def splats_of(kind, layers=2, size=(40, 150), dtype=np.float64, seed=0):
-    """Samples off their centres at depths of no order, some cells empty, and tangents of both."""
-    rng = np.random.default_rng(seed)
-    k, y, x = np.nonzero(np.logical_and.accumulate(rng.random((layers, *size)) > 0.2, axis=0))
-    row = np.full((layers, *size), -1, np.int32)
-    row[k, y, x] = np.arange(len(k))
-    positions = np.stack([x + 0.5, y + 0.5, rng.uniform(1, 2, len(k)) + k], axis=1)
-    positions[:, :2] += rng.uniform(-0.3, 0.3, (len(k), 2))
-    rgba = rng.random((len(k), 4))
-    tangents = rng.normal(size=(3, len(k), 3)), rng.normal(size=(3, len(k), 4))
-    kernel = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}[kind]()
-    settings = kernel._settings(2)
-    splats = Cells(settings, positions.astype(dtype), rgba.astype(dtype), row)
-    return splats, *(t.astype(dtype) for t in tangents)
-
-
-@pytest.mark.parametrize("colored", [True, False])
-@pytest.mark.parametrize("channels", [1, 3, 4])
-@pytest.mark.parametrize("kind", KINDS)
-def test_sweeps_are_products_of_pushed_tangents(kind, channels, colored):
-    for layers in (1, 2, 3):
-        splats, t_positions, t_rgba = splats_of(kind, layers)
-        t_rgba = t_rgba if colored else None
-        chosen = slice(3, 4) if channels == 1 else slice(0, channels)
-        image, rows = np.empty((36, 146, 4)), np.empty((3, 36, 146, 4))
-        splats.image(image)
-        splats.jvp(t_positions, t_rgba, rows)
-        image, rows = image[..., chosen], rows[..., chosen]
-        goal = np.random.default_rng(1).random(image.shape)
-        r, rows = (image - goal).ravel(), rows.reshape(3, -1)
-        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None, rts.Loss())
-        for own, expected in zip(found, (r @ r, rows @ rows.T, rows @ r), strict=True):
-            np.testing.assert_allclose(own, expected / len(r), rtol=1e-11, atol=1e-13)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_results_are_bitwise_the_same_on_any_number_of_threads(kind, monkeypatch):
-    splats, *tangents = splats_of(kind, dtype=np.float32)
-    goal, weights = (np.random.default_rng(n).random((36, 146, 4)) for n in (1, 2))
-    results = []
-    for threads in ("1", "2", "5"):
-        monkeypatch.setenv("RTS_NUM_THREADS", threads)
-        results.append(fused_normal.normal_equations(splats, *tangents, goal, weights, goal, rts.Loss()))
-    for one, other in itertools.pairwise(results):
-        for a, b in zip(one, other, strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_sweeps_of_means_are_products_of_pushed_means(kind):
-    splats, t_positions, t_rgba = splats_of(kind, 3, size=(40, 124))
-    image, rows = np.empty((36, 120, 4)), np.empty((3, 36, 120, 4))
-    splats.image(image)
-    splats.jvp(t_positions, t_rgba, rows)
-    for fine in (2, 3, 4, 6, 12):
-        size = 36 // fine, 120 // fine
-        mean = image.reshape(size[0], fine, size[1], fine, 4).mean(axis=(1, 3))
-        pushed = rows.reshape(3, size[0], fine, size[1], fine, 4).mean(axis=(2, 4)).reshape(3, -1)
-        goal = np.random.default_rng(1).random(mean.shape)
-        r = (mean - goal).ravel()
-        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None, rts.Loss())
-        for own, expected in zip(found, (r @ r, pushed @ pushed.T, pushed @ r), strict=True):
-            np.testing.assert_allclose(own, expected / len(r), rtol=1e-10, atol=1e-13)
-
-
-def test_a_sweep_at_512_needs_little_memory():
-    splats, _, _ = splats_of("visible", size=(516, 516), dtype=np.float32)
-    tangents = np.ones((12, len(splats.positions), 3), np.float32)
-    goal = np.ones((512, 512, 4), np.float32)
-    splats.choices  # noqa: B018  (made before, as the image has it)
-    fused_normal.normal_equations(splats, tangents, None, goal, None, None, rts.Loss())
-    tracemalloc.start()
-    try:
-        fused_normal.normal_equations(splats, tangents, None, goal, None, None, rts.Loss())
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < goal.nbytes / 4, "the Jacobian alone is twelve times the target"
 
 
 # ------------------------------------------------------------------------------------------------------------ fits
@@ -436,11 +307,10 @@ def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
     part = block()
     camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40)
     moved = lambda p: part.replace(transform=rts.rigid(p))  # noqa: E731
-    options = {"splatter": "single", "layers": 1}
-    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (40, 40), **options)[..., 3]
+    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (40, 40))[..., 3]
     there = arrays(target, goal)
     calls = []
-    known = rts.ImageResiduals(moved, camera, (40, 40), goal, **options)
+    known = rts.ImageResiduals(moved, camera, (40, 40), goal)
     sweeps = count_sweeps(monkeypatch)
     ours = rts.fit(known, arrays(target, np.zeros(6)), method="lm", jit=jit)
     assert len(sweeps) > 3
@@ -448,7 +318,7 @@ def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
 
     def residuals(p):
         calls.append(p)
-        return rts.render(moved(p), camera, (40, 40), **options)[..., 3] - there
+        return rts.render(moved(p), camera, (40, 40))[..., 3] - there
 
     theirs = rts.fit(residuals, arrays(target, np.zeros(6)), method="lm", jit=jit)
     assert calls and not sweeps

@@ -36,8 +36,8 @@ def test_what_a_class_overrides_is_read_off_it():
         refine = rts.TriangleSurface.refine
 
     class Mixin:
-        def needed(self, covered, depth):
-            return covered
+        def cropped(self, splats):
+            return self.image(splats)
 
     class Mixed(Mixin, splatting.Plain):
         pass
@@ -45,8 +45,8 @@ def test_what_a_class_overrides_is_read_off_it():
     faces = icosphere(0)[1]
     assert not MESH(faces).refines and Refining(faces).refines and not Still(faces).refines
     assert type("Below", (Refining,), {})(faces).refines and not type("BelowStill", (Still,), {})(faces).refines
-    assert all(overrides(kind, "needed", rts.Splatter) for kind in (splatting.Multi, Mixed, splatting.Plain()))
-    assert not overrides(Far, "needed", rts.Splatter) and not overrides(RASTER, "needed", rts.Splatter)
+    assert all(overrides(kind, "cropped", rts.Splatter) for kind in (Mixed, Mixed()))
+    assert not overrides(Far, "cropped", rts.Splatter) and not overrides(RASTER, "cropped", rts.Splatter)
     assert overrides(rts.plugin("samplers", "embree"), "prepare", rts.TriangleSampler)
     assert not overrides(RASTER, "prepare", rts.TriangleSampler)
 
@@ -269,7 +269,7 @@ def test_samples_with_too_narrow_an_apron_are_refused():
         rts.render_samples(sampled, part, FRONT, splatter=Far(3))
 
 
-@pytest.mark.parametrize("splatter", ["none", "single", "multi", "visible"])
+@pytest.mark.parametrize("splatter", ["none", "single", "multi"])
 def test_samples_for_no_splatter_have_an_apron_for_every_built_in_one(splatter):
     part = mesh_part(icosphere(1, 2.0))
     found = rts.render_samples(rts.sample(part, FRONT, SIZE, splatter=None, layers=2), part, FRONT, splatter=splatter)
@@ -445,16 +445,16 @@ class TestGaussian5(SplatterConformance):
         return Gaussian5()
 
 
-def test_a_subclass_of_a_compiled_splatter_may_have_an_image_of_its_own():
-    class Half(type(rts.plugin("splatters", "visible")())):
+def test_a_subclass_of_a_splatter_may_have_an_image_of_its_own():
+    class Half(splatting.Edges):
         def image(self, splats):
             return 0.5 * super().image(splats)
 
     part = mesh_part(icosphere(1))
-    np.testing.assert_allclose(show(part, splatter=Half()), 0.5 * show(part, splatter="visible"), atol=1e-6)
+    np.testing.assert_allclose(show(part, splatter=Half()), 0.5 * show(part), atol=1e-6)
 
 
-@pytest.mark.parametrize("splatter", ["none", "visible", splatting.Visible()], ids=str)
+@pytest.mark.parametrize("splatter", ["none", "edges", "multi"])
 def test_a_shader_may_close_over_arrays_that_the_scene_has_none_of(splatter):
     torch = pytest.importorskip("torch")
     color = torch.tensor([0.2, 0.4, 0.6, 1.0], requires_grad=True)

@@ -133,7 +133,7 @@ def test_the_outline_of_a_ball_grows_as_its_disk_does(motion, supersample):
     values, bounds = on_lattice(BALL, 128)
     offset = torch.zeros((), requires_grad=True)
     part = Part(Isosurface(bounds, motion=motion), {"values": torch.from_numpy(values) - offset})
-    area = rts.render(part, camera, (height, height), splatter="visible", supersample=supersample)[..., 3].sum()
+    area = rts.render(part, camera, (height, height), supersample=supersample)[..., 3].sum()
     (slope,) = torch.autograd.grad(area, offset)
     expected = (disk(0.701, height) - disk(0.699, height)) / 2e-3
     assert area.item() == pytest.approx(disk(0.7, height), rel=5e-3)
@@ -179,13 +179,11 @@ def test_a_table_changes_nothing_but_how_often_the_function_is_called(target, mo
     found = []
     for table in (False, True):
         surface = Isosurface(BOUNDS, f=counting, shape=(17,) * 3, motion=motion, table=table)
-        sampled = rts.sample(Part(surface, arrays(target, RADII)), CAMERA, SIZE, splatter="visible", layers=2)
+        sampled = rts.sample(Part(surface, arrays(target, RADII)), CAMERA, SIZE)
         calls.clear()
 
         def loss(radii, surface=surface, sampled=sampled):
-            return (
-                rts.render_samples(sampled, Part(surface, {"radii": radii}), CAMERA, splatter="visible")[..., 3]
-            ).sum()
+            return rts.render_samples(sampled, Part(surface, {"radii": radii}), CAMERA)[..., 3].sum()
 
         radii = arrays(target, RADII["radii"])
         found.append((float(loss(radii)), gradient(target, loss, radii), calls[0]))
@@ -214,9 +212,7 @@ def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
         traces.append(1)
 
         def area(radii):
-            return rts.render(
-                Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=3000, splatter="visible", layers=2
-            )[..., 3].sum()
+            return rts.render(Part(surface, {"radii": radii}), CAMERA, SIZE, capacity=3000)[..., 3].sum()
 
         return jax.value_and_grad(area)(radii)
 
@@ -225,7 +221,7 @@ def test_a_compiled_loop_with_a_capacity_compiles_once(motion):
         at = radii * jax.numpy.asarray([factor, 1.0])
         value, slope = step(at)
         plain = Part(Isosurface(BOUNDS, f=torus, shape=(17,) * 3, motion=motion), {"radii": at})
-        expected = rts.render(plain, CAMERA, SIZE, splatter="visible", layers=2)[..., 3].sum()
+        expected = rts.render(plain, CAMERA, SIZE)[..., 3].sum()
         assert float(value) == pytest.approx(float(expected), rel=1e-5) and np.isfinite(slope).all()
     assert len(traces) == 1
 
@@ -242,6 +238,70 @@ def test_samples_that_find_no_room_in_a_table_are_counted():
 
     overflow, row, ids = map(np.asarray, sampled(jax.numpy.asarray(RADII["radii"])))
     assert overflow == len(full.ids) - (row >= 0).sum() > 0 and ids.max() < 200
+
+
+def glass(theta, gbuffer, camera):
+    """Normals, a third of whose light passes through; a shader that may ask for its view."""
+    xp = rts.namespace(gbuffer["normal"])
+    return xp.concat([gbuffer["normal"] / 3, xp.full_like(gbuffer["normal"][:, :1], 2 / 3)], axis=-1)
+
+
+@pytest.mark.parametrize("shader", ["normals", glass], ids=["opaque", "glass"])
+@pytest.mark.parametrize("target", [*ALL, "jax.jit"])
+def test_samples_beside_outlines_are_joined_to_tables(target, shader):
+    """Two parts, each with a table, alone and in two views: images and gradients are those without tables."""
+    engine, weights = target.removesuffix(".jit"), np.random.default_rng(0).random((*SIZE, 4), np.float32)
+    moved = np.eye(4, dtype=np.float32)
+    moved[:3, 3] = 0.35, 0.1, 0.2
+    cameras = CAMERA, Camera.look_at((-0.4, -1.3, 2.9), (0, 0, 0), fov_y=40)
+
+    def found(table, views):
+        surface = Isosurface(BOUNDS, f=torus, shape=(17,) * 3, table=table)
+
+        def image(radii):
+            parts = [Part(surface, {"radii": s * radii}, shader, transform=t) for s, t in ((1, None), (0.8, moved))]
+            if views:
+                return rts.render_views(parts, cameras, SIZE)
+            return rts.render(parts, CAMERA, SIZE)
+
+        def loss(radii):
+            return (image(radii) * arrays(engine, weights)).sum()
+
+        if target == "jax.jit":
+            import jax
+
+            image, loss = jax.jit(image), jax.jit(loss)
+        radii = arrays(engine, RADII["radii"])
+        slope = np.zeros(2) if target == "numpy" else to_numpy(gradient(engine, loss, radii))
+        return to_numpy(image(radii)), slope
+
+    for views in (False, True):
+        (expected, slope), (shown, same) = found(False, views), found(True, views)
+        np.testing.assert_allclose(shown, expected, atol=2e-5)
+        np.testing.assert_allclose(same, slope, rtol=1e-4)
+        assert expected.any() and (target == "numpy" or slope.all())
+
+
+def test_breaks_without_room_in_a_table_are_left_out_and_counted():
+    """In few pixels most samples lie beside outlines; the table has room for half of all points."""
+    jax = pytest.importorskip("jax")
+    size = (10, 10)
+    room = len(rts.sample(function(33, table=True), CAMERA, size).samples[0].tables["points"]) // 2
+
+    def sampled(table):
+        surface = Isosurface(BOUNDS, f=torus, shape=(33,) * 3, table=table)
+
+        @jax.jit
+        def own(radii):
+            part = Part(surface, {"radii": radii})
+            found = rts.sample(part, CAMERA, size, capacity=1000)
+            image = rts.render_samples(found, part, CAMERA)
+            return found.overflow, found.row >= 0, found.outlines.ends.any(axis=1).sum(), image
+
+        return map(np.asarray, own(jax.numpy.asarray(RADII["radii"])))
+
+    (none, seen, every, _), (left, still, fewer, image) = sampled(True), sampled(room)
+    assert (still == seen).all() and none == 0 and left == every - fewer > 0 < fewer and np.isfinite(image).all()
 
 
 def test_a_network_is_fitted_through_its_parameters():
@@ -441,10 +501,8 @@ def test_a_constant_surface_with_a_table_has_its_normals():
     torch = pytest.importorskip("torch")
     part = function(21, shader="normals", table=True)
     camera = CAMERA.map(lambda m: torch.from_numpy(np.asarray(m, np.float32)))
-    found = rts.render(part, camera, SIZE, splatter="visible", layers=2)
-    np.testing.assert_allclose(
-        found.numpy(), rts.render(function(21, shader="normals"), CAMERA, SIZE, splatter="visible", layers=2), atol=1e-4
-    )
+    found = rts.render(part, camera, SIZE)
+    np.testing.assert_allclose(found.numpy(), rts.render(function(21, shader="normals"), CAMERA, SIZE), atol=1e-4)
 
 
 def test_torch_transforms_look_through_a_band():

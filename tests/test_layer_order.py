@@ -264,6 +264,7 @@ def spoiled(array, at):
         (lambda s: replace(s, tables={**s.tables, "places": np.zeros((11, 2))}), r"shape \(11, 2\).* allots \(10, 2\)"),
         (lambda s: replace(s, tables={**s.tables, "places": np.zeros((9, 3))}), r"shape \(9, 3\), where .* overflow"),
         (lambda s: replace(s, tables={**s.tables, "own": np.zeros((9, 1))}), "table 'own' of 9 rows; expected [0-9]+,"),
+        (lambda s: replace(s, ids=s.ids + 10), r"gave ids from 0 to 12, and tables \['places'\] of 10 rows .*are rows"),
     ],
 )
 def test_what_refine_may_not_give_is_refused_in_its_name(change, words):
@@ -345,7 +346,7 @@ def test_as_many_layers_as_count_are_taken_where_refine_leaves_fewer(heights):
     assert [n for n in found if n] == [n for n in expected if n]
     # And where it is one part of several.
     beside = part.replace(transform=rigid(translation=(100, 0, 0)))
-    several = [rts.sample([part, beside], FRONT, SIZE, layers=k, splatter="visible") for k in ("auto", 3)]
+    several = [rts.sample([part, beside], FRONT, SIZE, layers=k) for k in ("auto", 3)]
     assert (several[0].row >= 0).sum() == (several[1].row >= 0).sum() > 0
 
 
@@ -384,6 +385,6 @@ def test_samples_that_find_no_room_in_a_table_or_a_row_are_counted(target):
         assert found.overflow == total - kept
         assert (found.row >= 0).sum() == kept and (found.row[0] >= 0).sum() == front
         own = found.samples[0]
-        places = own.tables["places"][own.ids[:, 1]]
+        places = own.tables["places"][own.ids[:, 0], :2]
         again = whole.samples[0].params[whole.row[found.row >= 0]]
         np.testing.assert_allclose(places[found.row[found.row >= 0]], again, atol=1e-6)

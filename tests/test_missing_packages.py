@@ -192,7 +192,6 @@ def render(sampler):
         CAMERAS["perspective"],
         (9, 12),
         sampler=sampler,
-        splatter="visible",
         layers=2,
     )
 
@@ -292,7 +291,7 @@ def test_an_image_beyond_the_device_is_refused_and_the_next_render_works(tall):
     part = Part(Mesh([(0, 1, 2)]), {"vertices": icosphere(0)[0]})
     for _ in range(2):
         with pytest.raises(InputError) as error:
-            rts.render(part, CAMERAS["perspective"], size, sampler=sampler, splatter="visible", layers=2)
+            rts.render(part, CAMERAS["perspective"], size, sampler=sampler)
         message = str(error.value)
         assert (
             f"{size[0] + 2 * APRON} × {size[1] + 2 * APRON} pixels" in message

@@ -5,11 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, relative_error, to_numpy
+from rts.operations.inset import INSET, PAINTED, painted_inset, with_inset
+from rts_backends.fused.image import IMAGE
 
 import rts
 from rts.operations import linear, projection
 from rts.operations.combine import COMBINE, combine, interpolate
-from rts.operations.inset import INSET, PAINTED, painted_inset, with_inset
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import SHIFTED, TAKE, take
@@ -17,7 +18,6 @@ from rts.plugin_api.operations import Operation
 from rts.scene.rigid import RIGID
 from rts.testing import OperationConformance
 from rts.testing.splatters import scattered
-from rts_backends.fused.image import IMAGE
 
 pytestmark = pytest.mark.engines
 

@@ -346,10 +346,7 @@ def test_samples_where_outlines_are_have_the_colours_and_gradients_of_many_every
     camera = CAMERA if name == "weights" else Camera.look_at((0.1, 0.2, 2.5), (0, 0, 0), fov_y=40)
     sampled = rts.sample(part, camera, SIZE, supersample=rts.Adaptive(2), splatter=None)
     active = to_numpy(sampled.fine.pixel) >= 0
-    images = {
-        s: to_numpy(rts.render(part, camera, SIZE, supersample=s, splatter="visible", layers=2))
-        for s in (1, 2, rts.Adaptive(2))
-    }
+    images = {s: to_numpy(rts.render(part, camera, SIZE, supersample=s)) for s in (1, 2, rts.Adaptive(2))}
     found = images[rts.Adaptive(2)]
     assert 0.1 < active.mean() < 0.9 and np.abs(images[1] - images[2])[active].max() > 0.05
     np.testing.assert_allclose(found[active], images[2][active], rtol=0, atol=1e-5)
@@ -360,7 +357,7 @@ def test_samples_where_outlines_are_have_the_colours_and_gradients_of_many_every
     def slope(samples):
         def loss(x):
             moved = part.replace(theta={**part.theta, name: x})
-            return (rts.render(moved, camera, SIZE, supersample=samples, splatter="visible", layers=2) * factor).sum()
+            return (rts.render(moved, camera, SIZE, supersample=samples) * factor).sum()
 
         return gradient(TORCH[0], loss, part.theta[name])
 

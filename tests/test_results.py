@@ -8,7 +8,7 @@ import pytest
 from benchmarks.pages import charts, measured
 from benchmarks.pages.__main__ import DOCS, MARKED, filled, marks
 from benchmarks.pages.headline import ratio
-from benchmarks.pages.kept import kept, number, written
+from benchmarks.pages.kept import kept, number
 
 pytestmark = pytest.mark.docs
 
@@ -81,22 +81,6 @@ def test_all_ways_to_fail_are_counted():
 def test_the_first_page_names_every_page():
     named = set(re.findall(r"\]\(([\w-]+)\.md\)", (PAGES / "index.md").read_text()))
     assert named == {page.stem for page in PAGES.glob("*.md")} - {"index"}
-
-
-def test_outlines_gain_what_their_table_says():
-    text = " ".join((PAGES / "outlines.md").read_text().split())
-    columns, rows = written("outlines", "scene", "K", keys=2)
-    for samples in ("", ", 2 × 2"):
-        before, after = (columns.index(name + samples) for name in ("by samples", "`visible`"))
-        ratios = {
-            name: float(cells[after].split(" / ")[0]) / float(cells[before].split(" / ")[0])
-            for name, cells in rows.items()
-            if "turns" in name or "rolls" in name
-        }
-        worse = ratios.pop("finger turns | 2")
-        assert len(ratios) == 10 and max(ratios.values()) < 1 < worse
-        found = min(ratios.values()), max(ratios.values()), worse
-        assert all(f"{ratio:.2f}" in text.partition("What turns or rolls")[2][:320] for ratio in found)
 
 
 def test_old_links_to_results_lead_somewhere():

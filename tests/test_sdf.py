@@ -363,9 +363,7 @@ def test_bands_of_a_large_picture_have_the_gradient_of_the_whole(monkeypatch, gr
 
     def image():
         radii = torch.tensor(part.theta["radii"], requires_grad=grad)
-        return radii, rts.render(
-            part.replace(theta={"radii": radii}), camera, (24, 20), supersample=3, splatter="visible", layers=2
-        )
+        return radii, rts.render(part.replace(theta={"radii": radii}), camera, (24, 20), supersample=3, layers=2)
 
     radii, whole = image()
     monkeypatch.setattr(settings, "BAND", 500)

@@ -1,35 +1,27 @@
-"""Splatters on random samples: what no scene may change, and compiled code against the specification."""
+"""Splatters on random samples: what no scene may change."""
 
 import numpy as np
 import pytest
-from helpers import TORCH, arrays, to_numpy
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import examples, masks, steps
 
 from rts import splatting
-from rts_backends.fused import splatters as fused
 
 pytestmark = pytest.mark.splatting
 
-torch = pytest.importorskip("torch")
+KINDS = [splatting.Single, splatting.Multi]
+of_every_kind = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 
-COMPILED = [fused.Single, fused.Multi, fused.Visible]
-EVERY = [splatting.Single, splatting.Multi, splatting.Visible, *COMPILED]
-of_every_kind = pytest.mark.parametrize("kind", EVERY, ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
-of_compiled_kinds = pytest.mark.parametrize("kind", COMPILED, ids=lambda kind: kind.__name__)
-
-FEW, MANY = examples(0.2), examples(0.4)
+FEW = examples(0.2)
 TOLERANCE = {np.float32: 1e-5, np.float64: 1e-12}
 REALS = st.sampled_from([np.float32, np.float64])
 
-POSITIVE = 1e-3, 0.05, 0.2
-"""Values of ε: with none, rounding decides whether weights add up to one, and so the derivative on centres."""
 
-
-def options(epsilons=(0.0, *POSITIVE)):
+def options():
     """σ, ε and γ."""
-    return st.tuples(st.sampled_from([0.5, 0.3, 0.8]), st.sampled_from(epsilons), st.sampled_from([None, 1.0]))
+    values = [0.5, 0.3, 0.8], [0.0, 1e-3, 0.05, 0.2], [None, 1.0]
+    return st.tuples(*map(st.sampled_from, values))
 
 
 # ------------------------------------------------------------------------------------------------- samples
@@ -60,35 +52,9 @@ def patches(draw):
 
 
 @st.composite
-def quilts(draw):
-    """Larger scenes, of rectangles that overlap, over more than one block of columns of compiled code.
-
-    Some rectangles are as wide as the image, since compiled code takes shortcuts along whole lines. In some scenes
-    deeper layers are only on one side of the border between two blocks.
-    """
-    layers, height, width = draw(st.tuples(st.integers(1, 4), st.integers(5, 12), st.integers(20, 45)))
-    rng = np.random.default_rng(draw(st.integers(0, 9999)))
-    covered, colors = np.zeros((layers, height, width), bool), np.zeros((layers, height, width), np.int64)
-    depth = np.ones(covered.shape)
-    for _ in range(8):
-        top, left = rng.integers(height) - 3, rng.integers(width) - 3
-        across = slice(max(0, left), left + rng.integers(4, 16)) if rng.random() < 0.6 else slice(width)
-        place = slice(max(0, top), top + rng.integers(4, 9)), across
-        y, x = np.indices((height, width))
-        slopes, rough = rng.integers(-4, 5, (2, 1 if rng.random() < 0.5 else layers, 1, 1)), rng.choice([0, 0, 2, 12])
-        plane = rng.integers(0, 9, (layers, 1, 1)) + slopes[0] * x + slopes[1] * y
-        plane = plane + rng.integers(0, 1 + rough, plane.shape)
-        depth[:, *place] = 60 + plane[:, *place] / 4
-        covered[:, *place] = (np.arange(layers) < rng.integers(0, layers + 1))[:, None, None]
-        colors[:, *place] = rng.integers(0, 3, (layers if rng.random() < 0.5 else 1, 1, 1))
-    covered[1:, :, draw(st.sampled_from([slice(0), slice(32), slice(32, None)]))] = False
-    return covered, depth, colors
-
-
-@st.composite
 def scenes(draw, centred=False, opaque=False, reals=REALS):
     """Positions (N, 3), rgba (N, 4) and row; layers are filled from the front, colours premultiplied."""
-    covered, depth, colors = draw(patches() | quilts())
+    covered, depth, colors = draw(patches())
     covered, depth = np.logical_and.accumulate(covered, axis=0), np.sort(depth, axis=0)
     rng = np.random.default_rng(draw(st.integers(0, 999)))
     total = max(1, covered.sum() + draw(st.integers(0, 3)))
@@ -97,7 +63,7 @@ def scenes(draw, centred=False, opaque=False, reals=REALS):
     k, y, x = np.nonzero(covered)
     positions, rgba = rng.normal(size=(total, 3)), rng.random((total, 4))
     positions[row[covered]] = np.stack([x + 0.5, y + 0.5, depth[covered]], axis=1)
-    # All of them off the centres, one in twenty, or none; a little is no matter to compiled code.
+    # All of them off the centres, one in twenty, or none.
     share = draw(st.just(0.0) if centred else st.sampled_from([0.0, 0.05, 1.0]))
     off = rng.integers(-6, 7, (len(k), 2)) / draw(st.sampled_from([16, 2**17]))
     positions[row[covered], :2] += off * (rng.random((len(k), 1)) < share)
@@ -195,13 +161,13 @@ def test_images_are_linear_in_colours_of_given_alphas(kind, options, scene, a, b
     close(found[..., 3], first[..., 3], tolerance(scene))
 
 
-@pytest.mark.parametrize("kind", [splatting.Single, fused.Single])
 @FEW
 @given(options=options(), scene=scenes(), seed=st.integers(0, 9))
-def test_the_image_of_one_layer_is_linear_in_colour_and_alpha(kind, options, scene, seed):
+def test_the_image_of_one_layer_is_linear_in_colour_and_alpha(options, scene, seed):
     positions, rgba, row = scene
     other = np.random.default_rng(seed).random(rgba.shape).astype(rgba.dtype)
-    first, second, found = (kind(*options).splat(positions, x, row) for x in (rgba, other, rgba - 2 * other))
+    splatter = splatting.Single(*options)
+    first, second, found = (splatter.splat(positions, x, row) for x in (rgba, other, rgba - 2 * other))
     close(found, first - 2 * second, 4 * tolerance(scene))
 
 
@@ -210,8 +176,7 @@ def test_the_image_of_one_layer_is_linear_in_colour_and_alpha(kind, options, sce
 @given(options=options(), scene=scenes(), down=st.integers(-2, 2), right=st.integers(1, 30))
 def test_a_scene_that_moves_by_whole_cells_moves_its_image(kind, options, scene, down, right):
     height, width = scene[2].shape[1:]
-    # Away from the sides; other columns are beside the borders of the blocks that compiled code looks at.
-    top, left, size = 3, 3, (height + 6, width + 36)
+    top, left, size = 3, 3, (height + 6, width + 36)  # Away from the sides.
     still = kind(*options).splat(*placed(scene, (top, left), size))
     moved = kind(*options).splat(*placed(scene, (top + down, left + right), size))
     close(moved, np.roll(still, (down, right), axis=(0, 1)), tolerance(scene))
@@ -224,13 +189,6 @@ def test_how_far_away_a_scene_is_does_not_matter(kind, options, scene, quarters)
     positions, rgba, row = scene
     farther = positions + np.array([0, 0, quarters / 4], positions.dtype)
     close(kind(*options).splat(farther, rgba, row), kind(*options).splat(*scene), tolerance(scene))
-
-
-@pytest.mark.parametrize("kind", [splatting.Visible, fused.Visible])
-def test_how_far_away_a_scene_is_does_not_matter_where_the_camera_is_amid_it(kind):
-    positions, row = np.array([(0.5, 0.5, 1.5), (1.5, 0.5, 1.0)]), np.array([[[0, 1]], [[-1, -1]]], np.int32)
-    away = kind().splat(positions, np.ones((2, 4)), row)
-    close(kind().splat(positions - [0, 0, 1.25], np.ones((2, 4)), row), away, 1e-12)
 
 
 @of_every_kind
@@ -249,7 +207,6 @@ def test_scenes_before_and_behind_the_camera_look_as_they_do_when_all_is_before_
         for back in (1, 3, 5, 7, 9, 12):
             nearer = positions - [0, 0, back], rgba, row
             close(splatter.splat(*nearer), away, 1e-12)
-            close(splatter.splat(*without_what_is_not_needed(splatter, nearer)), away, 1e-12)
 
 
 @pytest.mark.parametrize("mirror", ["left to right", "top to bottom", "rows for columns"])
@@ -282,16 +239,6 @@ def test_the_order_of_packed_rows_does_not_matter(kind, options, scene, seed):
     np.testing.assert_array_equal(found, kind(*options).splat(*scene))
 
 
-@pytest.mark.parametrize("kind", [splatting.Visible, fused.Visible])
-@MANY
-@given(options=options(), scene=scenes())
-def test_a_layer_that_is_empty_everywhere_changes_nothing(kind, options, scene):
-    positions, rgba, row = scene
-    # Of `Multi` it does: an empty target pairs with a source's empty layer, and takes all others in front.
-    found = kind(*options).splat(positions, rgba, np.concatenate([row, np.full_like(row[:1], -1)]))
-    close(found, kind(*options).splat(*scene), tolerance(scene))
-
-
 @of_every_kind
 @FEW
 @given(options=options(), scene=scenes(), border=st.integers(1, 3))
@@ -300,84 +247,3 @@ def test_a_border_is_left_out_and_changes_nothing_inside(kind, options, scene, b
     height, width = whole.shape[:2]
     expected = whole[border : max(border, height - border), border : max(border, width - border)]
     close(kind(*options).splat(*scene, border=border), expected, tolerance(scene))
-
-
-# --------------------------------------------------------------------------------------- what is needed
-
-
-def without_what_is_not_needed(splatter, scene):
-    """The scene with the rows of samples that the splatter does not need taken from their cells."""
-    positions, rgba, row = scene
-    covered = row >= 0
-    kept = splatter.needed(covered, np.where(covered, positions[row, 2], 0))
-    assert kept.dtype == bool and not (kept & ~covered).any()
-    return positions, rgba, np.where(kept, row, -1).astype(np.int32)
-
-
-@of_every_kind
-@MANY
-@given(options=options(), scene=scenes(centred=True, opaque=True))
-def test_what_is_not_needed_leaves_the_image_of_opaque_samples_as_it_is(kind, options, scene):
-    splatter = kind(*options)
-    close(splatter.splat(*without_what_is_not_needed(splatter, scene)), splatter.splat(*scene), tolerance(scene))
-
-
-@of_compiled_kinds
-@FEW
-@given(
-    options=options(POSITIVE),
-    scene=scenes(centred=True, opaque=True, reals=st.just(np.float64)),
-    seed=st.integers(0, 9),
-)
-def test_what_is_not_needed_leaves_the_derivative_of_opaque_samples_as_it_is(kind, options, scene, seed):
-    splatter = kind(*options)
-    found = pulled_back(splatter, without_what_is_not_needed(splatter, scene), seed)
-    for values, expected in zip(found, pulled_back(splatter, scene, seed), strict=True):
-        close(values[:, :3], expected[:, :3], 1e-9)  # Not of alpha, which is constant.
-
-
-# ---------------------------------------------------------------------------- compiled, and the specification
-
-
-def specification(kind):
-    """The class of `rts.splatting`."""
-    return getattr(splatting, kind.__name__)
-
-
-def pulled_back(splatter, scene, seed):
-    """Gradients from a random one of the image, by torch: of positions and colours, and of positions alone."""
-    positions, rgba, row = arrays(TORCH[0], scene, scene[0].dtype)
-    found = []
-    for wanted in ((positions, rgba), (positions,)):
-        for x in (positions, rgba):
-            x.requires_grad_(any(x is w for w in wanted))
-        image = splatter.splat(positions, rgba, row)
-        along = torch.tensor(np.random.default_rng(seed).normal(size=image.shape), dtype=image.dtype)
-        found += torch.autograd.grad(image, wanted, along)
-    return to_numpy(found)
-
-
-@of_compiled_kinds
-@MANY
-@given(options=options(), scene=scenes(), border=st.integers(0, 2))
-def test_compiled_images_are_those_of_the_specification(kind, options, scene, border):
-    found = kind(*options).splat(*scene, border=border)
-    assert found.dtype == scene[0].dtype
-    close(found, specification(kind)(*options).splat(*scene, border=border), tolerance(scene))
-
-
-@of_compiled_kinds
-@MANY
-@given(options=options(POSITIVE), scene=scenes(), seed=st.integers(0, 9))
-def test_compiled_gradients_are_those_of_the_specification(kind, options, scene, seed):
-    given = pulled_back(kind(*options), scene, seed), pulled_back(specification(kind)(*options), scene, seed)
-    for found, expected in zip(*given, strict=True):
-        close(found, expected, 20 * tolerance(scene) * max(1, np.abs(expected).max()))
-
-
-@of_compiled_kinds
-@MANY
-@given(options=options(), scene=scenes(centred=True, opaque=True))
-def test_what_compiled_code_needs_is_what_the_specification_needs(kind, options, scene):
-    own, specified = (without_what_is_not_needed(k(*options), scene)[2] for k in (kind, specification(kind)))
-    np.testing.assert_array_equal(own, specified)

@@ -1,9 +1,11 @@
-"""Found edges beside `visible` on the scenes of other measurements: errors of derivatives in each pixel and low-passed.
+"""Found edges beside the paper's splatter on the scenes of other measurements: errors of derivatives.
 
-The scenes are those of `accuracy.run`, `accuracy.crossings`, `accuracy.other_motions`, `thin`, the derivative images of
-`rts_compare.stability`, and those of `benchmarks.edges`. All have as many layers as a scene asks for, `edges` one where
-all is opaque. Truths are closed forms, or differences over ±0.15 pixels of area-sampled renders. Rows are kept in a
-file, from which a run that is interrupted goes on, and of which the summary is made:
+Errors are in each pixel and low-passed.
+
+The scenes are those of `accuracy.run`, `accuracy.crossing_scenes`, `accuracy.other_motions` and `thin`, the derivative
+images of `rts_compare.stability`, and those of `benchmarks.edges`. All have as many layers as a scene asks for, `edges`
+one where all is opaque. Truths are closed forms, or differences over ±0.15 pixels of area-sampled renders. Rows are
+kept in a file, from which a run that is interrupted goes on, and of which the summary is made:
 
     python -m benchmarks.accuracy.found_edges -o out/found_edges
     python -m benchmarks.accuracy.found_edges --suites thin crossings
@@ -34,14 +36,13 @@ from rts_compare.moving_scenes import Scene
 from rts_compare.true_derivatives import truth
 
 SIZE = 128
-"""Pixels along each side of the scenes of `accuracy.run` and `accuracy.crossings`."""
+"""Pixels along each side of the scenes of `accuracy.run` and `accuracy.crossing_scenes`."""
 STEP = 0.3
 """Length of the truth's central difference, pixels."""
 LOW, GAIN, WORSE = 0.08, 0.03, 0.02
 """The largest low-passed error and difference of the gain from 1 of a scene within; the least that counts as worse."""
 METHODS: dict[str, dict[str, Any]] = {
-    "visible": {"splatter": "visible"},
-    "Adaptive(4)": {"splatter": "visible", "supersample": rts.Adaptive(4)},
+    "multi": {"splatter": "multi"},
     "edges": {"splatter": "edges"},
 }
 
@@ -203,7 +204,7 @@ def within(found: tuple[float, float, float]) -> bool:
 
 
 def summary(rows: list[Row]) -> str:
-    """Medians and shares by suite and method; then the rows where `edges` is worse than `visible`."""
+    """Medians and shares by suite and method; then the rows where `edges` is worse than `multi`."""
     lines = []
     for suite in [*dict.fromkeys(row.suite for row in rows), "all"]:
         own = [row for row in rows if suite in ("all", row.suite)]
@@ -214,12 +215,12 @@ def summary(rows: list[Row]) -> str:
             share = sum(map(within, found)) / len(found)
             cells.append("{:.3f} / {:.3f} / {:.3f} / {:.0f} %".format(*medians, 100 * share))
         lines.append([suite, str(len(own)), *cells])
-    worse = [r for r in rows if r.found["edges"][1] > r.found["visible"][1] + WORSE]
+    worse = [r for r in rows if r.found["edges"][1] > r.found["multi"][1] + WORSE]
     beyond = [r for r in rows if not within(r.found["edges"])]
     return "\n".join(
         [
             table(["scenes of", "scenes", *METHODS], lines),
-            "Low-passed worse than `visible`:\n\n" + _listed(worse),
+            "Low-passed worse than `multi`:\n\n" + _listed(worse),
             "Not within:\n\n" + _listed(beyond),
         ]
     )

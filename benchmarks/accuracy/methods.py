@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-import rts
 from benchmarks.accuracy import scenes
 from benchmarks.accuracy.scenes import MOTION
 from rts_compare.failures.method_renderers import Own
@@ -32,10 +31,6 @@ CLOSED = {
 """Scene → its parts that are closed, whose back faces are hidden whether they are culled or not."""
 
 
-ADAPTIVE = (rts.Adaptive(4, dilated=False), rts.Adaptive(4, dilated=True), rts.Adaptive(8, dilated=False))
-"""Samples where outlines are, and around them, that are scored and timed on the cases."""
-
-
 class Method(NamedTuple):
     """A renderer of one scene.
 
@@ -52,28 +47,14 @@ class Method(NamedTuple):
     seeds: int = 1
 
 
-def name_of(splatter: str, layers: int, supersample: int | rts.Adaptive = 1) -> str:
+def name_of(splatter: str, layers: int, supersample: int = 1) -> str:
     """The name of a method of ours."""
-    if isinstance(supersample, rts.Adaptive):
-        side, where = supersample.samples, "around outlines" if supersample.dilated else "at outlines"
-        return f"{splatter}, K = {layers}, {side} × {side} {where}"
     return f"{splatter}, K = {layers}" + (f", {supersample} × {supersample}" if supersample > 1 else "")
 
 
-def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int | rts.Adaptive = 1) -> Method:
-    """A splatter of this library, or one with other settings.
-
-    `multi, calibrated` has the constants of `visible`; outlines of `visible, by samples` move as the samples inside of
-    them.
-    """
-    chosen = splatter
-    if splatter == "visible, by samples":
-        chosen = rts.plugin("rts.splatters", "visible")(rims=False)
-    if splatter == "multi, calibrated":
-        visible = rts.plugin("rts.splatters", "visible")()
-        chosen = rts.plugin("rts.splatters", "multi")(epsilon=visible.epsilon, calibration=visible.calibration)
-
-    drawn = Own(scene.moving, {"splatter": chosen, "layers": layers, "supersample": supersample})
+def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int = 1) -> Method:
+    """A splatter of this library."""
+    drawn = Own(scene.moving, {"splatter": splatter, "layers": layers, "supersample": supersample})
 
     def gradient(weights: np.ndarray) -> float:
         return float(drawn.slopes(np.zeros(1), lambda image: weights)[0])
@@ -83,13 +64,10 @@ def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int | rts
 
 def splatters(scene: scenes.Scene) -> list[Method]:
     """All of ours that are scored on a scene."""
-    most = scene.layers[-1]
-    found = [ours(scene, "single", 1, s) for s in (1, 2)]
-    found += [ours(scene, name, k, s) for name in ("multi", "visible") for k in scene.layers for s in (1, 2)]
-    found += [ours(scene, "multi, calibrated", most), ours(scene, "edges", 1)]
-    found += [ours(scene, "visible, by samples", most, s) for s in (1, 2)]
+    found = [ours(scene, name, 1, s) for name in ("edges", "single") for s in (1, 2)]
+    found += [ours(scene, "multi", k, s) for k in scene.layers for s in (1, 2)]
     if scene.name in CASES:
-        found += [ours(scene, "none", 1), *(ours(scene, "visible", most, s) for s in (4, *ADAPTIVE))]
+        found += [ours(scene, "none", 1), ours(scene, "edges", 1, 4)]
     return found
 
 

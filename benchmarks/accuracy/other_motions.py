@@ -1,8 +1,6 @@
 """Outlines under motions that are no shifts: bodies that turn about their axis, thicken, come nearer, twist.
 
-Derivative images of `visible` with outlines that move as the samples inside of them (*samples*), as depths of the front
-extrapolate it (*root*, K = 1), and as chords through the body do where they can be had (*chord*, K = 2, not culled);
-beside differences of area-sampled images over a pixel:
+Derivative images by `edges` and by `multi`, beside differences of area-sampled images over a pixel:
 
     python -m benchmarks.accuracy.other_motions
 """
@@ -19,22 +17,22 @@ import rts
 from benchmarks.accuracy.scenes import DISTANCE, grids, pixel
 from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh, rotation_xy
-from benchmarks.outline_fits import TILT, around_axis, vase
 from benchmarks.report import table
 from rts.diagnostics.example_shapes import icosphere
 from rts.diagnostics.smoothing import low_pass
+from rts_compare.builtin_scenes import VASE_HEIGHTS, VASE_RADII
 from rts_compare.derivative_scores import all_scores
 
 SIZE, POINTS = 256, 8
 """Pixels, and points of a pixel along x and y in each of the truth's two grids."""
 METHODS: dict[str, dict[str, Any]] = {
-    "samples": {"splatter": rts.plugin("rts.splatters", "visible")(rims=False), "layers": 1},
-    "root": {"splatter": "visible", "layers": 1},
-    "chord": {"splatter": "visible", "layers": 2},
-    "found": {"splatter": "edges", "layers": 1},
+    "multi": {"splatter": "multi", "layers": 2},
+    "edges": {"splatter": "edges", "layers": 1},
 }
 """Options of `rts.render`."""
 UP = np.array([0.0, 1.0, 0.0])
+TILT = (0.45, 0.3)
+"""Turns of the vase about x and y, radians."""
 
 
 class Motion(NamedTuple):
@@ -67,6 +65,35 @@ def motions() -> dict[str, Motion]:
         "flat ellipsoid turns": Motion(flat, triangles, step * np.cross(UP, flat)),
         "flat ellipsoid turns, fast": Motion(flat, triangles, 4 * step * np.cross(UP, flat)),
     }
+
+
+def vase() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (T, 3) of a vase that is closed above, tilted."""
+    from scipy.interpolate import BSpline
+
+    count, degree = 64, 3
+    ends = len(VASE_RADII) - degree
+    spline = BSpline(
+        np.clip(np.arange(len(VASE_RADII) + degree + 1) - degree, 0, ends),
+        np.stack([VASE_RADII, VASE_HEIGHTS], axis=-1),
+        degree,
+    )
+    profile = spline(np.linspace(0, ends, count - 1))
+    radius, height = np.concatenate([profile, [[0.0, profile[-1, 1]]]]).T
+    vertices, faces = around_axis(radius, height, 96)
+    return vertices @ rotation_xy(*TILT).T, faces
+
+
+def around_axis(radius: np.ndarray, height: np.ndarray, around: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (T, 3) that a profile, from below, sweeps around the y axis."""
+    angle, count = 2 * np.pi * np.arange(around) / around, len(radius)
+    x, z = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    vertices = np.stack([x, np.broadcast_to(height[:, None], x.shape), z], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(count - 1), np.arange(around), indexing="ij")
+    a, b = i * around + j, i * around + (j + 1) % around
+    triangles = (a, a + around, b), (b, a + around, b + around)
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in triangles])
+    return vertices, faces.astype(np.int32)
 
 
 class Body:

@@ -75,7 +75,7 @@ def seconds(turns: dict[str, Callable[[], object]], done: Callable[[], None]) ->
 def timed(scene: scenes.Scene, others: list[Method], done: Callable[[], None]) -> list[dict]:
     """Render and gradient of a loss in the scalar motion, by each method."""
     weights = np.array(loss_weights(*scene.size)[0])
-    chosen = [*(methods.ours(scene, "visible", 2, s) for s in (1, 2, 4, *methods.ADAPTIVE)), *others]
+    chosen = [*(methods.ours(scene, "edges", 1, s) for s in (1, 2, 4)), *others]
     # The fewest samples compile the same loops as many.
     fewest = next((m for m in chosen if m.name.startswith("Mitsuba")), None)
     for method in chosen:

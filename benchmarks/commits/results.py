@@ -21,16 +21,16 @@ from benchmarks.commits.scenes import CULLED, POSE, SIZE, camera_of_scenes, matr
 LAYERS, USUAL = (1, 2, 4), 2
 """K, and the one that is never left out."""
 
-NAMED = ("none", "single", "multi", "visible")
-DEFAULT = "visible"
-IN_ARRAY_CODE = ("Single", "Multi", "Visible")
-"""Classes of `rts.splatting`; by name, the same methods are compiled, save "none"."""
+NAMED = ("none", "single", "multi", "edges")
+DEFAULT = "edges"
+IN_ARRAY_CODE = ("Single", "Multi")
+"""Classes of `rts.splatting`; in older commits the same methods are compiled by name."""
 
 SLOW = ("toy",)
 """Samplers that take a hundred times longer than others."""
 
 JIT_LAYERS = ("mesh", "silhouette", "split uv")
-JIT_SPLATTERS = {"mesh": (*NAMED, *IN_ARRAY_CODE), "heightfield": (DEFAULT, "Visible")}
+JIT_SPLATTERS = {"mesh": (*NAMED, *IN_ARRAY_CODE), "heightfield": (DEFAULT,)}
 """Scenes that are compiled as a whole for every K, and for more splatters than the default: each takes seconds."""
 
 

@@ -1,4 +1,4 @@
-"""The charts of the pages of results; here those of the first page: speed against accuracy, growth, and stability."""
+"""The charts of the pages of results; here those of the first page: growth, and stability."""
 
 from __future__ import annotations
 
@@ -11,27 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.pages import table_charts
-from benchmarks.pages.drawing import INK, OURS, PALE, logarithmic, panels
-from benchmarks.pages.kept import kept, number, scene, written
+from benchmarks.pages.drawing import INK, OURS, logarithmic, panels
+from benchmarks.pages.kept import kept, number, written
 from rts_compare.chart_style import PEER_COLORS
-from rts_compare.pareto_front import milliseconds, timed
 
 IMAGES = Path(__file__).parents[2] / "docs/images/results"
-SCENES = ("bunny over black", "bunny before square", "square behind bunny")
 VERDICTS = {"ok": "well", "degraded": "degraded", "failed": "failed", "cannot": "does not apply"}
 VERDICT_COLORS = {"ok": "#2F9E6E", "degraded": "#F2C14E", "failed": "#D1495B", "cannot": "#DDE1E6"}
-
-
-def fronts() -> dict[str, Any]:
-    """Times and errors of translations in three scenes: our front, and the other renderers' settings."""
-    found = {}
-    for name in SCENES:
-        rows = [row for row in scene(name)["rows"] if row["mode"] == "translation" and timed(row)]
-        ours = sorted((milliseconds(r), r["error"]) for r in rows if "peer" not in r)
-        best = [p for n, p in enumerate(ours) if p[1] < min((e for _, e in ours[:n]), default=2.0)]
-        peers = {p: sorted((milliseconds(r), r["error"]) for r in rows if r.get("peer") == p) for p in PEER_COLORS}
-        found[name] = {"ours": [list(p) for p in best], **{p: [list(x) for x in v] for p, v in peers.items()}}
-    return found
 
 
 def growth() -> dict[str, Any]:
@@ -50,27 +36,6 @@ def verdicts() -> dict[str, Any]:
     table = kept("stability")
     told = {m: [row["cells"][n]["verdict"] for row in table["rows"]] for n, m in enumerate(table["methods"])}
     return {method: {v: cells.count(v) for v in VERDICTS} for method, cells in told.items()}
-
-
-def draw_fronts(found: dict[str, Any]) -> Any:
-    """Error against time, a panel a scene."""
-    figure, three = panels(3, 11, 3.9)
-    for axes, (name, lines) in zip(three, found.items(), strict=True):
-        axes.set(xscale="log", yscale="log", title=name, xlabel="time of a render and its gradient, ms")
-        axes.grid(color="#e5e7eb")
-        axes.plot(*zip(*lines["ours"], strict=True), "o-", color=OURS, drawstyle="steps-post", label="rts")
-        axes.plot(*zip(*lines["DEODR"], strict=True), "X", color=PEER_COLORS["DEODR"], ms=9, label="DEODR")
-        mitsuba = lines["Mitsuba"]
-        axes.plot(*zip(*mitsuba, strict=True), "s-", color=PEER_COLORS["Mitsuba"], label="Mitsuba, samples a pixel")
-        for spp, (ms, error) in zip((1, 4, 16), mitsuba, strict=True):
-            axes.annotate(str(spp), (ms, error), (6, 3), textcoords="offset points", color=PALE, fontsize=8)
-        axes.set(ylim=(0.006, 0.4), xlim=(2.5, 2500))
-        logarithmic(axes.xaxis, lambda value: f"{value:g}")
-        logarithmic(axes.yaxis, lambda value: f"{100 * value:g} %")
-        axes.tick_params(axis="x", labelrotation=45)
-    three[0].set_ylabel("error of the derivative image")
-    three[0].legend(frameon=False, loc="lower right", fontsize=8)
-    return figure
 
 
 def draw_growth(found: dict[str, Any]) -> Any:
@@ -129,10 +94,8 @@ class Chart:
 
 
 CHARTS = {
-    "speed_against_accuracy": Chart(fronts, draw_fronts),
     "growth": Chart(growth, draw_growth),
     "outcomes": Chart(verdicts, draw_verdicts),
-    "error_vs_time": Chart(table_charts.times, table_charts.draw_times),
     "samplers": Chart(table_charts.samplers, table_charts.draw_samplers),
     "smooth": Chart(table_charts.smooth, table_charts.draw_smooth),
 }

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rts_compare.chart_style import SPLATTER_COLORS
-
-INK, PALE, OURS = "#1f2937", "#6b7280", SPLATTER_COLORS["visible"]
+INK, PALE, OURS = "#1f2937", "#6b7280", "#D55E00"
 
 
 def panels(columns: int, width: float, height: float, rows: int = 1) -> tuple[Any, Any]:

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.pages import measured
-from rts_compare.builtin_scenes import BUILTIN
-from rts_compare.comparison import file_name
 
 RESULTS = Path(__file__).parents[1] / "results"
 PAGES = Path(__file__).parents[2] / "docs/results"
@@ -20,16 +18,6 @@ PAGES = Path(__file__).parents[2] / "docs/results"
 def kept(name: str) -> Any:
     """What a JSON file of benchmarks/results holds."""
     return json.loads((RESULTS / f"{name}.json").read_text())
-
-
-def scenes() -> list[Mapping]:
-    """The comparisons of all built-in scenes that were measured, in the order of `rts compare list`."""
-    return [kept(file_name(name)) for name in BUILTIN if (RESULTS / f"{file_name(name)}.json").exists()]
-
-
-def scene(name: str) -> Mapping:
-    """The comparison of a built-in scene."""
-    return kept(file_name(name))
 
 
 def outcome(row: str, method: str) -> Mapping:

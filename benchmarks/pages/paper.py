@@ -19,7 +19,7 @@ def derivatives_on_page() -> dict[str, dict[str, float]]:
     found = {}
     for line, cells in lines.items():
         name = re.sub(r"[`*]", "", line)
-        name += {"none": ", K = 1", "single": ", K = 1"}.get(name, "")
+        name += dict.fromkeys(("none", "single", "edges"), ", K = 1").get(name, "")
         at = dict(zip(columns, cells, strict=True))
         if at["A low-pass"]:
             found[name] = {scene: number(at[f"{scene} low-pass"]) for scene in "ABC"}

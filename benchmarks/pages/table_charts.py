@@ -4,53 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.pages.drawing import OURS, PALE, logarithmic, panels
+from benchmarks.pages.drawing import logarithmic, panels
 from benchmarks.pages.kept import number, written
-from rts_compare.chart_style import PEER_COLORS
 
-CASES = {"A": "bunny moves over black", "B": "square moves behind the bunny", "C": "bunny moves before the square"}
-"""A scene's letter on the page → its name."""
-EVERYWHERE = {"`visible`, K = 2": "1 × 1", "the same, `supersample=2`": "2 × 2", "the same, `supersample=4`": "4 × 4"}
-ADAPTIVE = {"4 × 4 at outlines": "D", "4 × 4 around outlines": "P", "8 × 8 at outlines": "*"}
 SAMPLER_LOOKS = {"raster": ("#D55E00", "o"), "embree": ("#0072B2", "D"), "opengl": ("#009E73", "^")}
 KINDS = {"refined": ("#D55E00", "o"), "as found": ("#9467BD", "D"), "mesh": ("#0072B2", "s"),
          "mesh, a facet a pixel": ("#009E73", "^")}  # fmt: skip
-
-
-def times() -> dict[str, Any]:
-    """Seconds and errors of each method, by scene, of the page of accuracy."""
-    columns, lines = written("accuracy", "method", "A s")
-    found = {}
-    for letter, name in CASES.items():
-        s, e = columns.index(f"{letter} s"), columns.index(f"{letter} exact")
-        found[name] = {line: [number(cells[s]), number(cells[e])] for line, cells in lines.items()}
-    return found
-
-
-def draw_times(found: dict[str, Any]) -> Any:
-    """Error of the derivative image against time, a panel a scene."""
-    figure, three = panels(3, 12, 4.6)
-    for axes, (name, points) in zip(three, found.items(), strict=True):
-        axes.set(xscale="log", yscale="log", title=name, xlabel="render and gradient, s", ylim=(0.006, 0.4))
-        axes.set_xlim(0.004, 9)
-        axes.grid(color="#e5e7eb")
-        ours = [points[line] for line in EVERYWHERE]
-        axes.plot(*zip(*ours, strict=True), "o-", color=OURS, label="rts, s × s samples a pixel")
-        for text, point in zip(EVERYWHERE.values(), ours, strict=True):
-            place = {"xytext": (7, -4)} if text == "4 × 4" else {"xytext": (-7, -10), "ha": "right"}
-            axes.annotate(text, point, textcoords="offset points", color=OURS, fontsize=8, **place)
-        for line, marker in ADAPTIVE.items():
-            axes.plot(*points[line], marker, color="#7A3FF2", ms=8, label=f"rts, {line}", ls="none")
-        mitsuba = {line.removeprefix("Mitsuba, "): p for line, p in points.items() if line.startswith("Mitsuba")}
-        axes.plot(*zip(*mitsuba.values(), strict=True), "s-", color=PEER_COLORS["Mitsuba"], label="Mitsuba")
-        for text, point in mitsuba.items():
-            axes.annotate(text, point, (5, 5), textcoords="offset points", color=PALE, fontsize=8)
-        axes.plot(*points["DEODR"], "X", color=PEER_COLORS["DEODR"], ms=9, label="DEODR", ls="none")
-        logarithmic(axes.xaxis, lambda value: f"{value:g}", (1, 3))
-        logarithmic(axes.yaxis, lambda value: f"{100 * value:g} %")
-    three[0].set_ylabel("error of the derivative image")
-    figure.legend(*three[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    return figure
 
 
 def samplers() -> dict[str, Any]:

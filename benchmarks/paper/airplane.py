@@ -28,7 +28,7 @@ from benchmarks.paper import airplane_scene as scene
 from rts.arrays.engines import engine_named
 from rts.files.srgb import decode_srgb, encode_srgb
 
-SPLATTERS = {"none": 1, "single": 1, "multi": 2, "visible": 2}
+SPLATTERS = {"none": 1, "single": 1, "multi": 2, "edges": 1}
 """Splatter → layers."""
 STEPS = {"lm": 50, "adam": 250}
 RATE = 0.05

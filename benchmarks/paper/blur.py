@@ -36,14 +36,12 @@ TRUSTED = np.radians(60.0)
 WAYS = {
     "none": ("none", 1),
     "multi": ("multi", 1),
-    "visible": ("visible", 1),
-    "none, 2 × 2": ("none", 2),
-    "visible, 2 × 2": ("visible", 2),
     "edges": ("edges", 1),
+    "none, 2 × 2": ("none", 2),
     "edges, 2 × 2": ("edges", 2),
 }
 """Name → splatter, and samples a pixel along each axis."""
-COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red", "tab:green", "tab:olive"
+COLORS = "black", "tab:blue", "tab:orange", "tab:gray", "tab:red"
 """The colours of their lines."""
 
 

@@ -44,7 +44,7 @@ def derivatives(numbers: dict[str, dict[str, float]]) -> list[Row]:
         Row(
             "Two layers closely match finite differences",
             "picture",
-            f"error {errors('multi, K = 2')} (`multi`), {errors('visible, K = 2')} (`visible`)",
+            f"error {errors('multi, K = 2')} (`multi`), {errors('edges, K = 1')} (`edges`)",
             verdict(*(two[s] <= CLOSE for s in "ABC")),
             "what is off is mostly size: by the paper's constants 0.85 to 0.89 of a derivative arrives",
         ),
@@ -155,14 +155,14 @@ def speed(numbers: dict[str, Any]) -> list[Row]:
             "16 → 26 ms (1.6×), 2.5K to 2M, V100",
             told(full),
             verdict(growth(full) < 4),
-            f"by `visible`; {meshes}",
+            f"by the former default; {meshes}",
         ),
         Row(
             "RtS-pose hardly depends on the mesh",
             "16 → 17 ms (1.06×)",
             told(pose),
             verdict(growth(pose) < 1.25),
-            "by `visible`; finding the points does depend on it, on two cores",
+            "by the former default; finding the points does depend on it, on two cores",
         ),
     ]
     if "DEODR" in ms:
@@ -200,7 +200,7 @@ def airplane(numbers: dict[str, Any]) -> list[Row]:
 
     fits, unknowns = numbers["summary"], sum(x.size for x in start(0).values())
     main = fits["multi"]
-    known = {s: fits[s] for s in ("single", "multi", "visible") if s in fits}
+    known = {s: fits[s] for s in ("single", "multi", "edges") if s in fits}
 
     def told(key: str, unit: str = "") -> str:
         lines = []
@@ -287,8 +287,7 @@ def hand(numbers: dict[str, Any]) -> list[Row]:
         Row(
             "With one layer the hand converges more slowly",
             "picture",
-            f"error at the end, best rate: {best['single']:.4f} (one layer), {best['multi, K = 2']:.4f} (`multi`), "
-            f"{best['visible']:.4f} (`visible`)",
+            f"error at the end, best rate: {best['single']:.4f} (one layer), {best['multi, K = 2']:.4f} (`multi`)",
             verdict(best["multi, K = 2"] < best["single"], all(more[f] < one[f] for f in slower)),
             f"`multi` ends lower at {sum(more[f] < one[f] for f in slower)} of the {len(slower)} rates that one layer "
             "bears; errors after 100 steps, three seeds",
@@ -296,8 +295,7 @@ def hand(numbers: dict[str, Any]) -> list[Row]:
         Row(
             "With one layer it is unstable at higher learning rates; several are necessary",
             "picture",
-            "highest rate at which no seed stalls or diverges: "
-            + ", ".join(f"×{highest(m):g} (`{m}`)" for m in ("single", "multi, K = 2", "visible")),
+            "highest rate at which no seed stalls or diverges: " + ", ".join(f"×{highest(m):g} (`{m}`)" for m in fits),
             verdict(highest("single") < highest("multi, K = 2")),
         ),
     ]

@@ -33,9 +33,7 @@ from rts_compare.failures import table_columns as failures
 from rts_compare.kept_measurements import KeptMeasurements
 
 PHOTOGRAPHS = ("IMG-1842.jpg", "IMG-1843.jpg", "IMG-1844.jpg")
-METHODS = {
-    m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "visible", "edges")
-}
+METHODS = {m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "edges")}
 """Options of `rts.render`. The hand is culled, so that its second layer is what lies behind it."""
 FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0, 15.0, 20.0, 30.0)
 QUICK_FACTORS = (0.3, 3.0, 10.0, 20.0)
@@ -305,16 +303,16 @@ def draw(found: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from rts_compare.chart_style import OTHER_COLORS, PEER_COLORS, SPLATTER_COLORS
+    from rts_compare.chart_style import PEER_COLORS, SPLATTER_COLORS
 
     fits, seeds = found["fits"], range(len(found["start"]))
-    colors = {m: SPLATTER_COLORS.get(m.split(",")[0], OTHER_COLORS[0]) for m in fits}
+    colors = {m: SPLATTER_COLORS[m.split(",")[0]] for m in fits}
     factors = list(next(iter(fits.values())))
     least = {m: min(factors, key=lambda f, m=m: np.median([r["error"] for r in fits[m][f]])) for m in fits}
     high, higher = factors[-3], factors[-2]
     figure = plt.figure(figsize=(13, 9))
-    grid = figure.add_gridspec(3, 8, height_ratios=[1.25, 1, 1])
-    axes = figure.add_subplot(grid[0, :4])
+    grid = figure.add_gridspec(3, 6, height_ratios=[1.25, 1, 1])
+    axes = figure.add_subplot(grid[0, :3])
     for method, runs in fits.items():
         x = [float(f) for f in runs]
         every = np.array([[runs[f][s]["error"] for f in runs] for s in seeds])
@@ -325,7 +323,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     axes.axhline(np.median(found["start"]), color="0.6", ls=":", label="start")
     axes.set(xscale="log", yscale="log", xlabel="learning rate × base", ylabel="RMS error of hard images, sRGB")
     axes.legend(fontsize=8)
-    axes = figure.add_subplot(grid[0, 4:])
+    axes = figure.add_subplot(grid[0, 3:])
     for method, runs in fits.items():
         for s in seeds:
             axes.plot(runs[high][s]["losses"], color=colors[method], alpha=0.8, label=method if s == 0 else None)
@@ -338,7 +336,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
         pictures.append(("DEODR's fitter", np.array(found["deodr"]["images"])[0]))
     below = [(f"{m}, ×{f}", judged(as_arrays(fits[m][f][0]["parameters"]))[0]) for f in (high, higher) for m in fits]
     for row, shown in ((1, pictures), (2, below)):
-        for column, (title, image) in enumerate(shown[:8]):
+        for column, (title, image) in enumerate(shown[:6]):
             axes = figure.add_subplot(grid[row, column])
             axes.imshow(np.clip(image, 0, 1))
             axes.set_title(title, fontsize=8)

@@ -1,6 +1,6 @@
 """The parts of a pose iteration's time, and the least time that the machine's memory would allow.
 
-An iteration with torch, K = 2: the milliseconds of its compiled loops, by what they are for, and of the rest, which is
+An iteration with torch: the milliseconds of its compiled loops, by what they are for, and of the rest, which is
 Python, torch and Adam; how many bytes the loops are handed; and how long two threads take to read so many.
 
     python -m benchmarks.speed.bound
@@ -29,8 +29,8 @@ LINE = 64
 
 STAGES = {
     "rasterize": ("raster",),
-    "choose, lift": ("pruning", "interiors", "facing", "packing", "extremes", "merging", "exits"),
-    "splat": ("survey", "choices", "stencil", "mixed", "outlines", "crossing"),
+    "lift, find outlines": ("packing", "extremes", "merging", "sheets", "silhouettes", "spans", "segments"),
+    "splat": ("edges",),
 }
 """Loops by the beginnings of their modules' names; others are *the rest of the loops*."""
 
@@ -104,7 +104,7 @@ def listening(loops: Loops) -> Iterator[None]:
 def measure(task: Task, rounds: int) -> tuple[float, Loops]:
     """Seconds of an iteration, the median, and its loops, of which seconds and bytes are those of one."""
     step = torch_iteration(task)
-    samples = rts.sample(task.part, task.view, task.size, layers=task.layers, splatter="visible")
+    samples = rts.sample(task.part, task.view, task.size, layers=task.layers)
     loops, times = Loops(samples.samples[0].ids.shape[0]), []
     for _ in range(6):
         step()

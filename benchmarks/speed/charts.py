@@ -18,7 +18,7 @@ LINES = {
 }
 """What the chart shows, and how."""
 STAGE_COLORS = (
-    *("#111827", "#1d4ed8", "#3b82f6", "#7dd3fc", "#c7d2fe"),
+    *("#111827", "#1d4ed8", "#3b82f6", "#c7d2fe"),
     *("#15803d", "#86efac", "#4ade80", "#eab308", "#c2410c", "#fb923c", "#9ca3af"),
 )
 """What samples is blue, what goes forward green, what goes back orange."""
@@ -73,25 +73,4 @@ def stages_chart(rows: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def splat_chart(rows: list[dict], path: Path) -> None:
-    """Time of each splatter against K; one panel a splatter, at the largest size."""
-    from matplotlib.figure import Figure
-
-    side, found = by_side(rows)[-1]
-    splatters = list(dict.fromkeys(row["splatter"] for row in found))
-    figure = Figure(figsize=(4 * len(splatters), 4.2), layout="constrained")
-    panels = figure.subplots(1, len(splatters), sharey=True, squeeze=False)[0]
-    for axes, splatter in zip(panels, splatters, strict=True):
-        chosen = [row for row in found if row["splatter"] == splatter]
-        for name in chosen[0]["times"]:
-            style = {"color": "#c2410c" if "torch" in name else "#1d4ed8", "linestyle": "--" if "spec" in name else "-"}
-            points = [(row["layers"], row["times"][name]["ms"]) for row in chosen]
-            axes.semilogy(*zip(*points, strict=True), label=name, marker="o", markersize=4, **style)
-        axes.set(title=f"{splatter}, {side}²", xlabel="K", xticks=[row["layers"] for row in chosen])
-        axes.grid(alpha=0.3, which="both")
-    panels[0].set_ylabel("milliseconds, forward and gradient")
-    panels[0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-
-
-CHARTS = {"pose": pose_chart, "stages": stages_chart, "splat": splat_chart}
+CHARTS = {"pose": pose_chart, "stages": stages_chart}

@@ -1,4 +1,4 @@
-"""Times: iterations of a pose fit beside other renderers, stages, splatters, memory, pruning, second order.
+"""Times: iterations of a pose fit beside other renderers, stages, memory, second order.
 
 Methods that are compared take turns in one run, so that noise of the machine hits all alike. Writes tables (speed.md),
 all numbers (speed.json) and charts:
@@ -21,17 +21,16 @@ from pathlib import Path
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from benchmarks.meshes import MESHES, kept_mesh
-from benchmarks.speed import levenberg_marquardt, memory, second_layer, splatters, stages, tables
+from benchmarks.speed import levenberg_marquardt, memory, stages, tables
 from benchmarks.speed.charts import CHARTS
 from benchmarks.speed.pose_iteration import ENGINES, MODES, Task, torch_iteration
 from benchmarks.timing import ROUNDS, WARM_UP, in_turn
 from rts_compare.environment import environment
 
 QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 3
-SPLATTED, PRUNED, STAGED = ("bunny",), ("bunny", "nefertiti"), ("teapot", "bunny", "nefertiti")
+SOLVED, STAGED = ("bunny",), ("teapot", "bunny", "nefertiti")
 MEASURED = ("teapot", "bunny", "spot", "nefertiti")
 """Meshes of the sections that do not take all."""
-LAYERS = (1, 2, 4)
 BUDGET = 30.0
 """Seconds of timed calls after which a method has had enough turns."""
 PACKAGES = ("numpy", "torch", "jax", "numba", "deodr", "mitsuba", "drjit")
@@ -76,8 +75,7 @@ class Plan:
     def __init__(self, args: argparse.Namespace, done: Callable[[], None]):
         self.args, self.folder = args, args.output / "meshes"
         engines, rounds, largest = tuple(ENGINES), args.rounds, (max(args.sizes),)
-        depths = LAYERS[:2] if args.quick else LAYERS
-        staged, splatted, pruned = (self.chosen(names) for names in (STAGED, SPLATTED, PRUNED))
+        staged, solved = (self.chosen(names) for names in (STAGED, SOLVED))
         every, measured = self.chosen(MESHES), self.chosen(MEASURED)
         count = len(args.sizes)
         self.sections: dict[str, tuple[int, Callable[[], list[dict]]]] = {
@@ -89,21 +87,13 @@ class Plan:
                 len(staged) * count * len(stages.KINDS),
                 lambda: stages.measure(self.tasks(staged), rounds, done),
             ),
-            "splat": (
-                len(splatted) * count * len(depths) * len(splatters.SPLATTERS),
-                lambda: splatters.measure(self.tasks(splatted), depths, rounds, done),
-            ),
             "memory": (
                 len(measured) * len(memory.CASES),
                 lambda: memory.measure(measured, *largest, self.folder, done),
             ),
-            "pruning": (
-                len(pruned) * len(second_layer.SHADERS) * len(engines),
-                lambda: second_layer.measure(self.tasks(pruned, largest), engines, rounds, done),
-            ),
             "lm": (
-                len(splatted) * count * len(engines) * len(levenberg_marquardt.UNKNOWNS),
-                lambda: levenberg_marquardt.measure(self.tasks(splatted), engines, rounds, done),
+                len(solved) * count * len(engines) * len(levenberg_marquardt.UNKNOWNS),
+                lambda: levenberg_marquardt.measure(self.tasks(solved), engines, rounds, done),
             ),
         }
 

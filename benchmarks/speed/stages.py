@@ -19,7 +19,6 @@ from rts.sampling import packing, triangle_sampler
 STAGES = (
     "pose matrix",
     "rasterize",
-    "choose hidden layers",
     "lift",
     "rest of sample",
     "evaluate, project",
@@ -65,12 +64,7 @@ class TimedSplatter(rts.Splatter):
 
     def __init__(self, splatter: Any, clock: Clock):
         self._splatter, self._clock = splatter, clock
-        self.reach, self.reads, self.fills_interiors = splatter.reach, splatter.reads, splatter.fills_interiors
-
-    def needed(self, covered: Any, depth: Any) -> Any:
-        """See `rts.Splatter`."""
-        with self._clock.stage("choose hidden layers"):
-            return self._splatter.needed(covered, depth)
+        self.reach, self.reads, self.layers = splatter.reach, splatter.reads, splatter.layers
 
     def image(self, splats: Splats) -> Any:
         """See `rts.Splatter`."""
@@ -131,7 +125,7 @@ def stages(task: Task, mode: str, sampler: str, rounds: int) -> dict[str, float]
         posed = part.replace(transform=transform) if mode == "full" else prepared.replace(transform=transform)
         options: dict[str, Any] = {"sampler": timed} if mode == "full" else {}
         with clock.stage("rest of sample"):
-            options |= {"splatter": splatter, "layers": task.layers, "settles": True}
+            options |= {"splatter": splatter, "layers": task.layers}
             sampled = rts.sample(posed, task.view, task.size, **options)
         with clock.stage("evaluate, project"):
             image = rts.render_samples(sampled, posed, task.view, splatter=splatter)
@@ -157,7 +151,7 @@ def _one(clock: Clock, iteration: Callable[[], None]) -> dict[str, float]:
     iteration()
     found = {**clock.seconds, "total": time.perf_counter() - start}
     for outer, inner in (
-        ("rest of sample", ("rasterize", "choose hidden layers", "lift")),
+        ("rest of sample", ("rasterize", "lift")),
         ("evaluate, project", ("shade", "splat")),
         ("backward: rest", ("backward: splat",)),
     ):

@@ -75,18 +75,6 @@ def stages(rows: list[dict]) -> str:
     return table(header, lines)
 
 
-def splat(rows: list[dict]) -> str:
-    header = ["mesh, side", "K", "samples", "splatter", *rows[0]["times"]]
-    header += [f"{engine}: specification / compiled" for engine in ("torch", "jax")]
-    lines = []
-    for row in rows:
-        times = {name: t["ms"] for name, t in row["times"].items()}
-        gains = (times[f"{e}, specification"] / times[f"{e}, compiled"] for e in ("torch", "jax"))
-        about = [f"{row['mesh']}, {row['side']}²", str(row["layers"]), f"{row['samples']:,}", row["splatter"]]
-        lines.append([*about, *map(number, times.values()), *(f"{gain:.1f}" for gain in gains)])
-    return table(header, lines)
-
-
 def memory(rows: list[dict]) -> str:
     keys = list(dict.fromkeys((r["engine"], r["mode"], r["sampler"]) for r in rows))
     faces = faces_of(rows)
@@ -100,16 +88,6 @@ def memory(rows: list[dict]) -> str:
         for key in keys
     ]
     header = ["MiB", *(f"{f:,}" for f in faces.values()), *(f"{f:,}, NumPy" for f in faces.values())]
-    return table(header, lines)
-
-
-def pruning(rows: list[dict]) -> str:
-    header = ["mesh, side", "shader, engine", *rows[0]["times"], "K = 2 / K = 1", "nothing dropped / K = 2"]
-    lines = []
-    for row in rows:
-        one, two, all_kept = (t["ms"] for t in row["times"].values())
-        about = [f"{row['mesh']}, {row['side']}²", f"{row['shader']}, {row['engine']}"]
-        lines.append([*about, *map(number, (one, two, all_kept)), f"{two / one:.2f}", f"{all_kept / two:.2f}"])
     return table(header, lines)
 
 
@@ -140,18 +118,12 @@ SECTIONS = {
         "Constant surfaces are evaluated within *rest of sample*; *backward: splat* includes the loss's.",
         stages,
     ),
-    "splat": (
-        "Splatters alone",
-        "Forward and gradients of positions and colours, milliseconds, all layers kept.",
-        splat,
-    ),
     "memory": (
         "Memory",
         "Peak of resident memory over that of the loaded scene with its code compiled, in three iterations, each case "
         "in a process of its own; by faces. *NumPy*: peak of its allocations in sampling.",
         memory,
     ),
-    "pruning": ("Two layers against one", "Pose iterations, milliseconds.", pruning),
     "lm": (
         "Levenberg–Marquardt",
         "A step that is accepted: a solution, and loss and normal equations at the trial; milliseconds. *step*: by "

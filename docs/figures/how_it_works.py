@@ -215,15 +215,14 @@ def edge_slope(chosen: Any) -> np.ndarray:
 
 
 def edge() -> Figure:
-    """The derivative at a straight edge: the truth, and by four splatters."""
-    made, axes = figure(10, 2.7, 5, sharey=True)
+    """The derivative at a straight edge: the truth, and by three splatters."""
+    made, axes = figure(9, 2.7, 4, sharey=True)
     truth = np.zeros(12)
     truth[6] = 1
     found = {
         "truth:\npixels are means of areas": (truth, INK),
         "no derivative at edges:\n`none`": (edge_slope("none"), PALE),
         "the paper's:\n`multi`": (edge_slope("multi"), BLUE),
-        "calibrated:\n`visible`": (edge_slope("visible"), PINK),
         "found:\n`edges`": (edge_slope("edges"), ORANGE),
     }
     for one, (name, (slope, color)) in zip(axes, found.items(), strict=True):

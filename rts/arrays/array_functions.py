@@ -204,3 +204,11 @@ def _is_finite(x: Array, below: float) -> bool:
 
     # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
     return largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below
+
+
+def averaged(image: Array, side: int) -> Array:
+    """An image (h, w, C) of (h · side, w · side, C): each pixel is the mean of `side`² cells."""
+    # One axis after the other: over both at once, torch takes three times as long.
+    xp, (height, width), channels = namespace(image), (n // side for n in image.shape[:2]), image.shape[2]
+    rows = xp.mean(xp.reshape(image, (height, side, width * side * channels)), axis=1)
+    return xp.mean(xp.reshape(rows, (height, width, side, channels)), axis=2)

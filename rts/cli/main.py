@@ -203,13 +203,6 @@ def _layers(text: str) -> Any:
     return text if text == "auto" else int(text)
 
 
-def _supersample(text: str) -> Any:
-    """The `supersample` written as "4" or "adaptive:4"."""
-    from rts.sampling.adaptive import Adaptive
-
-    return Adaptive.of_text(text)
-
-
 def _view(text: str) -> tuple[float, ...]:
     """Azimuth, elevation and optional distance, from comma-separated numbers."""
     try:
@@ -325,10 +318,8 @@ def render(
     engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
     layers: Annotated[str, typer.Option(help="Surface layers kept at each pixel, or auto.")] = "auto",
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
-    splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, visible, multi, single or none.")] = "auto",
-    supersample: Annotated[
-        str, typer.Option(help="Samples along each side of a pixel: 4; or adaptive:4, where outlines are.")
-    ] = "1",
+    splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, multi, single or none.")] = "auto",
+    supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
     cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
     pose: Annotated[
@@ -339,6 +330,7 @@ def render(
     """Render a model to a picture."""
     import rts
     from rts.cli.pose_file import posed, read_pose
+    from rts.diagnostics.command_tools import supersample_of
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
 
@@ -373,7 +365,7 @@ def render(
         sampler=sampler,
         splatter=splatter,
         layers=_layers(layers),
-        supersample=_supersample(supersample),
+        supersample=supersample_of(supersample),
         background=color,
     )
     seconds = time.perf_counter() - start

@@ -17,7 +17,7 @@ from rts.compiling.threads import thread_count
 from rts.errors import InputError, RtsError
 
 FIRST = ("picture",)
-OTHERS = ("least_squares", "gradient_of_vertices", "adaptive", "gradient_of_crossing", "least_squares_of_mask")
+OTHERS = ("least_squares", "gradient_of_vertices", "gradient_of_crossing", "least_squares_of_mask")
 """Names of calls in `warmup_calls`. The first compiles what all share; then the others run together, longest first."""
 
 

@@ -51,11 +51,6 @@ def picture() -> None:
     rts.render(octahedra()[0], camera(), SIZE)
 
 
-def adaptive() -> None:
-    """Render with more samples where outlines are."""
-    rts.render(octahedra()[0], camera(), SIZE, supersample=rts.Adaptive(2))
-
-
 def gradient_of_vertices() -> None:
     """Differentiate a picture of one part in its vertices, and another in its pose, by torch, or else by jax.
 
@@ -83,9 +78,8 @@ def least_squares() -> None:
 
 
 def least_squares_of_mask() -> None:
-    """Make a step of Levenberg–Marquardt for a silhouette, by the splatters of one layer and of two."""
-    for options in ({}, {"splatter": "single", "layers": 1}):
-        _step(octahedra()[1], np.zeros(SIZE, np.float32), **options)
+    """Make a step of Levenberg–Marquardt for a silhouette."""
+    _step(octahedra()[1], np.zeros(SIZE, np.float32))
 
 
 def _gradient_of_poses(parts: list[rts.Part]) -> None:
@@ -98,11 +92,9 @@ def _gradient_of_poses(parts: list[rts.Part]) -> None:
         gradient(mean, array(np.zeros(6, np.float32)))
 
 
-def _step(part: rts.Part, target: np.ndarray, **options: Any) -> None:
+def _step(part: rts.Part, target: np.ndarray) -> None:
     if (found := engine()) is not None:
-        residuals = rts.ImageResiduals(
-            lambda pose: part.replace(transform=rts.rigid(pose)), camera(), SIZE, target, **options
-        )
+        residuals = rts.ImageResiduals(lambda pose: part.replace(transform=rts.rigid(pose)), camera(), SIZE, target)
         rts.fit(residuals, found[0](np.full(6, 0.01, np.float32)), method="lm", steps=1, progress=False)
 
 

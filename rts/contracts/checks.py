@@ -208,11 +208,6 @@ def check_splatter(chosen: Any) -> Splatter:
     return splatter
 
 
-def splatter_of(chosen: Any, outlines: bool) -> Splatter:
-    """A usable splatter, as `check_splatter`; of samples with outlines between them, or without, if "auto" is given."""
-    return check_splatter("visible" if is_auto(chosen) and not outlines else chosen)
-
-
 def is_auto(chosen: Any) -> bool:
     """True for the name "auto"."""
     return isinstance(chosen, str) and chosen == "auto"
@@ -290,7 +285,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     if capacity is not None and not is_count(capacity):
         raise InputError(f"capacity is {quoted(capacity)}; expected an integer of at least 1, or None")
     if not is_count(supersample):
-        raise InputError(f"supersample is {quoted(supersample)}; expected an integer of at least 1, or an rts.Adaptive")
+        raise InputError(f"supersample is {quoted(supersample)}; expected an integer of at least 1")
     return height, width
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
-from typing import Any, ClassVar, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class RayHits(NamedTuple):
         params: (K, R, P) float, the `Samples.params` of each hit, for `evaluate`; finite where there is no hit, too.
         ids: (K, R, I) int32, or None for I = 0.
         entering: (K, R) bool, true where the ray enters the inside of a solid at the hit; None for surfaces without an
-            inside. Splatters then tell fronts from backs (`Cells.facing`).
+            inside. Outlines then move as `RaySurface.deepest` tells.
     """
 
     hit: Array
@@ -96,42 +96,21 @@ class Cells:
     Attributes:
         row: (K, H, W) int32, the index of the sample in each cell, or −1 for none.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1. None where positions hold it.
-        facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on. It is negative
-            where the piece is seen from behind, and 0 where the side is unknown or not of interest. Pieces are
-            consistently oriented: a piece seen from opposite sides in two neighbouring cells is not one sheet there.
-            Absolute values are larger by `MORE_BEHIND` in the last layer of cells whose K layers are all covered. None
-            where no sides are recorded.
-        exit: (E, H, W) int32, indices of one or two further samples, not in `row`, in cells at outlines and beside
-            them; −1 for none. A single one is where the ray leaves the closed part behind its front. Two are samples
-            beside the deepest point of the ray, where the field that it crosses is least: the mean of their motions
-            is that of the outline (`rts.splatting.rims`). None if none are recorded.
-        settled: (H, W) integers. In a cell whose colour cannot change, however the scene moves, the index of a sample
-            of this colour; −1 in others. Such a cell may lack a sample of its own, and so may cells around it that
-            affect no others. Samples in it and in the eight cells around it have its colour. None if no cells are
-            marked.
-        between: (H, W) float32, linear depth of a piece of the surface that lies in the cell's square, between the
-            centres: this cell and the eight around it show nothing as near, nor anything that it continues. 0 where
-            there is no such piece. None if none are looked for.
+        triangle: (K, H, W) int32, the triangle of the proxy that the sample lies on; −1 where `row` is. None if it was
+            not requested, or if samples left their triangles.
     """
-
-    MORE_BEHIND: ClassVar[int] = 1 << 14
 
     row: Array
     depth: Array | None = None
-    facing: Array | None = None
-    exit: Array | None = None
-    settled: Array | None = None
-    between: Array | None = None
+    triangle: Array | None = None
 
     def map(self, f: Callable[[Array], Array]) -> Cells:
         """The cells with `f` applied to each array; `f` sees axes (..., H, W), and None stays None."""
-        arrays = (self.row, self.depth, self.facing, self.exit, self.settled, self.between)
-        return Cells(*(None if x is None else f(x) for x in arrays))  # pyright: ignore[reportArgumentType]
+        return Cells(f(self.row), *(None if x is None else f(x) for x in (self.depth, self.triangle)))
 
     def first(self, layers: int) -> Cells:
-        """The cells with only their first layers; `exit`, `settled` and `between`, which have no layers, stay."""
-        own = (None if x is None else x[:layers, ...] for x in (self.row, self.depth, self.facing))
-        return Cells(*own, exit=self.exit, settled=self.settled, between=self.between)  # pyright: ignore[reportArgumentType]
+        """The cells with only their first layers."""
+        return self.map(lambda x: x[:layers, ...])
 
 
 class _OnCells:
@@ -141,10 +120,7 @@ class _OnCells:
 
     row = property(attrgetter("cells.row"), doc="See `Cells`.")
     depth = property(attrgetter("cells.depth"), doc="See `Cells`.")
-    facing = property(attrgetter("cells.facing"), doc="See `Cells`.")
-    exit = property(attrgetter("cells.exit"), doc="See `Cells`.")
-    settled = property(attrgetter("cells.settled"), doc="See `Cells`.")
-    between = property(attrgetter("cells.between"), doc="See `Cells`.")
+    triangle = property(attrgetter("cells.triangle"), doc="See `Cells`.")
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed; fields of `cells` may be named directly."""
@@ -166,17 +142,18 @@ class Samples(_OnCells):
         params: (N, P) float32, such as barycentrics; in θ's own dtype if they were computed on the device.
         cells: the index of the sample in each cell.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
-        tables: further arrays of the surface by name, filled by its `refine`.
+        tables: further arrays of the surface by name, filled by its `refine`. If samples share one (see `by_sample`),
+            all `ids` are rows of it, so that samples can be joined.
         gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
         asked: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
         by_sample: names of the tables that have a row for each sample; other tables are shared by all.
-        followed: the fields of the `Request`, out of "cells", "points" and "hidden", that were given and that the
-            sampler obeyed.
+        followed: ("points",) if the `Request` had points and the sampler obeyed.
         ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
             None for a surface that is not refined.
-        triangle: (N,) int32, the triangle of the proxy that each sample lies on; None if it was not requested, or if
-            samples left their triangles.
+        pair: (2, M) int32, of M points: the indices of two further samples, not in `row`, beside the deepest point of
+            the point's ray, where the field that it crosses is least; −1 for none. The mean of their motions is that
+            of the outline. None if not requested, or not known.
     """
 
     ids: Array
@@ -190,128 +167,31 @@ class Samples(_OnCells):
     by_sample: tuple[str, ...] = ()
     followed: tuple[str, ...] = ()
     ran_out: Array | None = None
-    triangle: Array | None = None
-
-
-class Question(NamedTuple):
-    """Candidate samples, for a decision on which of them can reach the image. Host arrays.
-
-    Attributes:
-        covered: (K, H, W) bool, true where there is a sample.
-        depth: (K, H, W) float, the depths of the samples; anything where nothing is covered.
-        size: the largest absolute coordinate that depths were computed from, which bounds rounding; 0 if unknown.
-    """
-
-    covered: np.ndarray
-    depth: np.ndarray
-    size: float = 0.0
-
-
-class Decision(NamedTuple):
-    """The samples that can reach the image. Host arrays.
-
-    Attributes:
-        kept: (K, H, W) bool, the samples to compute: `needed` without samples that only settled cells need.
-        settled: (H, W) int8, `Cells.settled` of a scene of one part; None unless the rule `settles` (see `Hidden`).
-        needed: (K, H, W) bool, the samples that the splatter needs.
-    """
-
-    kept: np.ndarray
-    settled: np.ndarray | None
-    needed: np.ndarray
-
-
-class Hidden(Protocol):
-    """A rule that tells which samples can reach the image, by their depths, and which are hidden. It keeps no state.
-
-    Attributes:
-        settles: whether decisions have `settled` (see `Cells.settled`).
-        size: the largest absolute number in the θ that surfaces read, which bounds rounding; 0 if unknown.
-    """
-
-    @property
-    def settles(self) -> bool:
-        """True if decisions have `settled`."""
-        ...
-
-    @property
-    def size(self) -> float:
-        """The largest absolute number in the θ that surfaces read; 0 if unknown."""
-        ...
-
-    def decide(self, question: Question) -> Decision:
-        """The samples that can reach the image."""
-        ...
+    pair: Array | None = None
 
 
 @dataclass(frozen=True)
 class Request:
     """Options of a call of a sampler, which may ignore all but `capacity`.
 
-    `Samples.followed` tells whether it obeyed `cells`, `points` and `hidden`.
-
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are samples.
-        cells: (L, C) int32, the only cells of the grid to sample, in any layout, as flat indices, none twice, or −1 for
-            none; an array of the part's engine, perhaps traced. Cells of the samples are then (K, L, C). None for all.
         points: (M, 2) float64, x and y in cells from the grid's upper left corner: the only points to sample, in place
-            of the centres of cells. Cells of the samples are then (K, 1, M). None for centres.
-        hidden: the rule that tells which samples to keep, once depths are known; None to keep all.
-        facing: whether to compute `Cells.facing`, which is of interest in cells with hidden samples, and beside them.
-        exits: whether to compute `Cells.exit`, of a culled part or a field, at outlines and beside them; of `points`
-            at all of them, and then for fields alone.
-        between: whether to compute `Cells.between`, of all cells of the grid.
-        triangles: whether to record `Samples.triangle`.
+            of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None for
+            centres.
+        pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
+            move.
+        triangles: whether to record `Cells.triangle`.
+        uniform: whether all samples look alike, so that one row may stand for all cells.
         entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
     """
 
     capacity: int | None = None
-    cells: Array | None = None
     points: Array | None = None
-    hidden: Hidden | None = None
-    facing: bool = False
-    exits: bool = False
-    between: bool = False
+    pairs: bool = False
     triangles: bool = False
+    uniform: bool = False
     entry: Any = None
-
-
-@record(static=("supersample", "apron", "flat"))
-class Fine(_OnCells):
-    """The fine samples of an adaptively sampled scene: of its active pixels and an apron around them.
-
-    They lie in strips, runs of pixels a few lines high, side by side in one picture of h × w cells, the layout.
-    Splatters treat it as any other. Cells of the layout outside of active pixels are no part of the image.
-
-    Attributes:
-        samples: one `Samples` for each part; their cells are a list, not a grid.
-        index: (M,) int32, the index of the sample that each splat shows, counted over all parts in order.
-        shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
-        cells: the index of the splat in each cell of the layout; without depth.
-        part: (K, h, w) int32, the part of the splat in each cell of the layout, or −1.
-        wanted: (h, w) bool, the cells of active pixels.
-        pixel: (H, W) int32, for each pixel of the image the index of its pixel in the layout, counted row by row with
-            the apron left out; −1 where the pixel is not active.
-        coarse: (h', w') bool, the cells of the coarse grid, with its apron, whose pixels are not active.
-        overflow: () int32, number of pixels that stay coarse for want of room, plus number of samples dropped.
-        supersample: s; each active pixel has s² cells.
-        apron: cells around active pixels, and around the layout.
-        flat: whether inactive pixels need no splatting. True if all samples have one colour and each inactive pixel
-            is empty or shows that colour, however the scene moves.
-    """
-
-    samples: tuple[Samples, ...]
-    index: Array
-    shift: Array
-    cells: Cells
-    part: Array
-    wanted: Array
-    pixel: Array
-    coarse: Array
-    overflow: Array
-    supersample: int
-    apron: int
-    flat: bool = False
 
 
 @record()
@@ -382,13 +262,11 @@ class Sampled(_OnCells):
 
     Attributes:
         samples: one `Samples` for each part.
-        cells: the index of the sample in each cell, counted over all parts in order. Pieces of different parts have
-            different numbers in `facing`; `exit` is that of the part in front.
-        overflow: () int32, number of samples dropped for want of capacity, or beyond the limit of `layers="auto"`;
-            `fine.overflow` is included. Should be 0.
+        cells: the index of the sample in each cell, counted over all parts in order.
+        overflow: () int32, number of samples dropped for want of capacity, or beyond the limit of `layers="auto"`.
+            Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
-        fine: further samples, in pixels that `rts.Adaptive` makes active, or None.
         outlines: outlines between centres, for splatters that read them, or None. Their samples are the last rows of
             each part.
     """
@@ -398,7 +276,6 @@ class Sampled(_OnCells):
     overflow: Array
     supersample: int = 1
     apron: int = 2
-    fine: Fine | None = None
     outlines: Outlines | None = None
 
     @property
@@ -438,7 +315,6 @@ class Splats(_OnCells):
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
         part: (K, H, W) int32, the part of each sample, or −1; None if unknown, or if all samples are of `one_part`.
             See `parts`.
-        wanted: (H, W) bool, the cells whose colour is used; others may get any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
         one_part: whether all samples are of one part.
         opaque: a promise that alpha is 1 at all samples.
@@ -449,7 +325,6 @@ class Splats(_OnCells):
     rgba: Array
     cells: Cells
     part: Array | None = None
-    wanted: Array | None = None
     border: int = 0
     one_part: bool = False
     opaque: bool = True

@@ -22,13 +22,7 @@ class Splatter(Plugin):
         layers: the number of layers it reads, from the front; None for all. A `translucent` splatter reads all layers
             where light passes through some part.
         reach: the largest distance, in cells along either axis, at which a sample has an effect; at least 1.
-        reads: the fields that it reads, out of `Cells.facing` and `Cells.exit` (samplers compute no others) and
-            `Splats.outlines`, by name.
-        fills_interiors: a promise on samples of one opaque colour, on cells' centres, that move by little. A cell shows
-            this colour if the nine cells in and around it have samples in layer 0, and no sample behind these is
-            `needed`. It shows nothing if all nine are empty. A cell that is `settled` shows the colour of its sample,
-            whichever samples are given. Samples farther than `reach` from all cells that are not settled may therefore
-            be missing; with `Splats.wanted`, those farther than `reach` + 1 from wanted ones that are not settled.
+        reads: "outlines", if it reads `Splats.outlines`, which are found for no other.
         translucent: a promise that samples behind others show as far as alpha lets light through, in all their layers,
             if `Splats.opaque` is False. Without it an image of translucent samples comes with a `LayersWarning`.
     """
@@ -36,7 +30,6 @@ class Splatter(Plugin):
     layers: int | None = None
     reach: int = 1
     reads: frozenset[str] = frozenset()
-    fills_interiors: bool = False
     translucent: bool = False
 
     @abc.abstractmethod
@@ -67,21 +60,6 @@ class Splatter(Plugin):
             EngineError: arrays of two engines.
         """
         return self.cropped(_checked_splats(positions, rgba, row, border).replace(opaque=opaque))
-
-    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """The samples that can affect the image, in value or derivative, if all are opaque and on cells' centres.
-
-        If a class overrides this method, other samples are dropped before they are evaluated; all are kept in scenes of
-        which some part may be translucent. Host arrays.
-
-        Args:
-            covered: (K, H, W) bool, true where there is a sample.
-            depth: (K, H, W) float; 0 where nothing is covered.
-
-        Returns:
-            (K, H, W) bool; by default `covered`.
-        """
-        return covered
 
 
 class SummingSplatter(Splatter):

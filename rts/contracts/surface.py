@@ -175,21 +175,6 @@ class TriangleSurface(Surface):
         """
         return size, *(m.tobytes() for m in camera)
 
-    def pieces(self, proxy: Proxy) -> np.ndarray:
-        """The consistently oriented piece of each triangle, so that splatters do not join a front to a back side.
-
-        Not called where `refine` moves samples. `rts.plugin_api.checks.pieces` computes them from the edges
-        that triangles share.
-
-        Args:
-            proxy: the result of `proxy`.
-
-        Returns:
-            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 if its winding tells no sides; or
-            (1,), one such number for all triangles.
-        """
-        return np.zeros(1, np.int16)
-
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
         """Move samples from the triangles onto the surface, along their rays, or drop them; on the host.
 
@@ -214,12 +199,12 @@ class TriangleSurface(Surface):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Mapping[str, np.ndarray]] | None:
         """Pairs of samples that tell how outlines move, on the host; see `RaySurface.deepest`.
 
-        Called for cells at outlines of surfaces with a `refine` that does not move samples.
+        Called for points just inside of outlines, of surfaces with a `refine` that does not move samples.
 
         Args:
             inputs: the result of `proxy_inputs`, on the host.
             rays: the rays (R, 3), local space.
-            beside: the rays (R, 8, 3) of the eight cells around each, NaN for those towards which its front goes on.
+            beside: the rays (R, 8, 3) a cell away from each, in eight directions.
             depth: (R,), the depth of each ray's front.
             tables: the tables that `refine` filled. None may be `by_sample`.
 
@@ -271,7 +256,9 @@ class TriangleSurface(Surface):
                 tables may have any length up to that of their specs, which then set `packed=True`.
 
         Returns:
-            Name → spec; none by default. The core sets the number of rows of tables `by_sample`.
+            Name → spec; none by default. The core sets the number of rows of tables `by_sample`. Other tables are
+            shared by samples, whose `ids` are rows of them, all of one length. Where further samples join the first
+            ones, their tables are appended, and their ids are shifted by the rows before.
         """
         return {}
 

@@ -9,13 +9,12 @@ import numpy as np
 
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import CheckedPart, check_scene
-from rts.contracts.records import Sampled, Samples
+from rts.contracts.records import Samples
 from rts.contracts.shader import FunctionShader
 from rts.registry import name_of
-from rts.rendering.arguments import Layers, SplatterLike, Supersample
+from rts.rendering.arguments import Layers, SplatterLike
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
-from rts.sampling.adaptive import Adaptive, missed
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import INSIDE_OUT, is_inside_out
@@ -42,7 +41,7 @@ def explain(
     *,
     splatter: SplatterLike = "auto",
     layers: Layers = "auto",
-    supersample: Supersample = 1,
+    supersample: int = 1,
 ) -> list[Choice]:
     """Explain which sampler `sampler="auto"` chooses for each part, and count samples if a size is given.
 
@@ -56,8 +55,7 @@ def explain(
 
     Returns:
         For each part the name of the `sampler`, the `reason`, and `remarks` on likely mistakes. With a size also the
-        number of `samples`, apron included. With `rts.Adaptive` also the number of `fine` ones among them, and of
-        `active` pixels; with `thin` also of pixels with something `between` samples.
+        number of `samples`, apron and those beside outlines included.
 
     Raises:
         InputError: the scene cannot be sampled.
@@ -73,20 +71,12 @@ def explain(
     if isinstance(parts, Prepared):
         choices = [Choice(name_of("rts.samplers", sampler), PREPARED) for sampler in parts.samplers]
     else:
-        thin = isinstance(supersample, Adaptive) and supersample.thin
-        choices = [choose(part, static=is_static(part, seen), thin=thin) for part in checked]
+        choices = [choose(part, static=is_static(part, seen)) for part in checked]
     remarks = [tuple(_remarks(part, seen, own)) for part, own in zip(checked, shaded, strict=True)]
     choices = [choice._replace(remarks=own) for choice, own in zip(choices, remarks, strict=True)]
     if sampled is None:
         return choices
-    coarse = map(_count, sampled.samples)
-    if sampled.fine is None:
-        return [choice._replace(samples=n) for choice, n in zip(choices, coarse, strict=True)]
-    pixel = engine_of(sampled).to_numpy(sampled.fine.pixel)
-    finer, active = map(_count, sampled.fine.samples), int(np.count_nonzero(pixel >= 0))
-    counts = zip(choices, coarse, finer, strict=True)
-    between = _missed(sampled)
-    return [choice._replace(samples=n + m, fine=m, active=active, between=between) for choice, n, m in counts]
+    return [choice._replace(samples=n) for choice, n in zip(choices, map(_count, sampled.samples), strict=True)]
 
 
 def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int]) -> list[set[str]]:
@@ -95,7 +85,7 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
     watched = [part.replace(shader=own) for part, own in zip(parts, shaders, strict=True)]
     small = min(size[0], FEW), min(size[1], FEW)
     sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, splatter=None, layers=1)
-    render_samples(sampled, watched, camera.for_size(size).replace(aspect=None))
+    render_samples(sampled, watched, camera.for_size(size).replace(aspect=None), splatter="none")
     return [own.read for own in shaders]
 
 
@@ -108,16 +98,6 @@ def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) 
         yield INSIDE_OUT
     if isinstance(part.shader, FunctionShader) and not hasattr(part.shader.function, "opaque"):
         yield NO_PROMISE
-
-
-def _missed(sampled: Sampled) -> int | None:
-    """The number of pixels of the image in which something lies between samples; None if no sampler told."""
-    if sampled.between is None:
-        return None
-    host = engine_of(sampled).to_numpy
-    settled = None if sampled.settled is None else host(sampled.settled)
-    found = missed(host(sampled.row)[0], host(sampled.depth)[0], host(sampled.between), settled)
-    return int(np.count_nonzero(found[sampled.apron : -sampled.apron, sampled.apron : -sampled.apron]))
 
 
 def _count(samples: Samples) -> int:

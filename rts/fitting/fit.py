@@ -29,7 +29,6 @@ from rts.fitting.saving import Saving
 from rts.fitting.schedule import Stage, checked_schedule
 from rts.fitting.terms import Terms
 from rts.plugin_base import overrides
-from rts.sampling.adaptive import finest
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
 PATIENCE = 50
@@ -189,7 +188,7 @@ def fit(
                 run.patience = patience or max(PATIENCE, 3 * judge.every if judge else 0)
                 if isinstance(reduced, Loss) and title == "lm":
                     own = fits and overrides(stage, "normal_equations", Residuals)
-                    supersample = finest(getattr(stage, "supersample", None))
+                    supersample = getattr(stage, "supersample", None)
                     levenberg_marquardt(terms, parameters, engine, run, jit, reduced, own, supersample, saving)
                 else:
                     descend(terms, reduced, parameters, engine, optimizer, run, jit, judge, saving)

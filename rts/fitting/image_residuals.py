@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple, TypeGuard
-
-import numpy as np
+from typing import Any, TypeGuard
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
@@ -23,9 +20,8 @@ from rts.contracts.checks import (
     check_sampler,
     check_scene,
     is_count,
-    splatter_of,
 )
-from rts.contracts.records import ArraySpec, Fine, Splats
+from rts.contracts.records import Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
 from rts.errors import InputError
@@ -35,13 +31,13 @@ from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.plugin_base import overrides
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
-from rts.rendering.samples import sample
+from rts.rendering.samples import sampled_scene
+from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
-from rts.rendering.splats import to_fine_splats, to_splats
-from rts.sampling.adaptive import Adaptive
+from rts.rendering.splats import to_splats
 from rts.sampling.prepared import Prepared
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -109,7 +105,7 @@ class ImageResiduals(Residuals):
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
         layers: Layers = "auto",
-        supersample: Supersample = 1,
+        supersample: int = 1,
         capacity: int | None = None,
         channels: int = 3,
         loss: str | Loss = "linear",
@@ -264,8 +260,8 @@ class ImageResiduals(Residuals):
         return scene, self._camera
 
     @property
-    def supersample(self) -> int | Adaptive:
-        """Samples a pixel along each axis, or an `rts.Adaptive`."""
+    def supersample(self) -> int:
+        """Samples a pixel along each axis."""
         return self._settings.supersample
 
     @property
@@ -284,27 +280,20 @@ class ImageResiduals(Residuals):
             equations = [view.normal_equations(parameters) for view in self._views]
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*equations, strict=True))
             return value, matrix, gradient
-        engine = engine_of(parameters)
-        splatter, equations = self._settings.splatter, None
-        if (
-            self._ordinary
-            and not self._sigma
-            and (splatter == "auto" or isinstance(splatter, SummingSplatter))
-            and engine.differentiates
-            and self._image_channels == 3
-            and self._settings.contrast is None
-        ):
-            equations = self._swept(parameters, engine)
+        engine, equations = engine_of(parameters), None
+        splatter, ordinary = self._settings.splatter, self._ordinary and not self._sigma and self._image_channels == 3
+        if isinstance(splatter, SummingSplatter) and ordinary and engine.differentiates:
+            equations = self._swept(parameters, engine, splatter)
         return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 
-    def _swept(self, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
+    def _swept(self, parameters: Tree, engine: Engine, splatter: SummingSplatter) -> tuple[Array, Array, Array] | None:
         """`normal_equations` without a Jacobian: by the splatter's method of that name, band of rows by band.
 
         None where the splatter's method gives None.
         """
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
-            equations = self._swept_band(parameters, engine, top, rows)
+            equations = self._swept_band(parameters, engine, splatter, top, rows)
             if equations is None:
                 return None
             # Means over a band become shares of means over the image.
@@ -313,7 +302,9 @@ class ImageResiduals(Residuals):
         value, matrix, gradient = total
         return value, matrix, gradient
 
-    def _swept_band(self, parameters: Tree, engine: Engine, top: int, rows: int) -> tuple[Array, Array, Array] | None:
+    def _swept_band(
+        self, parameters: Tree, engine: Engine, splatter: SummingSplatter, top: int, rows: int
+    ) -> tuple[Array, Array, Array] | None:
         """`normal_equations` of a band: of `rows` rows of the image, from row `top` on, with means over the band alone.
 
         None where the splatter's method gives None.
@@ -327,62 +318,29 @@ class ImageResiduals(Residuals):
             # The ratio of a window is free.
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
-        sampled = sample(parts, window(camera), size, sampler=self._sampler, settles=True, **vars(self._settings))
-        splatter = splatter_of(self._settings.splatter, sampled.outlines is not None)
-        if not isinstance(splatter, SummingSplatter):
-            return None
-        checked, _ = _checked(parts, camera)
-        self._refuse_other(checked[0].shader.channels)
-        opaque = all(part.shader.opaque for part in checked)
-        colored = self._channels > 1 or not opaque
-        band = slice(top, top + rows)
-        fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
+        scene = Scene.of(parts, window(camera), self._sampler, None).at(size)
+        sampled = sampled_scene(scene, scene.camera, size, self._settings)
+        self._refuse_other(scene.channels)
+        # Opaque samples have an alpha of one, whatever their colours.
+        colored = self._channels > 1 or not all(scene.opaque)
+        target, weights, background = (None if x is None else x[top : top + rows] for x in self._constants(vector))
 
-        def swept(shown: Callable[..., Splats], fields: _Fields, known: Splats) -> tuple[Array, Array, Array] | None:
-            """Normal equations of one grid of cells, or None; see `_swept_band`.
+        def splats(v: Array) -> Splats:
+            parts, camera = _checked(*self.scene(unflatten(v)))
+            context = context_of(parts, camera, sampled, v)
+            return to_splats(sampled, parts, camera.for_size(self.size), window(camera), context)
 
-            Args:
-                shown: parts, the camera of the image, that of the band and a context → splats.
-                fields: target, weights and background of the grid's pixels.
-                known: the splats' cells and marks, which are constant; positions and colours are filled in.
-            """
+        def moved(v: Array) -> tuple[Array, Array]:
+            shown = splats(v)
+            positions, rgba = constants((shown.positions, shown.rgba), engine, v)
+            return positions, rgba if colored else engine.stop_gradient(rgba)
 
-            def splats(v: Array) -> tuple[Array, Array]:
-                parts, camera = _checked(*self.scene(unflatten(v)))
-                seen = camera.for_size(self.size), window(camera)
-                moved = shown(parts, *seen, context_of(parts, camera, sampled, v))
-                positions, rgba = constants((moved.positions, moved.rgba), engine, v)
-                # Opaque samples have an alpha of one, whatever their colours.
-                return positions, rgba if colored else engine.stop_gradient(rgba)
-
-            (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
-            return splatter.normal_equations(
-                replace(constants(known, engine, vector), positions=positions, rgba=rgba),
-                t_positions,
-                t_rgba if colored else None,
-                **fields._asdict(),
-                loss=self.loss if self.loss.robust else None,
-            )
-
-        part = None if sampled.one_part else sampled.part
-        known = Splats(None, None, replace(sampled.cells, depth=None), part, one_part=sampled.one_part, opaque=opaque)
-        known = replace(known, outlines=sampled.outlines)
-        if sampled.fine is None:
-            return swept(partial(to_splats, sampled), fields, replace(known, border=sampled.apron))
-        # A pixel counts on one of the grids alone.
-        fine = sampled.fine
-        coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
-        outside = replace(known, wanted=fine.coarse, border=sampled.apron)
-        placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron, opaque=opaque)
-        grids = (
-            swept(partial(to_splats, sampled), coarse, outside),
-            swept(lambda parts, camera, _, own: to_fine_splats(fine, parts, camera, own), finer, placed),
-        )
-        if grids[0] is None or grids[1] is None:
-            return None
-        share = finer.target.shape[0] * finer.target.shape[1] / (rows * self.size[1])
-        value, matrix, gradient = (a + share * b for a, b in zip(grids[0], grids[1], strict=True))
-        return value, matrix, gradient
+        known = constants(splats(vector), engine, vector)
+        (positions, rgba), (t_positions, t_rgba) = engine.jacobian(moved)(vector)
+        known = replace(known, positions=positions, rgba=rgba)
+        loss = self.loss if self.loss.robust else None
+        tangents = t_positions, t_rgba if colored else None
+        return splatter.normal_equations(known, *tangents, target, weights, background, loss)
 
     def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
         """The tree, its NumPy arrays moved to the engine of the parameters, or of the target if parameters are NumPy's.
@@ -413,55 +371,6 @@ class ImageResiduals(Residuals):
                 background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
             background = xp.broadcast_to(background, (*self.size, self._image_channels + 1))
         return target, weights, background
-
-
-class _Fields(NamedTuple):
-    """Fields of an image of h × w pixels.
-
-    Attributes:
-        target: (h, w, c), alpha (c = 1), colours (3) or both (4).
-        weights: (h, w, 1) or (h, w, c); None for ones.
-        background: (h, w, 4), or None.
-    """
-
-    target: Array
-    weights: Array | None
-    background: Array | None
-
-
-def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
-    """The fields for the coarse and for the fine grid of an adaptive image; each pixel counts on one of them alone.
-
-    Args:
-        fields: fields of the image, or of a band of it, (H, W, …).
-        pixel: (H, W), `fine.pixel` in the engine of the fields. Pixels with fine samples (active) have an index into
-            the picture that shows these side by side, the layout; the others have −1.
-        fine: the fine samples, whose layout is h × w pixels without its apron.
-
-    Returns:
-        The fields, with weights zero at active pixels; and fields (h, w, …) in which each pixel of the layout has the
-        values of the active pixel that it shows, and zeros if it shows none. Weights of None become ones.
-    """
-    xp, engine = namespace(pixel), engine_of(pixel)
-    height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
-
-    def host(pixel: np.ndarray) -> tuple[np.ndarray]:
-        origin = np.full(height * width, -1, np.int32)
-        active = np.flatnonzero(pixel >= 0)
-        origin[pixel.reshape(-1)[active]] = active
-        return (origin,)
-
-    (origin,) = engine.call_host(host, (ArraySpec((height * width,), np.int32),), pixel)
-    there = (origin >= 0)[:, None]
-
-    def laid_out(x: Array) -> Array:
-        rows = xp.take(xp.reshape(x, (-1, x.shape[-1])), xp.where(origin >= 0, origin, 0), axis=0)
-        return xp.reshape(xp.where(there, rows, 0.0), (height, width, x.shape[-1]))
-
-    weights = xp.ones_like(fields.target[..., :1]) if fields.weights is None else fields.weights
-    background = None if fields.background is None else laid_out(fields.background)
-    coarse = fields._replace(weights=xp.where((pixel >= 0)[..., None], 0.0, weights))
-    return coarse, _Fields(laid_out(fields.target), laid_out(weights), background)
 
 
 def _checked_loss(loss: Any, f_scale: Any) -> Loss:

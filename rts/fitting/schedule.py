@@ -14,7 +14,6 @@ from rts.arrays.engines import constants, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.contracts.checks import is_count, is_real
 from rts.errors import InputError
-from rts.sampling.adaptive import Adaptive, finest
 
 COARSEST, BLUR = 16, 1 / 16
 """A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""
@@ -29,7 +28,7 @@ class Stage:
 
     Attributes:
         scale: the share of the residuals' own resolution along each axis, in (0, 1].
-        supersample: samples a pixel along each axis, or an `rts.Adaptive`; None for the residuals' own.
+        supersample: samples a pixel along each axis; None for the residuals' own.
         sigma: standard deviation of the Gaussian that blurs the differences, pixels of this stage; 0 for none.
 
     Raises:
@@ -37,16 +36,15 @@ class Stage:
     """
 
     scale: float = 1.0
-    supersample: int | Adaptive | None = None
+    supersample: int | None = None
     sigma: float = 0.0
 
     def __post_init__(self):
         if not (is_real(self.scale) and 0 < self.scale <= 1):
             raise InputError(f"scale is {quoted(self.scale)}; expected a share of the resolution, in (0, 1]")
-        if self.supersample is not None and not is_count(finest(self.supersample)):
+        if self.supersample is not None and not is_count(self.supersample):
             raise InputError(
-                f"supersample is {quoted(self.supersample)}; expected an integer of at least 1, an rts.Adaptive, or "
-                f"None for as before"
+                f"supersample is {quoted(self.supersample)}; expected an integer of at least 1, or None for as before"
             )
         if not (is_real(self.sigma) and 0 <= self.sigma < math.inf):
             raise InputError(f"sigma is {quoted(self.sigma)}; expected a number of pixels, at least 0")

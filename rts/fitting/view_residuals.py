@@ -20,8 +20,7 @@ from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage
 from rts.operations.linear import matmul
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
-from rts.sampling.adaptive import Adaptive
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.scene.camera import Camera
 from rts.scene.view import View
 
@@ -98,7 +97,7 @@ class ViewResiduals(Residuals):
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
         layers: Layers = "auto",
-        supersample: Supersample = 1,
+        supersample: int = 1,
         capacity: int | None = None,
         channels: int = 3,
         loss: str | Loss = "linear",
@@ -141,8 +140,8 @@ class ViewResiduals(Residuals):
         return self._like.loss
 
     @property
-    def supersample(self) -> int | Adaptive:
-        """Samples a pixel along each axis, or an `rts.Adaptive`."""
+    def supersample(self) -> int:
+        """Samples a pixel along each axis."""
         own = None if self._stage is None else self._stage.supersample
         return self._like.supersample if own is None else own
 

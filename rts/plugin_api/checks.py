@@ -2,7 +2,6 @@
 
 from rts.arrays.argument_checks import check_numbers, check_positive, quoted
 from rts.contracts.checks import is_count
-from rts.contracts.oriented_pieces import pieces
 from rts.sampling.cache import fingerprint
 from rts.sampling.sample_checks import check_camera
 from rts.scene.topology import index_table
@@ -15,7 +14,6 @@ __all__ = [
     "fingerprint",
     "index_table",
     "is_count",
-    "pieces",
     "quoted",
     "shows_bar",
 ]

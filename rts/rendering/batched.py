@@ -8,15 +8,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rts.arrays.array_functions import described, shape_of
+from rts.arrays.array_functions import averaged, described, shape_of
 from rts.arrays.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
 from rts.contracts.checks import check_background, check_cameras
 from rts.contracts.records import Sampled
 from rts.errors import InputError
-from rts.operations.inset import averaged
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_of, over_background, seen, splatted
 from rts.rendering.outlines_of_views import with_outlines_of_views
 from rts.rendering.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
@@ -43,15 +42,12 @@ def render_views(
     sampler: SamplerLike = "auto",
     splatter: SplatterLike = "auto",
     layers: Layers = "auto",
-    supersample: Supersample = 1,
+    supersample: int = 1,
     background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Array:
     """Render several views of a scene. The images equal the results of a loop of `render` up to rounding.
-
-    Gradients of hidden parts may differ more where layers are closer than float32 resolves at their distance. The
-    threshold for equal depths is set by the farthest view, and is up to twice that of a single view.
 
     Views lie side by side in pictures of at most 1024² cells. Python's overhead, results for the whole of θ such as
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
@@ -114,8 +110,8 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
-    if settings.layers != "auto" and settings.side is not None and len(settings.bands(size)) == 1:
-        height, width = (settings.side * n + 2 * settings.apron for n in size)
+    if settings.layers != "auto" and len(settings.bands(size)) == 1:
+        height, width = (settings.supersample * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
         samplings = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
@@ -136,8 +132,6 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
             if len(complete) == len(pictures):
                 return _as_pictures(complete, scenes, context, settings)
             return _one_by_one(scenes, views, context, settings)
-    elif settings.side is None and several and differentiates and settings.contrast is None:
-        return _one_by_one(scenes, _sampled_at_once(scenes, size, settings), context, settings)
     draw = partial(image_of, size=size, context=context, settings=settings)
     images = [draw(scene) for scene in (scenes[:1] if several and not differentiates else scenes)]
     if len(images) < len(scenes):
@@ -156,7 +150,7 @@ def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: R
     """The samples of each view; every core samples one view at a time, if threads may."""
 
     def own(scene: Scene) -> Sampled:
-        return sampled_scene(scene, scene.camera, size, settings, settles=True)
+        return sampled_scene(scene, scene.camera, size, settings)
 
     return each(own, scenes) if _concurrent(scenes[0]) else list(map(own, scenes))
 
@@ -170,8 +164,9 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
 
 def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
-    pairs = zip(views, scenes, strict=True)
-    images = [splatted(own, scene, scene.camera, context, settings.reader) for own, scene in pairs]
+    pairs, splatter = zip(views, scenes, strict=True), settings.splatter
+    assert splatter is not None
+    images = [splatted(own, scene, scene.camera, context, splatter) for own, scene in pairs]
     return namespace(*images).stack(images)
 
 
@@ -179,9 +174,10 @@ def _as_pictures(
     pictures: Sequence[Views], scenes: Sequence[Scene], context: Context, settings: RenderSettings
 ) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted picture by picture."""
-    images, cameras = [], [scene.camera for scene in scenes]
+    images, cameras, splatter = [], [scene.camera for scene in scenes], settings.splatter
+    assert splatter is not None
     for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
-        cells = views.picture.apart(cropped_image(settings.reader, splats), views.sampled.apron)
+        cells = views.picture.apart(cropped_image(splatter, splats), views.sampled.apron)
         xp, (count, height, width, channels), side = namespace(cells), cells.shape, views.sampled.supersample
         if side > 1:
             cells = averaged(xp.reshape(cells, (count * height, width, channels)), side)

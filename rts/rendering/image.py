@@ -7,22 +7,20 @@ from dataclasses import replace
 from functools import partial
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
+from rts.arrays.array_functions import averaged
+from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.arrays.trees import Array
-from rts.contracts.checks import check_background, splatter_of
-from rts.contracts.records import Sampled, Splats
+from rts.contracts.checks import check_background, check_splatter
+from rts.contracts.records import Sampled
 from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
-from rts.operations.inset import averaged, painted_inset, with_inset
-from rts.plugin_base import promised
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
-from rts.rendering.samples import Finer, coarse_scene, finer, sampled_scene
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
+from rts.rendering.samples import sampled_scene
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
-from rts.rendering.splats import to_fine_splats, to_splats
+from rts.rendering.splats import to_splats
 from rts.sampling.empty_images import why_empty
 from rts.sampling.prepared import Prepared
-from rts.sampling.strips import Layout
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
@@ -37,7 +35,7 @@ def render(
     sampler: SamplerLike = "auto",
     splatter: SplatterLike = "auto",
     layers: Layers = "auto",
-    supersample: Supersample = 1,
+    supersample: int = 1,
     background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
@@ -50,24 +48,18 @@ def render(
         size: (height, width) in pixels.
         sampler: name or object of a `Sampler`.
         splatter: name or object of a `Splatter`. "auto" is "edges", which finds outlines between the centres of pixels.
-            It is "visible", which spreads samples over 3 × 3 cells, with an `rts.Adaptive`, and where light passes
-            through parts whose samples lie on no triangles.
         layers: K, the number of surface layers kept at each pixel. "auto" is 1 for "edges" if all parts are opaque;
             else it is the number that the image needs, up to 16 (a warning says if more are needed). Where the places
             of samples are traced, as in `jax.jit`, it is 4 if some part may be translucent, else at most 2.
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
-            bands of rows, so that memory stays bounded; for a gradient each band is then rendered twice. An
-            `rts.Adaptive` takes s² samples only at outlines, and renders without bands; "edges" refuses it.
+            bands of rows, so that memory stays bounded; for a gradient each band is then rendered twice.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent. It has C or C + 1 channels if the image has C and alpha.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
-            for the worst case, layers × cells; with `rts.Adaptive` and a number of layers also for few outlines, in a
-            fast branch of the program. If a third of the cells are covered, pass a third of layers × cells. Samples
-            beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them. If the
-            image is rendered in bands, each band has this capacity. With `rts.Adaptive` the fine samples have as many
-            rows again, `layers` for each fine cell of active pixels and their aprons. Pixels that find no room stay
-            coarse, and `overflow` counts them, too. For the splatter "edges" there is also room for breaks of outlines:
-            8 a row and a column of the grid, or `capacity` / 4 if that is more.
+            for the worst case, layers × cells. If a third of the cells are covered, pass a third of layers × cells.
+            Samples beyond the capacity are dropped, deepest layers first, and `overflow` of `rts.sample` counts them.
+            If the image is rendered in bands, each band has this capacity. For the splatter "edges" there is also room
+            for breaks of outlines: 8 a row and a column of the grid, or `capacity` / 4 if that is more.
         engine: name of the engine to compute with, "torch" or "jax". Needed where all arrays are NumPy, but a shader
             holds a network. None for the engine of the arrays.
 
@@ -87,8 +79,7 @@ def render(
         InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`; nothing reads an entry of θ; a
             culled part is wound inside out; a sampler cannot sample single points, so that outlines lie midway between
             centres.
-        LayersWarning: surfaces or light behind the last layer are left out, or all behind the fronts, where "edges" by
-            name meets light that passes through parts without triangles.
+        LayersWarning: surfaces or light behind the last layer are left out.
     """
     scene = Scene.of(parts, camera, sampler, engine)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
@@ -104,25 +95,22 @@ def image_over(scene: Scene, size: tuple[int, int], background: Array | None, se
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The image (H, W, C + 1) of a checked scene, without a background; for `context` see `splatted`."""
     settings = settings.of(scene)
-    if settings.contrast is not None:
-        return _of_contrast(scene, size, context, settings)
-    bands, reader = settings.bands(size), settings.reader
-    if settings.side is None and settings.capacity is None:
-        return _with_few_outlines(scene, size, context, settings)
+    bands, splatter = settings.bands(size), settings.splatter
+    assert splatter is not None
     if len(bands) == 1:
         sampled = _sampled(scene, scene.camera, size, settings)
-        return splatted(sampled, scene, scene.camera, context, reader)
+        return splatted(sampled, scene, scene.camera, context, splatter)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(_sampled, scene, window, (rows, size[1]), settings)
-        images.append(context.engine.checkpoint(take, lambda s, w=window: splatted(s, scene, w, context, reader)))
+        images.append(context.engine.checkpoint(take, lambda s, w=window: splatted(s, scene, w, context, splatter)))
     return namespace(*images).concat(images)
 
 
 def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
     """The samples of a window of the image, with a warning if front samples exceed the capacity."""
-    sampled = sampled_scene(scene, window, size, settings, settles=True)
+    sampled = sampled_scene(scene, window, size, settings)
     if settings.capacity is not None:
         left_out, row = value_of(sampled.overflow), value_of(sampled.row)
         # The deepest layers are left out first.
@@ -133,35 +121,6 @@ def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: Rend
                 InputWarning,
             )
     return sampled
-
-
-def _with_few_outlines(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image with fine samples at outlines; traced programs have a branch of its own for an image with few."""
-    refined = finer(scene, scene.camera, size, settings, settles=True)
-    few, drawn = refined.few(), partial(splatted, scene=scene, window=scene.camera, context=context)
-    if few is None:
-        return drawn(refined.sampled(), splatter=settings.reader)
-    # The coarse samples are evaluated and shaded once, for both branches.
-    splats = to_splats(refined.coarse, scene.parts, scene.camera, scene.camera, context)
-
-    def image(layout: Layout | None) -> Array:
-        return drawn(refined.sampled(layout), splatter=settings.reader, splats=splats)
-
-    return context.engine.choose(few.dropped == 0, lambda: image(few), lambda: image(None))
-
-
-def _of_contrast(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The image with fine samples at outlines, and at contrasts between the colours of coarse samples."""
-    coarse = coarse_scene(scene, scene.camera, size, settings)
-    splats = to_splats(coarse, scene.parts, scene.camera, scene.camera, context)
-    colors = value_of(splats.rgba)
-    if colors is None or colors.ndim != 2 or value_of(coarse.row) is None:
-        raise InputError(
-            f"contrast of Adaptive is {settings.contrast}, and colours are traced; give None: what is sampled cannot "
-            f"depend on values that are not known yet"
-        )
-    refined = Finer(scene, scene.camera, size, coarse, settings, scene.hidden_by(settings.splatter), colors)
-    return splatted(refined.sampled(), scene, scene.camera, context, settings.reader, splats)
 
 
 @uncompiled
@@ -179,10 +138,10 @@ def render_samples(
     Args:
         sampled: the result of `sample` for these parts. θ, transform and camera may have other values now, with one
             exception: if a part's θ is NumPy, beside torch or jax arrays, `sample` may have evaluated its surface, and
-            new values have no effect. Samples taken with `settles=True` need the same values.
+            new values have no effect.
         parts: as in `render`.
         camera: as in `render`.
-        splatter: name or object of a `Splatter`. "auto" is "edges" if the samples have outlines, else "visible".
+        splatter: name or object of a `Splatter`. "edges" needs samples with outlines.
         background: as in `render`.
         engine: as in `render`.
 
@@ -203,7 +162,7 @@ def render_samples(
         raise InputError(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
-    splatter = splatter_of(splatter, sampled.outlines is not None)
+    splatter = check_splatter(splatter)
     if "outlines" in splatter.reads and sampled.outlines is None:
         raise InputError(
             f"the samples have no outlines, which {splatter!r} reads; give it to rts.sample, too, or take another"
@@ -213,12 +172,6 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{splatter.reach + 1}; give it to rts.sample, too"
         )
-    if sampled.settled is not None and not (promised(splatter, "fills_interiors") and scene.parts[0].uniform):
-        shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
-        raise InputError(
-            f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "
-            f"{shaders} need; give rts.sample this splatter and these parts, or leave it out"
-        )
     if "outlines" not in splatter.reads:
         sampled = _narrowed(replace(sampled, outlines=None), apron - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
@@ -227,24 +180,14 @@ def render_samples(
 
 
 def _narrowed(sampled: Sampled, count: int) -> Sampled:
-    """Samples with an apron that is narrower by `count` cells; that of fine samples stays."""
+    """Samples with an apron that is narrower by `count` cells."""
     if count == 0:
         return sampled
     rows, columns = (slice(count, n - count) for n in sampled.row.shape[1:])
-    fine = sampled.fine  # Its own apron may be wider than is needed.
-    fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
-    cells = sampled.cells.map(lambda x: x[..., rows, columns])
-    return replace(sampled, cells=cells, apron=sampled.apron - count, fine=fine)
+    return replace(sampled, cells=sampled.cells.map(lambda x: x[..., rows, columns]), apron=sampled.apron - count)
 
 
-def splatted(
-    sampled: Sampled,
-    scene: Scene,
-    window: Camera,
-    context: Context,
-    splatter: Splatter,
-    splats: Splats | None = None,
-) -> Array:
+def splatted(sampled: Sampled, scene: Scene, window: Camera, context: Context, splatter: Splatter) -> Array:
     """The image (H, W, C + 1) of a window, a rectangle of the camera's image, from the samples in it.
 
     Args:
@@ -253,23 +196,9 @@ def splatted(
         window: the camera of the window.
         context: the engine to compute with, and an exemplar of its constants.
         splatter: a splatter.
-        splats: the splats of the coarse samples; None if not yet computed.
     """
-    fine = sampled.fine
-    if fine is None or not fine.flat:
-        splats = splats or to_splats(sampled, scene.parts, scene.camera, window, context)
-    if fine is None:
-        assert splats is not None
-        image = cropped_image(splatter, splats)
-        return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
-    finer = to_fine_splats(fine, scene.parts, scene.camera, context)
-    small = cropped_image(splatter, finer)
-    if splats is None:
-        arrays = fine.pixel, sampled.row[0], sampled.settled
-        pixel, row, settled = constants(arrays, engine_of(small), small)
-        return painted_inset(finer.rgba[0, ...], small, pixel, row, settled, fine.supersample)
-    image = cropped_image(splatter, splats.replace(wanted=context_of(splats.rgba).constants(fine.coarse)))
-    return with_inset(image, small, constants(fine.pixel, engine_of(image), image), fine.supersample)
+    image = cropped_image(splatter, to_splats(sampled, scene.parts, scene.camera, window, context))
+    return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
 
 
 def seen(image: Array, scene: Scene, name: str = "the image") -> Array:

@@ -14,17 +14,17 @@ from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Outlines, Request, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.errors import InputError, InputWarning, warn
+from rts.errors import InputWarning, warn
+from rts.plugin_base import overrides
 from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
-from rts.rendering.scene import Grid, Scene, has_sheets, shares_tables
+from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
 from rts.sampling.spans import breaks_of_triangles
 from rts.sampling.stacks_of_spans import breaks_of_stacks
-from rts.sampling.strips import at_cells
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
@@ -40,38 +40,28 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         scene: the scene.
         grid: the cells.
         capacity: `Request.capacity`. Where values are traced, there is room for a quarter as many breaks, or for 8 a
-            row and a column of the grid, if that is more. `overflow` counts those beyond.
-
-    Raises:
-        InputError: samples of a surface share a table.
+            row and a column of the grid, if that is more, or for fewer if a shared table has no room for their samples.
+            `overflow` counts those beyond.
 
     Warns:
         InputWarning: a sampler cannot sample single points.
     """
-    for part in scene.parts:
-        if shares_tables(part.surface):
-            raise InputError(
-                f"samples of {part.surface!r} share a table, to which those beside outlines cannot be added; "
-                f"use table=False, or splatter='visible'"
-            )
     cells, known = sampled.cells, []
     if all(scene.opaque) or not scene.layered:
         sampled = replace(sampled, cells=cells.first(1))
     for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True):
         # Functions of surfaces want the arrays that they are given.
         known.append((part.transform, read, _proxy_inputs(part) if entry is None else None))
-    triangles = [own.triangle for own in sampled.samples]
-    inputs = stopped((known, scene.camera, grid.camera, sampled.row, sampled.depth, triangles))
+    inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
     if traced or scene.layered or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
-        found, more = _found_on_host(sampled, scene, grid, most, inputs)
+        found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:
-        row, depth, own = map_leaves(host_value, inputs[3:])
         entered = [map_leaves(host_value, x) for *_, x in inputs[0]]
-        centres = at_centres(row, depth, own, sampled.samples)
+        centres = at_centres(map_leaves(host_value, inputs[3]), sampled.samples)
         (here,), more = found_in_views([Points.of(scene, grid, entered)], [centres])
-        specs = Found.specs(0, grid.size, real_of(scene), len(row))
+        specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
@@ -110,7 +100,8 @@ def taken_rows(samples: Samples, index: Array) -> Samples:
 
     own = taken({"ids": samples.ids, "params": samples.params})
     gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
-    return replace(samples, **own, tables=taken(samples.tables), gbuffer=gbuffer, triangle=None)
+    tables = {**samples.tables, **taken({name: samples.tables[name] for name in samples.by_sample})}
+    return replace(samples, **own, tables=tables, gbuffer=gbuffer)
 
 
 def with_entries(scene: Scene, grid: Grid) -> Scene:
@@ -194,20 +185,27 @@ class Found(NamedTuple):
 
 
 def _found_on_host(
-    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, inputs: Tree
+    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, capacity: int | None, inputs: Tree
 ) -> tuple[Found, list[Samples]]:
     """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
-    owners = [_tables(own) for own in sampled.samples]
+    owners, layers = [_tables(own) for own in sampled.samples], sampled.row.shape[0]
+    # Where a break has a pair, its last sample is there once more.
+    rows = (_columns(layers)[0] + 1) * (most or 0)
+    room = [_rooms(*own, rows, capacity) for own in zip(scene.parts, sampled.samples, strict=True)]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
         given = iter(arrays)
         known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
-        of_parts, whole, camera, row, depth, own = known
+        of_parts, whole, camera, cells = known
         own_parts = zip(scene.parts, of_parts, strict=True)
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
         entered = [x for *_, x in of_parts]
         points = Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
-        (found,), more = found_in_views([points], [at_centres(row, depth, own, sampled.samples)], most)
+        centres, count = at_centres(cells, sampled.samples), most
+        (found,), more = found_in_views([points], [centres], count)
+        while count and not all(map(_has_room, more, room)):
+            count //= 2
+            (found,), more = found_in_views([points], [centres], count)
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
@@ -215,12 +213,13 @@ def _found_on_host(
             arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
         return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
 
-    layers = sampled.row.shape[0]
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
     specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
-    for x in (x for own in owners for x in own.values()):
-        dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
-        specs.append(ArraySpec((_columns(layers)[0] * (most or 0), *x.shape[1:]), dtype, packed=True))
+    for own, rooms in zip(owners, room, strict=True):
+        for (kind, name), x in own.items():
+            dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
+            count = rooms.get(name, rows) if kind == "tables" else rows
+            specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
     found = Found(*(next(results) for _ in Found._fields))
     return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
@@ -235,6 +234,20 @@ def real_of(scene: Scene) -> Any:
     """The dtype of a scene's floating arrays."""
     like = scene.context.like
     return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
+
+
+def _rooms(part: CheckedPart, samples: Samples, rows: int, capacity: int | None) -> dict[str, int]:
+    """The numbers of rows, by name, of tables that so many further samples of a part share."""
+    surface, names = part.surface, set(samples.tables) - set(samples.by_sample)
+    if not names or not isinstance(surface, TriangleSurface):
+        return {}
+    specs = surface.table_specs(rows, None if capacity is None else rows)
+    return {name: specs[name].shape[0] for name in names}
+
+
+def _has_room(samples: Samples, room: Mapping[str, int]) -> bool:
+    """True if tables have no more rows than there is room for."""
+    return all(samples.tables[name].shape[0] <= count for name, count in room.items())
 
 
 def _tables(samples: Samples) -> dict[tuple[str, str], Array]:
@@ -257,26 +270,23 @@ def _with_tables(samples: Samples, arrays: dict[tuple[str, str], Array]) -> Samp
 def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
     """The cells of a scene whose parts have got further rows behind their own."""
     if sampled.one_part:
-        return sampled.cells
+        return replace(sampled.cells, triangle=None)
     row, counts = sampled.row, [own.ids.shape[-2] for own in sampled.samples]
     more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
     shift = engine_of(row).constant(np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), row)
     xp = namespace(row)
     moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
-    return replace(sampled.cells, row=xp.where(row >= 0, moved, row))
+    return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)
 
 
-def at_centres(
-    row: np.ndarray, depth: np.ndarray, triangles: Sequence[np.ndarray | None], samples: Sequence[Samples]
-) -> Fronts:
-    """Surfaces seen at centres (K, H, W), from the `row` and `depth` of a scene, and its parts' triangles."""
-    counts = [own.ids.shape[-2] for own in samples]
-    of_samples = [np.full(n, -1, np.int32) if x is None else x for x, n in zip(triangles, counts, strict=True)]
-    of_samples = np.concatenate([*of_samples, np.full(1, -1, np.int32)])  # The last is read where nothing is seen.
-    part = np.minimum(row, np.int32(0))
-    for first in np.cumsum(counts)[:-1]:
-        part += row >= first
-    return Fronts(part, of_samples[row], depth.astype(np.float64))
+def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
+    """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
+    part = np.minimum(cells.row, np.int32(0))
+    for first in np.cumsum([own.ids.shape[-2] for own in samples])[:-1]:
+        part += cells.row >= first
+    triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
+    assert cells.depth is not None
+    return Fronts(part, triangle, cells.depth.astype(np.float64))
 
 
 def _refines(part: CheckedPart) -> bool:
@@ -397,17 +407,21 @@ class Points:
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
 
-        They are added to the samples of parts. Triangles have no kinks within, and no pairs.
+        They are added to the samples of parts. Triangles that stand for no field have no pairs.
         """
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
         for own, known in enumerate(self._parts):
             at = np.flatnonzero(part == own)
-            if isinstance(known[0], TriangleSampler) or not len(at):
+            surface, points, triangles = self._scene.parts[own].surface, breaks.points, breaks.triangles
+            drawn = isinstance(known[0], TriangleSampler)
+            if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
                 continue
-            more = self.sample(own, breaks.points[at, breaks.near[at]], exits=True)
-            if more.exit is not None and len(more.exit) == 2:
-                found = host_value(more.exit)[:, 0].T
+            chosen = at, breaks.near[at]
+            fragments = self.on_sheets(own, points[chosen], triangles[chosen]) if drawn else None
+            more = self.sample(own, points[chosen], fragments, pairs=True)
+            if more.pair is not None:
+                found = host_value(more.pair).T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
             samples[own] = in_one_table([samples[own], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
@@ -447,7 +461,7 @@ class Points:
         sheets = self._parts[part][-1]
         return sheets.at(triangles, points)[0] if sheets is not None and (triangles >= 0).all() else None
 
-    def sample(self, part: int, points: np.ndarray, fragments: Fragments | None = None, exits: bool = False) -> Samples:
+    def sample(self, part: int, points: np.ndarray, fragments: Fragments | None = None, pairs: bool = False) -> Samples:
         """One layer of samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
         sampler, camera, entry, sheets = self._parts[part]
         if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
@@ -455,7 +469,7 @@ class Points:
             points, fragments = np.full((1, 2), 0.5), None
         if fragments is not None:
             sampler = _OnTriangles(fragments)
-        request = Request(points=points, exits=exits, triangles=True, entry=entry)
+        request = Request(points=points, pairs=pairs, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, 1, request)
         if "points" in samples.followed:
             return samples
@@ -466,8 +480,13 @@ class Points:
         )
         height, width = self._grid.size
         x, y = (np.clip(np.floor(points[:, axis]), 0, count - 1) for axis, count in ((0, width), (1, height)))
-        cells = engine_of(samples.row).constant((y * width + x).astype(np.int32)[None], samples.row)
-        return at_cells(check_samples(samples, (height, width), sampler), cells, None)
+        at = (y * width + x).astype(np.int64)
+        check_samples(samples, (height, width), sampler)
+        found, depth = (host_value(z)[0].reshape(-1)[at] for z in (samples.row, samples.depth))
+        constant, number = engine_of(samples.row).constant, np.where(found >= 0, np.arange(len(found)), -1)
+        taken = taken_rows(samples, constant(np.maximum(found, 0).astype(np.int32), samples.row))
+        row = constant(number.astype(np.int32)[None, None], samples.row)
+        return taken.replace(row=row, depth=constant(depth[None, None], samples.depth))
 
     def _fronts(self, points: np.ndarray) -> Fronts:
         """The nearest samples of all parts at points (M, 2); of equal ones the first part's."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rts.arrays.engines import engine_of
-from rts.arrays.trees import Array
+from rts.arrays.trees import Array, map_leaves
 from rts.compiling.threads import each
 from rts.rendering.outlines import (
     Found,
@@ -36,8 +36,7 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]))
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
     points = [first, *each(lambda own: Points.of(*own, [None] * len(scenes[0].parts)), further)]
-    row, depth, *triangles = map(host_value, (sampled.row, sampled.depth, *(s.triangle for s in sampled.samples)))
-    centres = at_centres(row, depth, triangles, sampled.samples)
+    centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)
     samples, counts, moved, cells, start = [], [], [], sampled.cells, 0
@@ -55,13 +54,14 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
         for at, of, x in zip(rows, found, here, strict=True):
             at[x] = start + place[count + of.rows[x]]
         start += len(order)
-    cells = replace(cells, row=_moved(sampled.row, np.concatenate(moved)))
-    specs, none = Found.specs(0, grids[0].size, real_of(scenes[0]), len(row)), np.zeros((len(found), 1), np.int32)
+    cells = replace(cells, row=_moved(sampled.row, np.concatenate(moved)), triangle=None)
+    specs = Found.specs(0, grids[0].size, real_of(scenes[0]), len(sampled.row))
+    none = np.zeros((len(found), 1), np.int32)
     found = [Found(*(np.asarray(x, spec.dtype) for x, spec in zip(of, specs, strict=True))) for of in found]
     outlines = [of.outlines(at) for of, at in zip(found, rows, strict=True)]
-    joint = outlines_side_by_side(outlines, picture, none, none, host_value(views.scales))
+    joint = outlines_side_by_side(outlines, picture, none, none)
     sampled = replace(sampled, samples=tuple(samples), cells=cells, outlines=joint)
-    return with_counts(sampled, picture, views.scales, tuple(counts))
+    return with_counts(sampled, picture, tuple(counts))
 
 
 def _view_after_view(cells: np.ndarray, beside: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 from rts.arrays.engines import context_of_scene, uncompiled
 from rts.arrays.trees import Array
 from rts.contracts.checks import changed_part, check_background, check_changes, check_channels
-from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike, Supersample
+from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_over
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
@@ -81,7 +81,7 @@ class Renderer:
         *,
         splatter: SplatterLike = "auto",
         layers: Layers = "auto",
-        supersample: Supersample = 1,
+        supersample: int = 1,
         background: BackgroundLike = None,
         capacity: int | None = None,
         engine: str | None = None,

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from rts.arrays.engines import Context, context_of_scene, is_traced
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
-from rts.contracts.splatter import Splatter
-from rts.contracts.surface import Surface, TriangleSurface
-from rts.sampling.auto import Auto
-from rts.sampling.hidden import HiddenRule, hidden_by
+from rts.contracts.surface import TriangleSurface
 from rts.sampling.prepared import Prepared
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.sampling.winding import warn_of_winding
@@ -30,7 +26,6 @@ class Scene(NamedTuple):
         camera: the camera of the whole image.
         samplers: the sampler of each part, as the user chose it.
         entries: the structure that each sampler has built for its part, or None.
-        sizes: for each part the largest absolute number in the θ that its surface reads; None if unknown.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
     """
 
@@ -38,7 +33,6 @@ class Scene(NamedTuple):
     camera: Camera
     samplers: Sequence[Sampler]
     entries: Sequence[Any]
-    sizes: Sequence[float | None]
     context: Context
 
     @property
@@ -55,11 +49,6 @@ class Scene(NamedTuple):
     def layered(self) -> bool:
         """True if outlines can be found between stacks of layers: all samples lie on triangles."""
         return all(map(has_sheets, self.parts, self.chosen()))
-
-    @property
-    def joinable(self) -> bool:
-        """True if samples can be added to those of all parts: no surface has a table that its samples share."""
-        return not any(shares_tables(part.surface) for part in self.parts)
 
     @property
     def read(self) -> list[dict[str, Tree]]:
@@ -79,24 +68,15 @@ class Scene(NamedTuple):
         warn_of_unread(checked)
         warn_of_winding(checked, camera)
         if prepared:
-            fields = parts.samplers, parts.entries, parts.sizes
+            fields = parts.samplers, parts.entries
         else:
-            fields = [check_sampler(sampler)] * len(checked), [None] * len(checked), [None] * len(checked)
+            fields = [check_sampler(sampler)] * len(checked), [None] * len(checked)
         return cls(checked, camera, *fields, context_of_scene(checked, camera, engine=engine))
 
     def at(self, size: tuple[int, int]) -> Scene:
         """The scene with its camera made for images of a size; an AspectWarning if the camera is for another ratio."""
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
-
-    def hidden_by(self, splatter: Splatter | str | None, settles: bool = False) -> HiddenRule | None:
-        """The rule that tells which samples are hidden; None to keep all. See `rts.sampling.hidden.hidden_by`."""
-        return hidden_by(splatter, self.parts, self.sizes, settles) if isinstance(splatter, Splatter) else None
-
-    def telling(self, thin: bool) -> Scene:
-        """The scene itself; with `thin`, "auto" takes samplers that tell what lies between samples."""
-        samplers = [replace(s, thin=True) if thin and isinstance(s, Auto) else s for s in self.samplers]
-        return self._replace(samplers=samplers) if thin else self
 
     def chosen(self) -> list[Sampler]:
         """The sampler that samples each part."""
@@ -107,13 +87,6 @@ class Scene(NamedTuple):
         """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""
         context = context_of_scene(self.parts, self.camera, *others)
         return context if context.engine.differentiates else self.context
-
-
-def shares_tables(surface: Surface) -> bool:
-    """True if samples of a surface share a table, so that none can be added."""
-    if not (isinstance(surface, TriangleSurface) and surface.refines):
-        return False
-    return not all(spec.by_sample for spec in surface.table_specs(1, None).values())
 
 
 def has_sheets(part: CheckedPart, sampler: Sampler) -> bool:

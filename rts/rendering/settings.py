@@ -7,17 +7,17 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from rts.contracts.checks import check_size, check_splatter, is_auto, splatter_of
+from rts.contracts.checks import check_size, check_splatter, is_auto
 from rts.contracts.splatter import Splatter
-from rts.errors import InputError
 from rts.plugin_base import promised
-from rts.registry import name_of
 from rts.rendering.scene import Scene
-from rts.sampling.adaptive import Adaptive
-from rts.sampling.hidden import TRACED_LAYERS, planned
+from rts.sampling.layer_count import TRACED_LAYERS, planned
 
 BAND = 2**20
 """Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""
+
+APRON = 2
+"""Cells sampled beyond each side of the image where no splatter tells its reach."""
 
 
 @dataclass(frozen=True)
@@ -25,16 +25,15 @@ class RenderSettings:
     """Checked settings of a render.
 
     Attributes:
-        splatter: the splatter that samples are for; "auto" until the scene is known, see `of`; None for any splatter,
-            so that no sample may be left out.
+        splatter: the splatter that samples are for; None for any splatter.
         layers: K, or "auto".
-        supersample: samples along each side of a pixel, or an `Adaptive`.
+        supersample: samples along each side of a pixel.
         capacity: rows to allot for the samples of a part; None for as many as there are.
     """
 
-    splatter: Splatter | Literal["auto"] | None
+    splatter: Splatter | None
     layers: int | Literal["auto"]
-    supersample: int | Adaptive
+    supersample: int
     capacity: int | None
 
     @classmethod
@@ -51,64 +50,27 @@ class RenderSettings:
             capacity: as in `rts.render`.
 
         Raises:
-            InputError: an argument is of another kind, or makes no image; or a splatter that finds outlines is to have
-                an `Adaptive`.
+            InputError: an argument is of another kind, or makes no image.
         """
-        finest = supersample.samples if isinstance(supersample, Adaptive) else supersample
-        size = check_size(size, layers, capacity, finest)
-        if not isinstance(supersample, Adaptive):
-            supersample = int(supersample)
-        adaptive = isinstance(supersample, Adaptive)
-        if is_auto(splatter) and not adaptive:
-            return size, cls("auto", layers if is_auto(layers) else int(layers), supersample, capacity)
-        splatter = splatter_of(splatter, outlines=False)
-        if adaptive and "outlines" in splatter.reads:
-            raise InputError(
-                f"supersample is {supersample!r}, and splatter {name_of('rts.splatters', splatter)!r} finds outlines "
-                f"without further samples; give 1, or a number of samples along each side of a pixel"
-            )
-        settings = cls(splatter, layers if is_auto(layers) else int(layers), supersample, capacity)
-        return size, settings._of_most(None if promised(splatter, "translucent") else splatter.layers)
+        size = check_size(size, layers, capacity, supersample)
+        layers = layers if is_auto(layers) else int(layers)
+        splatter = None if splatter is None else check_splatter(splatter)
+        return size, cls(splatter, layers, int(supersample), capacity)
 
     def of(self, scene: Scene) -> RenderSettings:
-        """The settings for a scene: with a splatter, and a number of layers where values are traced.
-
-        "auto" is "edges", but "visible" where light passes through surfaces whose outlines are not found layer by
-        layer, or no samples can be added.
-        """
-        splatter, layers, opaque = self.splatter, self.layers, all(scene.opaque)
-        if splatter == "auto":
-            splatter = splatter_of("auto", outlines=scene.joinable and (opaque or scene.layered))
+        """The settings with the number of layers that the splatter reads of a scene; "auto" where it is to be found."""
+        layers, opaque = self.layers, all(scene.opaque)
         if layers == "auto" and scene.traced:
             layers = TRACED_LAYERS[opaque]
-        settings = replace(self, splatter=splatter, layers=layers)
-        return settings._of_most(splatter.layers) if splatter and (opaque or not scene.layered) else settings
-
-    def _of_most(self, most: int | None) -> RenderSettings:
-        """The settings with no more layers than are read; None for all."""
-        if most is None:
-            return self
-        return replace(self, layers=most if self.layers == "auto" else min(most, int(self.layers)))
-
-    @property
-    def side(self) -> int | None:
-        """Number of cells along each side of a pixel; None for `Adaptive`."""
-        return None if isinstance(self.supersample, Adaptive) else self.supersample
+        splatter = self.splatter
+        if splatter is not None and splatter.layers is not None and (opaque or not promised(splatter, "translucent")):
+            layers = splatter.layers if layers == "auto" else min(splatter.layers, int(layers))
+        return replace(self, layers=layers)
 
     @property
     def finds_outlines(self) -> bool:
         """True if the splatter reads the outlines between centres."""
-        return "outlines" in self.reader.reads
-
-    @property
-    def contrast(self) -> float | None:
-        """The contrast above which `Adaptive` takes more samples; None if contrast does not matter."""
-        return self.supersample.contrast if isinstance(self.supersample, Adaptive) else None
-
-    @property
-    def thin(self) -> bool:
-        """True if `Adaptive` looks for what falls between centres."""
-        return isinstance(self.supersample, Adaptive) and self.supersample.thin
+        return self.splatter is not None and "outlines" in self.splatter.reads
 
     @property
     def most_layers(self) -> int:
@@ -116,27 +78,22 @@ class RenderSettings:
         return planned(self.layers)
 
     @property
-    def reader(self) -> Splatter:
-        """The splatter whose `reads` and `reach` guide sampling: the given one, or the one that reads most."""
-        return self.splatter if isinstance(self.splatter, Splatter) else check_splatter("visible")
-
-    @property
     def apron(self) -> int:
         """Number of cells sampled beyond each side of the image: the splatter's reach plus one.
 
-        Samples within reach affect the image, and pairing reads one cell beside theirs.
+        Samples within reach affect the image, and splatters may read one cell beside theirs.
         """
-        return self.reader.reach + 1
+        return APRON if self.splatter is None else self.splatter.reach + 1
 
     def bands(self, size: tuple[int, int]) -> list[tuple[int, int]]:
         """(first row, number of rows) of each band of an image (height, width).
 
-        A band is rendered at a time. With one sample a pixel, or `Adaptive`, there is one band.
+        A band is rendered at a time. With one sample a pixel there is one band.
         """
         height, width = size
-        if self.side is None or self.side == 1:
+        if self.supersample == 1:
             return [(0, height)]
-        rows = max(1, BAND // (self.most_layers * self.side**2 * width))
+        rows = max(1, BAND // (self.most_layers * self.supersample**2 * width))
         count = math.ceil(height / rows)
         edges = [height * i // count for i in range(count + 1)]
         return [(top, end - top) for top, end in itertools.pairwise(edges)]

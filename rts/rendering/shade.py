@@ -128,13 +128,14 @@ def apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engi
         with lock:  # Views are shaded by several threads.
             return pieces(name)
 
-    rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *samples.tables.values())]
+    split_tables = [samples.tables[name] for name in samples.by_sample]
+    rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *split_tables)]
     views = []
     for b, (ids, params, *tables) in enumerate(zip(*rows, strict=True)):
         own = GBuffer(position=split("position")[b])
         for name in set(gbuffer) - {"position"}:
             own.defer(name, lambda name=name, b=b: split(name)[b])
-        tables = dict(zip(samples.tables, tables, strict=True))
+        tables = {**samples.tables, **dict(zip(samples.by_sample, tables, strict=True))}
         views.append((replace(samples, ids=ids, params=params, tables=tables, gbuffer=None), own))
     return views
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,10 +11,9 @@ from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
 from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart, check_splats
-from rts.contracts.records import ON_RAYS, Fine, Sampled, Samples, Splats
+from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats
 from rts.errors import InputError
 from rts.operations.projection import projective_map_of_views
-from rts.operations.take import take, take_shifted
 from rts.rendering.sampled_views import Views, in_one_table
 from rts.rendering.scene import Grid
 from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
@@ -63,7 +61,7 @@ def views_to_splats(
     cameras: Sequence[Camera],
     context: Context,
 ) -> list[Splats]:
-    """The splats of pictures of several views. They have no border; `wanted` marks the cells to show instead.
+    """The splats of pictures of several views. They have no border: each view keeps its apron.
 
     A surface is evaluated once, at the samples of all views, so that results for the whole of θ serve all. Shaders that
     take views are called once, too; others are called view by view.
@@ -86,8 +84,7 @@ def views_to_splats(
         here = slice(start, start := start + picture.picture.views)
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = _together(*zip(*of_parts, strict=True))
-        wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
-        splats.append(_splats(whole, parts, positions, rgba, context, wanted=wanted))
+        splats.append(_splats(whole, parts, positions, rgba, context))
     return splats
 
 
@@ -108,43 +105,21 @@ def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
 
 
 def _places_of(pictures: Sequence[Views], context: Context) -> Array:
-    """(B, 3) for each view its offsets along x and y in its picture, in cells, and the factor on depth."""
+    """(B, 3) for each view its offsets along x and y in its picture, in cells, and 1, the factor on depth."""
     corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
-    scales = [context.constants(picture.scales) for picture in pictures]
-    xp = namespace(*scales)
-    return xp.concat([context.constants(corners), xp.concat(scales)[:, None]], axis=1)
+    return context.constants(np.insert(corners, 2, 1, axis=1))
 
 
 def _splats(
-    sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, **more: Any
+    sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, border: int = 0
 ) -> Splats:
-    """The splats of samples with these positions and colours; `more` are further fields of `Splats`."""
+    """The splats of samples with these positions and colours."""
     cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
     outlines = context_of(positions, rgba).constants(sampled.outlines)
     if not context.engine.owns(rgba):
         cells, part = context_of(positions, rgba).constants((cells, part))
     opaque = all(p.shader.opaque for p in parts)
-    more["outlines"] = outlines
-    return Splats(positions, rgba, cells, part, one_part=sampled.one_part, opaque=opaque, **more)
-
-
-def to_fine_splats(fine: Fine, parts: Sequence[CheckedPart], camera: Camera, context: Context) -> Splats:
-    """Evaluate, shade and project fine samples into splats of their layout. Arguments as in `to_splats`."""
-    height, width = (n * fine.supersample for n in fine.pixel.shape)
-    fine, grid = _owned(fine, fine.row, context), Grid.around(camera, (height, width), fine.apron)
-    positions, rgba = _together(*_shown(fine.samples, fine.index, parts, camera, grid, context))
-    arrays = fine.index, fine.shift, fine.cells, fine.part, fine.wanted
-    index, shift, cells, part, wanted = context_of(positions, rgba).constants(arrays)
-    moved = take_shifted(positions, index, namespace(positions).astype(shift, positions.dtype))
-    return Splats(
-        moved,
-        take(rgba, index),
-        cells,
-        part,
-        wanted=wanted,
-        border=fine.apron,
-        opaque=all(p.shader.opaque for p in parts),
-    )
+    return Splats(positions, rgba, cells, part, border, sampled.one_part, opaque, outlines)
 
 
 def _shown(

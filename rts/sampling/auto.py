@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from rts import registry
@@ -30,29 +29,21 @@ class Choice(NamedTuple):
         sampler: the sampler that `sampler="auto"` takes, by name.
         reason: why.
         samples: the number of samples in an image; None if no image was sampled.
-        fine: the number of fine samples among them, of `rts.Adaptive`; None without it.
-        active: the number of pixels of the image with fine samples, for all parts together; None without it.
-        between: the number of these in which something lies between samples, of `rts.Adaptive(…, thin=True)`; else
-            None, also where no sampler tells.
         remarks: likely mistakes, a line each: entries of θ that nothing reads, a mesh wound inside out.
     """
 
     sampler: str
     reason: str
     samples: int | None = None
-    fine: int | None = None
-    active: int | None = None
-    between: int | None = None
     remarks: tuple[str, ...] = ()
 
 
-def choose(part: Part, *, static: bool, thin: bool = False) -> Choice:
+def choose(part: Part, *, static: bool) -> Choice:
     """The sampler for a part.
 
     Args:
         part: the part.
         static: True if its triangles stay the same from call to call.
-        thin: True if the sampler has to tell what lies between samples; see `Adaptive`.
     """
     surface = part.surface
     if not isinstance(surface, TriangleSurface):
@@ -65,9 +56,6 @@ def choose(part: Part, *, static: bool, thin: bool = False) -> Choice:
         return Choice("raster", f"{surface!r} does not say how many triangles it has (`face_count`)")
     if faces < STATIC_FACES:
         return Choice("raster", f"{faces} triangles are drawn faster than rays find them (below {STATIC_FACES})")
-    if thin:
-        reason = f"{faces} triangles that stay would suit embree; thin=True asks for raster, which tells of thin things"
-        return Choice("raster", reason)
     try:
         registry.plugin("rts.samplers", "embree")
     except PluginError as error:
@@ -81,23 +69,15 @@ def is_static(part: Part, camera: Camera) -> bool:
     return constant and engine_of(part, camera).differentiates
 
 
-@dataclass(frozen=True)
 class Auto(Sampler):
-    """A sampler that passes each part to the sampler that `choose` names.
-
-    Attributes:
-        thin: True to choose among samplers that tell what lies between samples; see `Adaptive`.
-    """
-
-    thin: bool = False
+    """A sampler that passes each part to the sampler that `choose` names."""
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""
-        choice = choose(part, static=camera is None or is_static(part, camera), thin=self.thin)
+        choice = choose(part, static=camera is None or is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
         return check_sampler(choice.sampler)
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
-        chosen = replace(self, thin=self.thin or request.between)
-        return chosen.suited(part, camera).sample(part, camera, size, layers, request)
+        return self.suited(part, camera).sample(part, camera, size, layers, request)

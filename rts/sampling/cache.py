@@ -28,13 +28,11 @@ class Entry(NamedTuple):
     Attributes:
         proxy: the triangles.
         prepared: the sampler's structure.
-        size: the largest absolute coordinate of the proxy's vertices; None if it was not computed.
         inputs: inputs of the proxy, if the surface refines samples; else None.
     """
 
     proxy: Proxy
     prepared: Any
-    size: float | None = None
     inputs: Tree = None
 
 

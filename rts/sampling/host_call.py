@@ -31,17 +31,19 @@ class Shape(NamedTuple):
         size: lines and columns of the cells to sample: of the grid, or of a list (L, C) of its cells.
         capacity: rows to allot, or None for as many as there are.
         view: (height, width) of the grid.
+        more: without a capacity there is room for a row a cell, and for so many more.
     """
 
     layers: int
     size: tuple[int, int]
     capacity: int | None
     view: tuple[int, int]
+    more: int = 0
 
     @property
     def rows(self) -> int:
         """The largest number of samples."""
-        return self.layers * self.size[0] * self.size[1] if self.capacity is None else self.capacity
+        return self.layers * self.size[0] * self.size[1] + self.more if self.capacity is None else self.capacity
 
     def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
         """The spec of an array (rows, *widths) with a row for each sample."""
@@ -49,7 +51,7 @@ class Shape(NamedTuple):
 
     def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:
         """Specs of the tables that a surface's `refine` fills."""
-        specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1], self.capacity))
+        specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1] + self.more, self.capacity))
         for name, spec in specs.items():
             if spec.by_sample:
                 specs[name] = self.row_spec(spec.dtype, *spec.shape[1:])._replace(by_sample=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,8 @@ def pack(
     table: np.ndarray,
     corner_params: np.ndarray | None,
     capacity: int,
-    *more: tuple[Fragments, np.ndarray],
     views: tuple[int, int] = (1, 1),
-) -> tuple[Any, ...]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
     """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and the number of these cells.
 
     Cells without a row have −1 and 0. They are those that are not taken, and those beyond the capacity.
@@ -30,28 +29,21 @@ def pack(
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
         capacity: rows to allot, or 0 for as many as are taken, at least one.
-        *more: further fragments, and the ones to take, for rows behind all others, at most K · H · W in all. Their
-            `row` is returned last; the number of cells does not include them, but those that found no room.
         views: the number of views in the grid, down and across; each is packed by itself, one after the other.
     """
-    grids = [_Lines.of(fragments, kept, views), *(_Lines.of(*given) for given in more)]
-    total, room = int(grids[0].counts.sum()), capacity or max(1, grids[0].kept.size)
-    found = min(room, sum(int(grid.counts.sum()) for grid in grids))
-    rows = capacity or max(1, found)
+    lines = _Lines.of(fragments, kept, views)
+    total = int(lines.counts.sum())
+    rows = capacity or max(1, total)
+    found = min(rows, total)
     make = np.zeros if rows > found else np.empty
     ids = make((rows, table.shape[1]), np.int32)
     params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
     # Without corner parameters, the barycentrics themselves are taken.
     corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
-    first, places = 0, []
-    for grid in grids:
-        row, depth = np.empty(grid.kept.shape, np.int32), np.empty(grid.kept.shape, np.float32)
-        offsets = first + grid.offsets()
-        given = grid.kept, grid.triangle_ids, grid.barycentrics, grid.depths, table, corners, offsets
-        parallel(_pack, len(row), *given, ids, params, row, depth, work=2 * row.size)
-        first += int(grid.counts.sum())
-        places.append((row.reshape(grid.shape), depth.reshape(grid.shape)))
-    return ids, params, *places[0], total, *(row for row, _ in places[1:])
+    row, depth = np.empty(lines.kept.shape, np.int32), np.empty(lines.kept.shape, np.float32)
+    given = lines.kept, lines.triangle_ids, lines.barycentrics, lines.depths, table, corners, lines.offsets()
+    parallel(_pack, len(row), *given, ids, params, row, depth, work=2 * row.size)
+    return ids, params, row.reshape(lines.shape), depth.reshape(lines.shape), total
 
 
 class _Lines(NamedTuple):

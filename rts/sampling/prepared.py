@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Self
 
-import numpy as np
-
 from rts.arrays.argument_checks import check_pixels
-from rts.arrays.engines import value_of
-from rts.arrays.extremes import largest
-from rts.arrays.trees import leaves
 from rts.contracts.checks import check_changes, check_sampler, check_scene, suited_sampler
 from rts.sampling.cache import Entry
 from rts.scene.camera import Camera
@@ -24,14 +19,10 @@ class Prepared:
         parts: the parts.
         samplers: the sampler of each.
         entries: the sampler's entry for each part, or None where it builds nothing.
-        sizes: for each part the largest number that its surface read when it was built; None if nothing was built.
     """
 
-    def __init__(
-        self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Any], sizes: Sequence[float | None]
-    ):
+    def __init__(self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Any]):
         self.parts, self.samplers, self.entries = tuple(parts), tuple(samplers), tuple(entries)
-        self.sizes = tuple(sizes)
 
     @classmethod
     def of(
@@ -44,8 +35,7 @@ class Prepared:
         chosen = check_sampler(sampler)
         samplers = [suited_sampler(chosen, part, None) for part in checked]
         entries = [own.hold(part, camera, size) for own, part in zip(samplers, checked, strict=True)]
-        sizes = [None if entry is None else _size(part) for entry, part in zip(entries, checked, strict=True)]
-        return cls(checked, samplers, entries, sizes)
+        return cls(checked, samplers, entries)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the samplers' structures, which can be built again from the triangles."""
@@ -63,14 +53,8 @@ class Prepared:
         check_changes(index, changes, len(self.parts))
         parts = list(self.parts)
         parts[index] = parts[index].replace(**changes)
-        return type(self)(parts, self.samplers, self.entries, self.sizes)
+        return type(self)(parts, self.samplers, self.entries)
 
 
 def _built(sampler: Any, kept: Entry) -> Entry:
     return sampler.arranged(kept._replace(prepared=sampler.prepare(kept.proxy))) if len(kept.proxy.faces) else kept
-
-
-def _size(part: Part) -> float:
-    """The largest absolute value in the floating-point arrays that a part's surface reads."""
-    read = [value_of(x) for name in part.surface.reads(part.theta) for x in leaves(part.theta[name])]
-    return max([0.0, *(largest(x) for x in read if x is not None and np.issubdtype(x.dtype, np.floating))])

@@ -18,7 +18,7 @@ from rts.errors import InputError
 from rts.sampling.packing import covered_cells
 from rts.scene.camera import Camera
 from rts.scene.topology import table_extent
-from rts.splatting.layers import check_rows
+from rts.splatting.cells import check_rows
 
 
 def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
@@ -97,29 +97,16 @@ def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: 
         return np.ascontiguousarray(array, dtype)
 
 
-def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
-    """The result of a surface's `pieces`, refused unless it is int16 of (T,) or (1,)."""
-    pieces = np.asarray(surface.pieces(proxy))
-    if pieces.dtype != np.int16 or pieces.shape not in ((1,), (len(proxy.faces),)):
-        raise InputError(
-            f"pieces of {surface!r} gave {pieces.dtype} of {pieces.shape}; expected int16 of ({len(proxy.faces)},), or "
-            f"of (1,)"
-        )
-    return pieces
-
-
 def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samples:
     """A sampler's samples of a part, if arrays on cells fit the grid and refer to rows of `ids`; else an InputError.
 
     Args:
         samples: the samples; of traced ones only shapes and dtypes are checked.
-        grid: (H, W) of the cells, or the shape of the list of cells.
+        grid: (H, W) of the cells.
         sampler: the sampler.
     """
     count, shape = samples.ids.shape[-2], tuple(samples.row.shape)
-    own = {"row": shape[:1] + tuple(grid), "depth": shape, "facing": shape, "settled": shape[1:], "between": shape[1:]}
-    if samples.exit is not None:
-        own["exit"] = (*samples.exit.shape[:1], *shape[1:])
+    own = {"row": shape[:1] + tuple(grid), "depth": shape}
     try:
         for name, expected in own.items():
             array: Any = getattr(samples, name)
@@ -127,10 +114,10 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
                 continue
             if tuple(array.shape) != expected:
                 raise InputError(f"{name} has shape {tuple(array.shape)}; expected {expected}")
-            if name not in ("depth", "between") and not namespace(array).isdtype(array.dtype, "signed integer"):
-                raise InputError(f"{name} is {array.dtype}; expected signed integers")
-            if name not in ("depth", "facing", "between"):
-                check_rows(array, count, name)
+            if name == "row":
+                if not namespace(array).isdtype(array.dtype, "signed integer"):
+                    raise InputError(f"row is {array.dtype}; expected signed integers")
+                check_rows(array, count)
     except InputError as error:
         raise InputError(f"sample of {sampler!r} gave samples that do not fit: {error}") from None
     return samples
@@ -283,6 +270,15 @@ def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> 
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
     tables = _checked_tables(refined.tables, lifted, who)
+    shared = [name for name in tables if name not in lifted.by_sample]
+    if shared:
+        lengths = {(len(tables[name]), len(lifted.tables[name])) for name in shared}
+        used, (count, _) = ids[row[covered]], next(iter(lengths))
+        if len(lengths) > 1 or used.min(initial=0) < 0 or used.max(initial=0) >= max(1, count):
+            raise InputError(
+                f"{who} gave ids from {used.min(initial=0)} to {used.max(initial=0)}, and tables {sorted(shared)} of "
+                f"{count} rows that samples share; expected tables of one length, and ids that are rows of them"
+            )
     return lifted.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 

@@ -58,7 +58,7 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
         if alpha.min() < 1 - LOST:
             warn(
                 f"samples are translucent, and {splatter!r} leaves out some of the light that passes through them; "
-                f"use splatter='visible'",
+                f"use splatter='edges'",
                 LayersWarning,
             )
         return

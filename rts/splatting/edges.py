@@ -31,9 +31,9 @@ from rts.contracts.records import ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
 from rts.splatting import edges_weights
+from rts.splatting.cells import check_rows, nothing, unpack
 from rts.splatting.edges_stacks import CELLS, Operands
 from rts.splatting.edges_weights import BORDER
-from rts.splatting.layers import check_rows, nothing, unpack
 
 FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
 """The fields of outlines that the operation takes: those of one layer."""

@@ -242,13 +242,14 @@ def weigh_sides(place, gap, near_ends, seen, ties, path, joined, normal, cells, 
 def _around(row, joined, y, x, around):
     """Fill `around` with the samples of the next cells to the left and right, above and below; see `_slope`.
 
-    Where the next cell shows another surface, the cell's own sample stands in.
+    Where the next cell shows another surface, the cell's own sample stands in. False if there is no slope.
     """
     n = row[y, x]
     around[0] = row[y, x - 1] if x > 0 and joined[0, y, x - 1] else n
     around[1] = row[y, x + 1] if joined[0, y, x] else n
     around[2] = row[y - 1, x] if y > 0 and joined[1, y - 1, x] else n
     around[3] = row[y + 1, x] if joined[1, y, x] else n
+    return around[0] != around[1] or around[2] != around[3]
 
 
 @compiled
@@ -267,10 +268,12 @@ def inside(first, last, positions, rgba, row, joined, out):
             if n < 0:
                 out[y, x] = 0.0
                 continue
-            mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
-            _around(row, joined, y, x, around)
             for c in range(rgba.shape[1]):
-                out[y, x, c] = rgba[n, c] - _slope(rgba, around, 0, c) * mx - _slope(rgba, around, 1, c) * my
+                out[y, x, c] = rgba[n, c]
+            if _around(row, joined, y, x, around):
+                mx, my = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
+                for c in range(rgba.shape[1]):
+                    out[y, x, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
 
 
 @loop
@@ -282,10 +285,9 @@ def push_inside(first, last, rgba, row, joined, t_positions, t_rgba, out):
             n = row[y, x]
             for c in range(rgba.shape[1]):
                 out[y, x, c] = t_rgba[n, c] if n >= 0 and len(t_rgba) else 0.0
-            if n < 0 or not len(t_positions):
+            if n < 0 or not len(t_positions) or not _around(row, joined, y, x, around):
                 continue
             mx, my = t_positions[n, 0], t_positions[n, 1]
-            _around(row, joined, y, x, around)
             for c in range(rgba.shape[1]):
                 out[y, x, c] -= _slope(rgba, around, 0, c) * mx + _slope(rgba, around, 1, c) * my
 
@@ -302,8 +304,7 @@ def pull_inside(rgba, row, joined, g, g_positions, g_rgba):
             if len(g_rgba):
                 for c in range(rgba.shape[1]):
                     g_rgba[n, c] += g[y, x, c]
-            if len(g_positions):
-                _around(row, joined, y, x, around)
+            if len(g_positions) and _around(row, joined, y, x, around):
                 for c in range(rgba.shape[1]):
                     g_positions[n, 0] -= _slope(rgba, around, 0, c) * g[y, x, c]
                     g_positions[n, 1] -= _slope(rgba, around, 1, c) * g[y, x, c]

@@ -24,7 +24,7 @@ from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Outlines, Splats
 from rts.operations.operation import Arrays, Operation, Some
-from rts.splatting.layers import over, unpack
+from rts.splatting.cells import over, unpack
 
 
 class Stack(NamedTuple):

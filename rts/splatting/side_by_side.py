@@ -1,8 +1,6 @@
 """The layout of several views in one picture, so that one splat serves all views.
 
-Each view keeps the apron that it was sampled with, so no splat of another view reaches its image. Splatters compare
-depths relative to the largest one. If the largest depths of views differ much, they are scaled to between 1 and 2 by
-powers of two, which is exact. The threshold for equal depths is then up to twice that of a single view.
+Each view keeps the apron that it was sampled with, so no splat of another view reaches its image.
 """
 
 from __future__ import annotations
@@ -71,14 +69,6 @@ class Picture(NamedTuple):
         down, across = np.divmod(np.arange(self.views), self.across)
         return np.stack([across * self.view[1], down * self.view[0]], axis=1)
 
-    def inside(self, border: int) -> np.ndarray:
-        """(height, width) bool, true for the cells of views but for a border in each."""
-        (height, width), inside = self.view, np.zeros((self.down, self.view[0], self.across, self.view[1]), bool)
-        inside[:, border : height - border, :, border : width - border] = True
-        for y, x in list(np.ndindex(self.down, self.across))[self.views :]:
-            inside[y, :, x] = False
-        return inside.reshape(self.size)
-
     def laid_out(self, views: Array, empty: int | bool) -> Array:
         """The picture (K, height, width) of the views' arrays (B, K, h, w); `empty` fills places without a view."""
         xp, (height, width), nowhere = namespace(views), self.view, self.down * self.across - self.views
@@ -94,18 +84,6 @@ class Picture(NamedTuple):
         inner = grid[:, border : height - border, :, border : width - border, :]
         views = xp.permute_dims(inner, (0, 2, 1, 3, 4))
         return xp.reshape(views, (-1, *views.shape[2:]))[: self.views, ...]
-
-
-def depth_scales(largest: np.ndarray) -> np.ndarray:
-    """(B,) float32 factors that scale the largest depth (B,) of each view to between 1 and 2.
-
-    All factors are one if the views would need the same factor. So are those of views without a positive, finite depth.
-    """
-    usable = np.isfinite(largest) & (largest > 0)
-    powers = np.frexp(np.where(usable, largest, 1.0))[1]
-    if not usable.any() or (powers[usable] == powers[usable][0]).all():
-        return np.ones(len(largest), np.float32)
-    return np.where(usable, np.ldexp(1.0, 1 - powers), 1.0).astype(np.float32)
 
 
 def at_once(view: tuple[int, int]) -> int:
@@ -126,7 +104,7 @@ def renumbered(rows: Array, starts: np.ndarray, shifts: np.ndarray) -> Array:
 
 
 def outlines_side_by_side(
-    views: Sequence[Outlines], picture: Picture, starts: np.ndarray, shifts: np.ndarray, scales: Array
+    views: Sequence[Outlines], picture: Picture, starts: np.ndarray, shifts: np.ndarray
 ) -> Outlines:
     """The outlines of several views as those of their picture: breaks and segments, view after view.
 
@@ -135,9 +113,8 @@ def outlines_side_by_side(
         picture: the layout of the views.
         starts: (B, P) the first row of each part in a view.
         shifts: (B, P) by how much the rows of these parts move in the picture.
-        scales: (B,) the factors on depths.
     """
-    xp, first, known = namespace(scales, views[0].place), views[0], {}
+    xp, first, known = namespace(views[0].place), views[0], {}
     for name in (field.name for field in fields(Outlines) if getattr(first, field.name) is not None):
         of_views = [getattr(view, name) for view in views]
         known[name] = picture.laid_out(xp.stack(of_views), False) if name == "joined" else xp.concat(of_views)
@@ -153,7 +130,6 @@ def outlines_side_by_side(
     def of_breaks(ties: Array) -> Array:
         return renumbered(ties, 0 * before[of_segment], before[of_segment])
 
-    factors = xp.take(xp.astype(scales, whole.slope.dtype), constant(of_break.astype(np.int32), whole.gap), axis=0)
     return replace(
         whole,
         gap=whole.gap + constant(corners[of_break], whole.gap),
@@ -162,7 +138,6 @@ def outlines_side_by_side(
         inner=of_samples(whole.inner),
         pair=of_samples(whole.pair),
         stack=None if whole.stack is None else of_samples(whole.stack),
-        slope=whole.slope * factors[:, None, None],
         ties=of_breaks(whole.ties),
         beyond=of_breaks(whole.beyond),
     )

@@ -12,16 +12,14 @@ from rts import registry
 from rts.arrays.trees import leaves
 from rts.contracts.checks import check_sampler
 from rts.contracts.gbuffer import GBuffer
-from rts.contracts.records import Decision, Question, Request, Sampled
+from rts.contracts.records import Request, Sampled
 from rts.contracts.surface import Surface, TriangleSurface
-from rts.errors import InputError
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
-from rts.testing.between_claims import claim_fine_meshes_are_not_told, claim_wires_are_told
 from rts.testing.claims import claim, claim_close, no_error, refusal
 from rts.testing.compatibility import APRON
 from rts.testing.conformance import Conformance
@@ -46,19 +44,6 @@ class Elsewhere(Surface):
     def evaluate(self, theta: Any, samples: Any) -> GBuffer:
         """The origin, for any sample."""
         return GBuffer(position=theta["center"] + 0 * samples.params[:, :1])
-
-
-class Fronts:
-    """A rule for hidden samples that keeps the fronts alone."""
-
-    settles, size = False, 0.0
-
-    def decide(self, question: Question) -> Decision:
-        """See `rts.contracts.records.Hidden`."""
-        covered, depth = question.covered, question.depth
-        claim(covered.dtype == bool and covered.shape == depth.shape, "decide is not asked with (K, H, W) arrays")
-        kept = covered & (np.arange(len(covered)) == 0)[:, None, None]
-        return Decision(kept, None, kept)
 
 
 class SamplerConformance(Conformance):
@@ -194,43 +179,6 @@ class SamplerConformance(Conformance):
         claim((row >= 0).sum() == capacity, f"{(row >= 0).sum()} cells have samples; the capacity is {capacity}")
         claim((row[0] >= 0).sum() == front, "samples of the front layer were dropped before those behind")
 
-    def test_hidden_samples_are_left_out_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
-        """A sampler that follows `Request.hidden` returns fronts alone if the rule keeps only these."""
-        chosen, part = check_sampler(sampler), scenes.checked(parts[0])
-        whole = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, Request())
-        fronts = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, Request(hidden=Fronts()))
-        if "hidden" not in fronts.followed:
-            claim_close(np.asarray(fronts.row), np.asarray(whole.row), 0, "row, though `hidden` was not followed,")
-            pytest.skip("the sampler leaves hidden samples to the core")
-        claim((np.asarray(fronts.row)[1] < 0).all(), "samples that are not needed are kept")
-        kept = (np.asarray(fronts.row)[0] >= 0) == (np.asarray(whole.row)[0] >= 0)
-        claim(kept.all(), "samples that are needed are left out")
-
-    def test_listed_cells_are_those_of_the_whole_grid(self, sampler: Any, parts: list[Part]) -> None:
-        """A sampler that follows `Request.cells` returns the grid's samples in these cells, and none for −1."""
-        chosen, (height, width) = check_sampler(sampler), scenes.SIZE
-        cells = np.random.default_rng(0).permutation(height * width)[: height * width // 2 // 8 * 8].astype(np.int32)
-        cells[::7] = -1
-        for index, part in enumerate(map(scenes.checked, parts)):
-            whole, listed = (
-                chosen.sample(part, scenes.CAMERA.within(part.transform), scenes.SIZE, 3, request)
-                for request in (Request(), Request(cells=cells.reshape(-1, 8)))
-            )
-            if "cells" not in listed.followed:
-                same = listed.row.shape == whole.row.shape
-                claim(same, f"part {index}: row has shape {listed.row.shape}, though `cells` was not followed")
-                pytest.skip("the sampler samples whole grids")
-            row, depth = (np.asarray(x).reshape(len(x), -1)[:, cells] for x in (whole.row, whole.depth))
-            claim(
-                listed.row.shape == (len(row), len(cells) // 8, 8),
-                f"part {index}: row has shape {listed.row.shape}",
-            )
-            covered = (row >= 0) & (cells >= 0)
-            seen = np.asarray(listed.row).reshape(row.shape)
-            claim(((seen >= 0) == covered).all(), f"part {index}: other cells are covered than in the whole grid")
-            near = np.abs(np.asarray(listed.depth).reshape(row.shape) - depth) <= 1e-5 * np.abs(depth)
-            claim((near | ~covered).all(), f"part {index}: depths are not those of the cells in the whole grid")
-
     def test_points_are_sampled_as_centres_are(self, sampler: Any, parts: list[Part]) -> None:
         """A sampler that follows `Request.points` finds at centres what it finds there in the grid.
 
@@ -258,47 +206,30 @@ class SamplerConformance(Conformance):
                 near = np.abs(deep - depth) <= 1e-3 * np.abs(depth)
                 claim((near | ~same | ~seen).mean() >= 0.995, f"part {index}: depths are not those of centres")
 
-    def test_exits_lie_on_the_part_behind_its_front(self, sampler: Any, parts: list[Part]) -> None:
-        """Exits, if a sampler gives any, lie where rays meet their culled part, and not before its front.
+    def test_triangles_are_told_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
+        """`Cells.triangle`, if a sampler records it, names the triangles whose corners samples have as ids, or −1."""
+        chosen, part = check_sampler(sampler), scenes.checked(parts[0])
+        found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, Request(triangles=True))
+        if found.triangle is None:
+            pytest.skip("the sampler tells no triangles")
+        row, triangle = np.asarray(found.row), np.asarray(found.triangle)
+        claim(triangle.shape == row.shape, f"triangle has shape {triangle.shape}; expected {row.shape}")
+        claim(((triangle >= 0) == (row >= 0)).all(), "triangle is not −1 where there is no sample")
+        surface: Any = part.surface
+        ids = surface.proxy(surface.proxy_inputs(part.theta), scenes.CAMERA, scenes.SIZE).faces[triangle[row >= 0]]
+        same = np.array_equal(np.asarray(found.ids)[row[row >= 0]], ids)
+        claim(same or surface.refines, "samples do not lie on the triangles that are told")
 
-        They are samples that `row` does not name.
-        """
-        chosen, told = check_sampler(sampler), []
-        for index, part in enumerate(map(scenes.checked, parts)):
-            if part.cull != "back":
-                continue
-            camera = scenes.CAMERA.within(part.transform)
-            try:
-                sampled = chosen.sample(part, camera, scenes.SIZE, 1, Request(exits=True))
-            except InputError:  # This sampler cannot cull.
-                continue
-            if sampled.exit is None:
-                continue
-            claim(len(sampled.exit) == 1, f"part {index}: exit has {len(sampled.exit)} entries a cell")
-            exits, row = np.asarray(sampled.exit)[0], np.asarray(sampled.row)
-            there = exits >= 0
-            told.append(there.any())
-            claim(exits.shape == row.shape[1:], f"part {index}: exit has shape {exits.shape}")
-            claim((row[0] >= 0)[there].all(), f"part {index}: there is an exit where the part is not seen")
-            claim(not np.isin(exits[there], row).any(), f"part {index}: exits are named by row, too")
-            whole = chosen.sample(part.replace(cull="none"), camera, scenes.SIZE, 8, Request())
-            points = np.asarray(part.surface.evaluate(part.theta, sampled)["position"])[exits[there]]
-            depth = np.asarray(camera.project(points, scenes.SIZE))[:, 2]
-            layers, covered = np.asarray(whole.depth)[:, there], np.asarray(whole.row)[:, there] >= 0
-            met = ((np.abs(layers - depth) <= 1e-4 * np.abs(depth)) & covered).any(axis=0)
-            claim(met.all(), f"part {index}: {np.sum(~met)} exits lie where the rays do not meet the part")
-            behind = depth >= np.asarray(sampled.depth)[0][there] * (1 - 1e-5)
-            claim(behind.all(), f"part {index}: {np.sum(~behind)} exits lie before the front")
-        if not told:
-            pytest.skip("the sampler tells no exits")
-        claim(any(told), "no cell has an exit")
-
-    def test_what_lies_between_centres_is_told_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
-        """A sampler that records `Cells.between` finds thin wires that no cell shows, and nothing in a fine mesh."""
-        chosen = check_sampler(sampler)
-        if not is_of_triangles(parts[0]) or not claim_wires_are_told(chosen):
-            pytest.skip("the sampler does not tell what lies between centres")
-        claim_fine_meshes_are_not_told(chosen)
+    def test_one_row_stands_for_all_cells_where_it_says_so(self, sampler: Any, parts: list[Part]) -> None:
+        """With `Request.uniform` cells are covered as without, at the same depths, whatever rows they name."""
+        chosen, part = check_sampler(sampler), scenes.checked(parts[0])
+        whole, one = (
+            chosen.sample(part, scenes.CAMERA, scenes.SIZE, 1, Request(uniform=uniform)) for uniform in (False, True)
+        )
+        covered, row = np.asarray(whole.row) >= 0, np.asarray(one.row)
+        claim(((row >= 0) == covered).all(), "other cells are covered with `uniform`")
+        claim(row.max() < len(one.ids), f"row names sample {row.max()} of {len(one.ids)}")
+        claim_close(np.asarray(one.depth), np.asarray(whole.depth), 1e-6, "depths with `uniform`")
 
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
         """A surface with neither triangles nor `intersect` raises an `rts.RtsError` of one line."""

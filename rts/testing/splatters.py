@@ -11,15 +11,14 @@ import pytest
 from rts.contracts.checks import check_splatter
 from rts.contracts.records import Cells, Splats
 from rts.contracts.splatter import Splatter
-from rts.plugin_base import overrides, promised
+from rts.plugin_base import promised
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance
-from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, installed
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
-SEAM, LEFT, RIGHT = 5, (0.9, 0.3, 0.1, 1.0), (0.2, 0.4, 0.8, 1.0)
 TOLERANCE = 1e-5
 
 
@@ -38,6 +37,11 @@ class SplatterConformance(Conformance):
         raise NotImplementedError("override the fixture 'splatter' with the splatter, or its name")
 
     # ------------------------------------------------------------------------------------------- values
+
+    def test_it_reads_what_there_is(self, splatter: Any) -> None:
+        """`reads` names nothing but "outlines"."""
+        unknown = set(_instance(splatter).reads) - {"outlines"}
+        claim(not unknown, f"reads names {sorted(unknown)}; expected 'outlines', or nothing")
 
     def test_a_constant_interior_stays(self, splatter: Any) -> None:
         """An opaque colour is reproduced away from the image's border, from one layer or two."""
@@ -110,45 +114,6 @@ class SplatterConformance(Conformance):
         positions[unused], rgba[unused] = [3.5, 4.5, 1e4], 1.0
         image = _splat(splatter, Splats(positions, rgba, splats.cells))
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
-
-    def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
-        """Samples that `needed` leaves out affect neither the image nor its derivative in positions."""
-        chosen = _instance(splatter)
-        if not overrides(chosen, "needed", Splatter):
-            pytest.skip("the splatter does not say which samples it needs")
-        splats = steps()
-        covered = splats.row >= 0
-        depth = np.where(covered, splats.positions[splats.row, 2], 0)
-        kept = np.asarray(chosen.needed(covered, depth))
-        claim(kept.shape == covered.shape and kept.dtype == bool, f"needed gave {kept.shape} {kept.dtype}")
-        claim(not (kept & ~covered).any(), "needed asks for samples that are not there")
-        pruned = splats.replace(row=np.where(kept, splats.row, -1).astype(np.int32))
-        claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
-        for engine in installed()[:1]:
-            along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
-            actual, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
-            claim_close(actual, expected, 1e-4, "the derivative of needed samples")
-
-    def test_settled_cells_show_the_colors_that_they_name(self, splatter: Any) -> None:
-        """Cells for which `settled` names a sample show its colour; samples that no other cell needs may be missing."""
-        chosen = _instance(splatter)
-        if not promised(chosen, "fills_interiors"):
-            pytest.skip("the splatter does not read which cells are settled")
-        splats, settled = two_colors()
-        loose = settled < 0
-        for _ in range(chosen.reach):
-            wide = np.pad(loose, 1)
-            near = [wide[v : v + HEIGHT, u : u + WIDTH] for v in range(3) for u in range(3)]
-            loose = np.logical_or.reduce(near)
-        row = np.where(loose, splats.row, -1).astype(np.int32)
-        known = splats.replace(row=row, settled=settled)
-        claim_close(_splat(splatter, known), _splat(splatter, splats), TOLERANCE, "the image of settled cells")
-        for engine in installed()[:1]:
-            along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
-            actual, expected = (_along(engine, splatter, s, along) for s in (known, splats))
-            claim_close(actual, expected, 1e-4, "the derivative of settled cells")
-            actual, expected = (_gradients_of_colors(engine, splatter, s) for s in (known, splats))
-            claim_close(actual, expected, 1e-4, "the gradients of the colours that settled cells show")
 
     def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
         """`cropped` returns the image that all cells splat into, those of the border too, with the border cut off."""
@@ -238,39 +203,6 @@ def scattered(layers: int = LAYERS) -> Splats:
     return Splats((splats.positions + off).astype(np.float32), rgba, Cells(row))
 
 
-def steps() -> Splats:
-    """Opaque samples at centres: a sheet with its back behind it, a square before both, and a hole through all."""
-    splats = everywhere(LAYERS + 1)
-    positions, row = splats.positions.copy(), splats.row.copy()
-    positions[:, 2] += 0.05 * positions[:, 0]
-    row[2] = -1
-    behind = row[0, 2:6, 3:7].copy(), row[1, 2:6, 3:7].copy()
-    row[0, 2:6, 3:7] = _numbered(LAYERS + 1)[2, 2:6, 3:7]
-    positions[row[0, 2:6, 3:7].ravel(), 2] = 1.0
-    row[1, 2:6, 3:7], row[2, 2:6, 3:7] = behind
-    row[:, 6:, :2] = -1
-    rgba = np.random.default_rng(7).random((len(positions), 4)).astype(np.float32)
-    rgba[:, 3] = 1
-    return Splats(positions, rgba, Cells(row))
-
-
-def two_colors() -> tuple[Splats, np.ndarray]:
-    """Opaque samples at centres, of one colour on the left and of another on the right; and a table of settled cells.
-
-    Settled cells are inside of either colour. The table (H, W) holds the row of a sample of their colour, −1 elsewhere.
-    """
-    splats, settled = everywhere(1), np.full((HEIGHT, WIDTH), -1, np.int32)
-    rgba = np.where(_on_the_left(splats)[:, None], LEFT, RIGHT).astype(np.float32)
-    settled[1:-1, 1 : SEAM - 1] = splats.row[0, 0, SEAM - 1]
-    settled[1:-1, SEAM + 1 : -1] = splats.row[0, -1, SEAM]
-    return splats.replace(rgba=rgba), settled
-
-
-def _on_the_left(splats: Splats) -> np.ndarray:
-    """Mask (N,) of the samples of `two_colors` with the colour on the left."""
-    return splats.positions[:, 0] < SEAM
-
-
 def square() -> Splats:
     """A white square of one layer, from cell (2, 3) to (4, 5), each (row, column)."""
     splats = everywhere(LAYERS)
@@ -305,13 +237,3 @@ def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.
     given, d = derivatives.on(engine, (splats, [along]))
     image = _instance(splatter).cropped
     return engine.to_numpy(engine.jvp(lambda x: image(given.replace(positions=x[0])), [given.positions], d)[1])
-
-
-def _gradients_of_colors(engine: Any, splatter: Any, splats: Splats) -> np.ndarray:
-    """Gradients (2, 4) of a sum over the image in the two colours of `two_colors`."""
-    weights, left = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4)), _on_the_left(splats)
-    given, w = derivatives.on(engine, (splats, weights))
-    image, xp = _instance(splatter).cropped, engine.namespace
-    _, gradients = engine.value_and_grad(lambda x: xp.sum(image(given.replace(rgba=x[0])) * w))([given.rgba])
-    (gradient,) = derivatives.host(engine, gradients)
-    return np.stack([gradient[left].sum(axis=0), gradient[~left].sum(axis=0)])

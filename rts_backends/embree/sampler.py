@@ -66,16 +66,6 @@ class Embree(TriangleSampler):
             return scene.cast(*arguments, camera, size, layers, cull)
         return _cast(prepared, camera, size, cull, np.empty((0, 2)), (layers, *size))
 
-    def rasterize_cells(
-        self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
-    ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: a ray for each of `cells`; the fallback casts one for each pixel."""
-        if isinstance(prepared.scene, embreex_fallback.Scene) or not cells.size:
-            return super().rasterize_cells(prepared, camera, size, layers, cull, cells)
-        lines, columns = np.divmod(cells.reshape(-1), size[1])
-        points = np.where(cells.reshape(-1, 1) >= 0, np.column_stack([columns, lines]) + 0.5, np.nan)
-        return _cast(prepared, camera, size, cull, points, (layers, *cells.shape))
-
     def rasterize_points(
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
     ) -> Fragments | None:

@@ -14,7 +14,6 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.raster.cells import EVERYTHING, SIDE, Blocks
 
 SIZE = 256
 """Triangles of a cluster, and vertices of a block; the last may have fewer."""
@@ -77,37 +76,25 @@ class Clusters(NamedTuple):
         blocks = blocks[: _find_blocks(faces, np.full(-(-used // SIZE), -1), offsets, blocks)].copy()
         return cls(*map(read_only, (vertices, faces, order, boxes, cones, offsets, blocks)))
 
-    def seen(
-        self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool, asked: Blocks = EVERYTHING
-    ) -> tuple[np.ndarray, ...]:
+    def seen(self, matrix: np.ndarray, size: tuple[int, int], keep: float) -> tuple[np.ndarray, np.ndarray]:
         """Clusters and blocks of vertices that may be in view.
 
         Args:
             matrix: (4, 4) to homogeneous pixels, see `pixel_matrix`.
             size: (height, width).
             keep: sign of the determinants of requested triangles; 0 for all.
-            both: True if triangles of the opposite sign are requested, too.
-            asked: the blocks of requested cells; others are out of view.
 
         Returns:
-            Indices of clusters (N,) int32; bits `FRONTS` and `BACKS` of the triangles that they may hold (N,) uint8;
-            and indices of the blocks of vertices that these clusters use, int32.
+            Indices of clusters (N,) int32, and of the blocks of vertices that these use, int32.
         """
         height, width = size
         # Positions more than a pixel outside of the image cannot be rounded into it.
         sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
         planes, rows = np.array(sums) @ matrix, matrix[[0, 1, 3]]
         kept, sides = np.empty(self.boxes.shape[1], np.int32), np.empty(self.boxes.shape[1], np.uint8)
-        wanted = FRONTS | BACKS if both or keep == 0 else FRONTS
-        count = _find(self.boxes, self.cones, planes, rows, keep, wanted, kept, sides)
-        kept, sides = kept[:count], sides[:count]
-        if len(asked.bits):
-            there, near = np.zeros(np.add(asked.table.shape, 1), np.int32), np.empty(count, np.bool_)
-            there[1:, 1:] = (asked.table >= 0).cumsum(axis=0).cumsum(axis=1)
-            parallel(_touch, count, kept, self.boxes, rows, *size, there, near, work=60 * count)
-            kept, sides = kept[near], sides[near]
-        used = np.empty(-(-len(self.vertices) // SIZE), np.int32)
-        return kept, sides, used[: _use(kept, self.offsets, self.blocks, used)]
+        count = _find(self.boxes, self.cones, planes, rows, keep, FRONTS if keep else FRONTS | BACKS, kept, sides)
+        kept, used = kept[:count], np.empty(-(-len(self.vertices) // SIZE), np.int32)
+        return kept, used[: _use(kept, self.offsets, self.blocks, used)]
 
 
 @loop
@@ -240,7 +227,7 @@ def _same(vertices, i, j):
 
 @loop
 def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
-    """Find clusters in view that may hold wanted triangles, and the bits of each. Returns the number of clusters.
+    """Find clusters in view that may hold wanted triangles. Returns their number.
 
     Args:
         boxes: see `Clusters`.
@@ -250,7 +237,7 @@ def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
         keep: sign of the determinants of triangles of the bit FRONTS, the others have BACKS; 0 gives both bits to all.
         wanted: bits, of which a cluster needs at least one.
         kept: (C,) int32, to be filled with the indices of the clusters, from the start.
-        sides: (C,) uint8, to be filled with the bits of each of `kept`; in the rest anything.
+        sides: (C,) uint8, working memory.
     """
     # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
     q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
@@ -259,7 +246,7 @@ def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
     count = 0
     for cluster in range(len(sides)):
         some = sides[cluster]
-        kept[count], sides[count] = cluster, some
+        kept[count] = cluster
         count += (some & wanted) != 0
     return count
 
@@ -299,40 +286,6 @@ def _test(boxes, cones, planes, towards, rows, sides):
         # For the normal farthest from the cone's axis.
         sure = (abs(along) * cosine - spread) * least > noise
         sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
-
-
-@loop
-def _touch(start, stop, kept, boxes, rows, height, width, there, near):
-    """Fill `near` (N,) bool: True for clusters `kept[start:stop]` that may touch blocks of requested cells.
-
-    `there` (Y + 1, X + 1) holds counts of these blocks, cumulative along both axes. `rows` (3, 4) lead to homogeneous
-    pixels (x, y, w). A cluster whose box reaches behind the eye is always marked.
-    """
-    corner, side = np.empty(3), np.empty((3, 3))
-    for n in range(start, stop):
-        cluster, least = kept[n], abs(rows[2, 3])
-        corner[:] = rows[:, 3]
-        for c in range(3):
-            low, high = np.float64(boxes[c, cluster]), np.float64(boxes[3 + c, cluster])
-            least += abs(rows[2, c]) * max(-low, high)
-            for r in range(3):
-                corner[r] += rows[r, c] * low
-                side[r, c] = rows[r, c] * (high - low)
-        x0, x1, y0, y1, ahead = np.inf, -np.inf, np.inf, -np.inf, True
-        for k in range(8):
-            u, v, t = k & 1, k >> 1 & 1, k >> 2
-            x = corner[0] + u * side[0, 0] + v * side[0, 1] + t * side[0, 2]
-            y = corner[1] + u * side[1, 0] + v * side[1, 1] + t * side[1, 2]
-            w = corner[2] + u * side[2, 0] + v * side[2, 1] + t * side[2, 2]
-            ahead &= w > AROUND * least
-            x0, x1, y0, y1 = min(x0, x / w), max(x1, x / w), min(y0, y / w), max(y1, y / w)
-        near[n] = True
-        if ahead:
-            # One pixel more on each side, since positions are rounded. Clusters out of view are dropped before.
-            left, right = int(max(x0 - 1, 0.0)) // SIDE, int(min(x1 + 1, width - 1.0)) // SIDE + 1
-            top, bottom = int(max(y0 - 1, 0.0)) // SIDE, int(min(y1 + 1, height - 1.0)) // SIDE + 1
-            if left < right and top < bottom:
-                near[n] = there[bottom, right] - there[top, right] - there[bottom, left] + there[top, left] > 0
 
 
 @loop

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
-from rts_backends.raster import cells
-from rts_backends.raster.cells import touching
 from rts_backends.triangles import owns
 
-BAND_ROWS = cells.SIDE
+BAND_ROWS = 16
+"""Rows of pixels that a thread draws at a time."""
+
 BLOCK = 64
 
 LISTED = 8
@@ -25,13 +25,13 @@ corners; the corners' w + z of clip space; and their w − z."""
 
 
 @loop
-def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
+def draw(first, last, listed, vertices, matrix, view_depth, size, fragments):
     """Fill the fragment arrays, ids and depths (K, H · W) and barycentrics (K, H · W, 2), in bands `turns[first:last]`.
 
-    `listed` holds the fields of the sampler's `_List`, `asked` the arrays of `cells.EVERYTHING`; `size` is (H, W).
+    `listed` holds the fields of the sampler's `_List`; `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
-    layers, (height, width), (table, numbers, bits) = len(triangle_ids), size, asked
+    layers, (height, width) = len(triangle_ids), size
     nearest = np.empty((layers, BAND_ROWS * width))
     keep, turns, offsets, items, rows = listed
     given = rows, vertices, matrix, view_depth, keep
@@ -40,44 +40,9 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
         start, stop = top * width, end * width
         nearest[:], triangle_ids[:, start:stop], barycentrics[:, start:stop] = np.inf, -1, 0
         here, layered = items[offsets[band] : offsets[band + 1]], (start, nearest, triangle_ids, barycentrics)
-        _draw(here, given, top, end, width, (table, numbers, bits), layered)
+        _draw(here, given, top, end, width, layered)
         for k in range(layers):
             _depths(depths[k, start:stop], nearest[k])
-
-
-@loop
-def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
-    """`draw` for a list of M cells: fills ids, barycentrics and depths `nearest` (K, M), which `clear` has emptied.
-
-    The depths among `fragments` are left to `clear`. `asked` are the arrays of the cells' `Blocks`. If `narrows` is
-    set, triangles whose boxes hold no requested cell are skipped.
-    """
-    triangle_ids, barycentrics, _ = fragments
-    table, numbers, bits = asked
-    keep, turns, offsets, items, rows = listed
-    given, layered = (rows, vertices, matrix, view_depth, keep), (0, nearest, triangle_ids, barycentrics)
-    height, width = len(bits), table.shape[1] * BAND_ROWS
-    for band in turns[first:last]:
-        top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
-        here = items[offsets[band] : offsets[band + 1]]
-        if narrows:
-            here = here[: touching(here, rows[:, 4:].T, top, end, bits)]
-        _draw(here, given, top, end, width, (table[band : band + 1], numbers, bits), layered)
-
-
-@loop
-def clear(start, stop, nearest, fragments, drawn):
-    """Empty the layers of cells [start, stop) of arrays (K, M); or, if `drawn`, fill in the depths from `nearest`."""
-    triangle_ids, barycentrics, depths = fragments
-    infinity = nearest.dtype.type(np.inf)
-    for k in range(len(nearest)):
-        if drawn:
-            _depths(depths[k, start:stop], nearest[k, start:stop])
-            continue
-        for m in range(start, stop):
-            nearest[k, m], triangle_ids[k, m] = infinity, -1
-        for m in range(start, stop):
-            barycentrics[k, m, 0] = barycentrics[k, m, 1] = np.float32(0)
 
 
 @compiled
@@ -88,7 +53,7 @@ def _depths(depths, nearest):
 
 
 @compiled
-def _draw(items, given, top, end, width, asked, layered):
+def _draw(items, given, top, end, width, layered):
     """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
     Args:
@@ -97,8 +62,7 @@ def _draw(items, given, top, end, width, asked, layered):
             `_List.keep`.
         top: first row.
         end: end of the rows.
-        width: columns of the image, or of all its blocks.
-        asked: the arrays of `Blocks`, `table` cut to this band; or of `EVERYTHING`.
+        width: columns of the image.
         layered: the index of the band's first cell among M; `nearest`, depths (K, ·); ids (K, M); and barycentrics (K,
             M, 2). They hold the layers found so far, or empty ones.
     """
@@ -108,9 +72,9 @@ def _draw(items, given, top, end, width, asked, layered):
     most = 4 * BLOCK
     # Room for hits left from a row, four for each small triangle, and one more row.
     room = 2 * most + width
-    hits, cells, sure = np.empty((room, 2), np.int32), np.empty(room, np.uint32), np.empty(room, np.bool_)
-    met = cells, sure, np.empty(room), np.empty((2, room), np.float32)
-    drawn = top, np.uint32(0 if len(asked[0]) > 0 else width), entries, numbers, clips
+    hits = np.empty((room, 2), np.int32)
+    met = np.empty(room, np.bool_), np.empty(room), np.empty((2, room), np.float32)
+    drawn = top, np.uint32(width), entries, numbers, clips
     for start in range(0, len(items), BLOCK):
         block = items[start : start + BLOCK]
         _gather(block, rows, vertices, entries, points)
@@ -136,29 +100,9 @@ def _draw(items, given, top, end, width, asked, layered):
                     count += (ea >= 0) & (eb >= 0) & (ec >= 0)
                 place += 1
                 if count > most - 4:
-                    _insert(hits[: _asked(hits, count, top, asked, cells)], met, drawn, layered)
+                    _insert(hits[:count], met, drawn, layered)
                     count = 0
-        _insert(hits[: _asked(hits, count, top, asked, cells)], met, drawn, layered)
-
-
-@compiled
-def _asked(hits, count, top, asked, cells):
-    """Move the hits in requested cells to the front of `hits[:count]`, and fill `cells` with these cells' numbers.
-
-    Returns the number of hits left. If all cells are requested, nothing is changed. `hits` are as in `_insert`, `asked`
-    as in `_draw`.
-    """
-    table, numbers, bits = asked
-    side, top = np.uint32(BAND_ROWS), np.uint32(top)
-    if len(bits) == 0:
-        return count
-    kept = 0
-    for h in range(count):
-        place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
-        row, block = place % side, np.uint32(max(table[0, i // side], 0))
-        hits[kept, 0], hits[kept, 1], cells[kept] = place, i, numbers[block, row, i % side]
-        kept += (bits[top + row, i // side] >> (i % side)) & 1
-    return kept
+        _insert(hits[:count], met, drawn, layered)
 
 
 # numba itself must inline these helpers: only with known lengths of rows do their loops become vector code.
@@ -239,20 +183,19 @@ def _insert(hits, met, drawn, layered):
 
     Args:
         hits: (n, 2): triangle in the block · BAND_ROWS + row in band, column.
-        met: the cells of the hits, which `_asked` fills; and working memory for `_meet`.
-        drawn: the band's first row; the image's width, or 0 to go by the cells in `met`; and the block's `entries`,
-            `numbers` and `clips`, see `_set_up`.
+        met: working memory for `_meet`.
+        drawn: the band's first row; the image's width; and the block's `entries`, `numbers` and `clips`, see `_set_up`.
         layered: see `_draw`; changed in place.
     """
     top, width, entries, numbers, clips = drawn
-    cells, sure, depths, within = met
+    sure, depths, within = met
     first, nearest, triangle_ids, barycentrics = layered
     _meet(hits, np.uint32(top), numbers, clips, sure, depths, within)
     for h in range(len(hits)):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
         if sure[h] or _covers(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips):
-            place = cells[h] if width == 0 else row * width + i
+            place = row * width + i
             p, q, cell = within[0, h], within[1, h], place + np.uint32(first)
             _put(depths[h], entries[0, b], p, q, place, cell, nearest, triangle_ids, barycentrics)
 

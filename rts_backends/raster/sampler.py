@@ -15,7 +15,7 @@ branches, so that they compile to vector instructions and no jump is mispredicte
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple, Self
 
@@ -25,10 +25,8 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.raster.between import between
-from rts_backends.raster.cells import EVERYTHING, Blocks, touching
-from rts_backends.raster.clusters import BACKS, FRONTS, SIZE, Clusters
-from rts_backends.raster.drawing import BAND_ROWS, LISTED, clear, draw, draw_cells
+from rts_backends.raster.clusters import SIZE, Clusters
+from rts_backends.raster.drawing import BAND_ROWS, LISTED, draw
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
 LONG_BLOCK = SIZE
@@ -77,7 +75,7 @@ class Raster(TriangleSampler):
         A subclass that overrides a method that draws gets `prepared` itself, too.
         """
         many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
-        draws = self._draws and type(self).rasterize_exits == Raster.rasterize_exits
+        draws = self._draws
         return Clusters.of(prepared) if many and draws else prepared
 
     def rasterize(
@@ -85,50 +83,12 @@ class Raster(TriangleSampler):
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
-            return mesh.draw(mesh.select()[0], layers)
-
-    def rasterize_cells(
-        self,
-        prepared: Proxy | Clusters,
-        camera: Camera,
-        size: tuple[int, int],
-        layers: int,
-        cull: str,
-        cells: np.ndarray,
-    ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: triangles that touch none of `cells` are skipped."""
-        blocks = Blocks.of(cells, size)
-        with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
-            return mesh.draw_cells(mesh.select()[0], layers, cells, blocks)
-
-    def rasterize_exits(
-        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
-    ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """See `TriangleSampler.rasterize_exits`: one pass lists triangles of both orientations.
-
-        In a subclass that overrides `rasterize` or `rasterize_cells`, these two methods draw.
-        """
-        if not self._draws:
-            return super().rasterize_exits(prepared, camera, size, layers, beside)
-        with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
-            fronts, backs = mesh.select()
-            fragments = mesh.draw(fronts, layers)
-            cells = beside(fragments)
-            return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
-
-    def between(
-        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], cull: str, depth: np.ndarray
-    ) -> np.ndarray | None:
-        """See `TriangleSampler.between`; triangles that the near or the far plane cuts are left out."""
-        if not self._draws:  # A subclass that prepares something else.
-            return None
-        return between(prepared, camera, size, facing(camera, cull), depth)
+            return mesh.draw(mesh.select(), layers)
 
     @property
     def _draws(self) -> bool:
-        """True unless a subclass overrides `rasterize` or `rasterize_cells`, either of which may expect a `Proxy`."""
-        kind = type(self)
-        return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
+        """True unless a subclass overrides `rasterize`, which may expect a `Proxy`."""
+        return type(self).rasterize is Raster.rasterize
 
     @contextmanager
     def _seen(
@@ -137,8 +97,6 @@ class Raster(TriangleSampler):
         camera: Camera,
         size: tuple[int, int],
         keep: float,
-        both: bool = False,
-        asked: Blocks = EVERYTHING,
     ) -> Iterator[_Seen]:
         """Lend a mesh as a camera sees it, whose arrays are scratch memory kept from call to call.
 
@@ -152,8 +110,8 @@ class Raster(TriangleSampler):
         try:
             memory = scratch[1].pop()
         except IndexError:
-            memory = np.empty(key[0], np.int32), *(np.empty((key[1], LISTED), np.int32) for _ in range(2))
-        yield _Seen(prepared, camera, size, keep, both, asked, *memory)
+            memory = np.empty(key[0], np.int32), np.empty((key[1], LISTED), np.int32)
+        yield _Seen(prepared, camera, size, keep, *memory)
         scratch[1].append(memory)
 
 
@@ -183,11 +141,8 @@ class _Seen:
         camera: the camera.
         size: (height, width).
         keep: sign of the determinants of triangles to draw; 0 for both signs.
-        both: True if triangles of the opposite sign are requested, too, for a list of their own.
-        asked: the blocks of requested cells; `EVERYTHING` for all cells.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
-        behind: (T, LISTED) int32, memory for a list of triangles that face the other way.
     """
 
     def __init__(
@@ -196,59 +151,38 @@ class _Seen:
         camera: Camera,
         size: tuple[int, int],
         keep: float,
-        both: bool,
-        asked: Blocks,
         screen: np.ndarray,
         listed: np.ndarray,
-        behind: np.ndarray,
     ):
         # With unsigned indices compiled code need not check for negative ones, which count from the end.
         self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
         self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
-        self.screen, self.listed, self.behind, self.both = screen, listed, behind if both else behind[:0], both
-        self.asked, self.step = asked, (max(size) / 2 + 2) / float(LIMIT)
+        self.screen, self.listed, self.step = screen, listed, (max(size) / 2 + 2) / float(LIMIT)
         if isinstance(mesh, Clusters):
             self.order = mesh.order
-            self.blocks, self.sides, used = mesh.seen(self.matrix, size, keep, both, asked)
+            self.blocks, used = mesh.seen(self.matrix, size, keep)
         else:
             self.order = ALL_IN_ORDER
             self.blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (self.faces, self.vertices))
-            self.sides = np.full(len(self.blocks), FRONTS | BACKS, np.uint8)
         to_steps = np.diag([1 / self.step, 1 / self.step, 1, 1])
         to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
-    def select(self) -> list[_List]:
-        """One list of the triangles that may cover requested cells; with `both`, a second of the other orientation."""
+    def select(self) -> _List:
+        """A list of the triangles that may cover pixels' centres."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads should not write to neighbouring memory.
-        spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
-        lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
-        triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
-        given = *triangles, self.matrix, *self.size, self.step, self.keep, self.asked.bits
-        parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
-        fronts = _sorted(self.keep, self.order, *lists[0])
-        return [fronts, _sorted(-self.keep, self.order, *lists[1])] if self.both else [fronts]
+        spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, bands), np.int64)
+        triangles = self.blocks, self.faces, self.vertices, self.screen
+        given = *triangles, self.matrix, *self.size, self.step, self.keep
+        parallel(_select, chunks, *given, (self.listed, spans, counts), work=10 * SIZE * len(self.blocks))
+        return _sorted(self.keep, self.order, self.listed, spans, counts)
 
     def draw(self, listed: _List, layers: int) -> Fragments:
         """Fragments (layers, H, W) of the listed triangles in all pixels."""
         fragments = _empty((layers, *self.size))
-        given = self.vertices, self.matrix, self.depth_row, tuple(EVERYTHING), self.size
+        given = self.vertices, self.matrix, self.depth_row, self.size
         parallel(draw, len(listed.turns), listed, *given, _flat(fragments))
-        return fragments
-
-    def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
-        """Fragments (layers, L, C) of the listed triangles in `cells` alone.
-
-        `cells` (L, C) are flat indices of pixels, or −1, whose fragments are empty; `blocks` are the `Blocks` of
-        `cells`.
-        """
-        fragments = _empty((layers, *cells.shape))
-        flat, nearest = _flat(fragments), np.empty((layers, cells.size))
-        parallel(clear, cells.size, nearest, flat, False, work=nearest.size)
-        given = self.vertices, self.matrix, self.depth_row, tuple(blocks), self.asked is EVERYTHING
-        parallel(draw_cells, len(listed.turns), listed, *given, nearest, flat)
-        parallel(clear, cells.size, nearest, flat, True, work=nearest.size // 8)
         return fragments
 
 
@@ -306,52 +240,30 @@ def _project(first, last, used, vertices, m, screen):
 
 
 @loop
-def _select(
-    first,
-    last,
-    blocks,
-    sides,
-    faces,
-    vertices,
-    screen,
-    matrix,
-    height,
-    width,
-    step,
-    keep,
-    bits,
-    fronts,
-    backs,
-):
-    """List and count the triangles that may cover the centre of a requested pixel.
+def _select(first, last, blocks, faces, vertices, screen, matrix, height, width, step, keep, made):
+    """List and count the triangles that may cover the centre of a pixel, and whose determinants may have a sign.
 
-    The search goes through chunks [first, last) of `blocks`, the indices of blocks of triangles. `sides` are bits
-    FRONTS and BACKS of each block. `bits` are those of `Blocks`, or empty if all pixels are requested.
+    The search goes through chunks [first, last) of `blocks`, the indices of blocks of triangles. `keep` is the sign, 0
+    for both.
 
-    `fronts` and `backs` are lists to be filled. A list consists of a row for each triangle (T, LISTED), where the rows
-    of each chunk begin and end (chunks, 2), and the number of a chunk's triangles that touch each band (chunks, bands).
-    One call writes its chunks one after another. `fronts` lists triangles whose determinants may have the sign `keep`;
-    `backs`, if it has room, the opposite sign.
+    `made` is the list, to be filled: a row for each triangle (T, LISTED), where the rows of each chunk begin and end
+    (chunks, 2), and the number of a chunk's triangles that touch each band (chunks, bands). One call writes its chunks
+    one after another.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
-    chosen, sign = np.empty(LONG_BLOCK, np.uint32), np.float32(keep)
-    step, given = np.float32(step), (vertices, matrix, height, width, np.float32(step), bits)
-    places = np.empty(2, np.int64)
-    places[0] = places[1] = first * CHUNK
+    chosen, step = np.empty(LONG_BLOCK, np.uint32), np.float32(step)
+    given, place = (vertices, matrix, height, width, step), first * CHUNK
     for chunk in range(first, last):
-        fronts[1][chunk, 0], backs[1][chunk, 0] = places[0], places[1]
+        made[1][chunk, 0] = place
         for n in range(chunk * PER_CHUNK, min(len(blocks), (chunk + 1) * PER_CHUNK)):
-            start, some = blocks[n] * LONG_BLOCK, sides[n]
+            start = blocks[n] * LONG_BLOCK
             block = faces[start : min(len(faces), start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            for side in range(2):  # A loop, since functions inlined in it are compiled once for each place of call.
-                made = backs if side else fronts
-                if some & (BACKS if side else FRONTS) and len(made[0]) > 0:
-                    _look(len(block), xy, height, width, step, -sign if side else sign, box, clips, near)
-                    places[side] = _list(chunk, start, block, near, box, clips, chosen, given, places[side], made)
-        fronts[1][chunk, 1], backs[1][chunk, 1] = places[0], places[1]
+            _look(len(block), xy, height, width, step, np.float32(keep), box, clips, near)
+            place = _list(chunk, start, block, near, box, clips, chosen, given, place, made)
+        made[1][chunk, 1] = place
 
 
 @compiled(inline="always")
@@ -390,20 +302,14 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
     """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on; count their bands.
 
-    Left out are triangles that touch no requested cell, and clipped ones that cover no centre. Returns the next free
-    row.
+    Left out are clipped ones that cover no centre. Returns the next free row.
     """
-    vertices, matrix, height, width, step, bits = given
+    vertices, matrix, height, width, step = given
     listed, _, counts = made
     count = 0
     for b in range(len(block)):
         chosen[count] = b
         count += near[b]
-    if len(bits) > 0:
-        for b in chosen[:count]:
-            if clips[b]:  # Its box is computed below.
-                box[0, b], box[1, b], box[2, b], box[3, b] = 0, width - 1, 0, height - 1
-        count = touching(chosen[:count], box, 0, height, bits)
     for b in chosen[:count]:
         i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
         if clips[b]:

@@ -114,7 +114,10 @@ class TorchEngine(Engine):
         if torch.compiler.is_compiling():
             # torch annotates nothing of what `disable` returns.
             return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
-        return _HostCall.apply(fn, specs, *args)
+        if transformed() or foreign(*(a for a in args if isinstance(a, torch.Tensor))):
+            return _HostCall.apply(fn, specs, *args)
+        with torch.no_grad():
+            return _HostCall.forward(fn, specs, *args)
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""

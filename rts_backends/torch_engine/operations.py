@@ -6,6 +6,7 @@ derivatives of the last two, which are second derivatives of the value, are take
 
 from __future__ import annotations
 
+import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.torch_engine.functions import along, foreign, on_host
+from rts_backends.torch_engine.functions import along, foreign, on_host, transformed
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _T = TypeVar("_T", Tensor, np.ndarray)
@@ -160,8 +161,10 @@ class _Value(torch.autograd.Function):
         if foreign(*gradients):
             varied, fixed = call.split(operands)
             found = call.pulled(wanted, fixed)(*varied, gradients[0])
-        else:
+        elif torch.is_grad_enabled() or transformed():
             found = _Pull.apply(call, wanted, *operands, gradients[0])
+        else:
+            found = _Pull.forward(call, wanted, *operands, gradients[0])
         found = (x if wish else None for x, wish in zip(found, wanted, strict=True))
         return None, *found, *[None] * (len(operands) - call.count)
 
@@ -280,3 +283,8 @@ class _Push(torch.autograd.Function):
         )
         out = _Push.apply(call, present, *given[:-count], *folded)
         return out.unflatten(0, (info.batch_size, -1)), 0
+
+
+for _function in (_Value, _Pull, _Push):
+    # torch asks for it in every call.
+    _function.forward.__signature__ = inspect.signature(_function.forward)

@@ -24,12 +24,9 @@ METHODS = (
     Method("none", {"splatter": "none", "layers": 1}),
     Method("single", {"splatter": "single", "layers": 1}),
     Method("multi, K = 2", {"splatter": "multi", "layers": 2}),
-    Method("visible", {"splatter": "visible", "layers": 2}),
-    Method("visible, auto", {"splatter": "visible", "layers": "auto"}),
-    Method("visible, 2 × 2", {"splatter": "visible", "layers": 2, "supersample": 2}),
     Method("edges", {"splatter": "edges"}),
     Method("DEODR", {}, "DEODR"),
     Method("Mitsuba", {"spp": 16}, "Mitsuba"),
 )
-DEFAULT = "visible"
-"""The column of the splatter that was the default before "edges"."""
+DEFAULT = "edges"
+"""The column of the splatter that is the default."""

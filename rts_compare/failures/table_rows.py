@@ -113,7 +113,7 @@ ROWS: tuple[Row, ...] = (
         "interpenetrating surfaces",
         f"Two spheres cross; one moves. {ERROR}",
         Derivative(failure_scenes.crossing),
-        f"{NO_EDGES} Near outlines of closed surfaces `multi` takes the back for the front; `visible` does not.",
+        f"{NO_EDGES} Near outlines of closed surfaces `multi` takes the back for the front; `edges` does not.",
     ),
     Row(
         "wires of 1, 0.5, 0.25 pixels",

@@ -139,7 +139,8 @@ class FunctionOnLattice(Field):
         """
         if not self.table:
             return {}
-        room = 6 * rows if capacity is None else 2 * capacity if self.table is True else int(self.table)
+        # One sample has room at least.
+        room = 6 * rows if capacity is None else 2 * capacity if self.table is True else max(6, int(self.table))
         return {"points": ArraySpec((min(room, self._lattice.count),), np.int32, packed=capacity is None)}
 
     def tabled(self, samples: Samples) -> Samples:

@@ -232,10 +232,6 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         parallel(lattice_samples_loops.hand_on, len(ids), faces, triangles.ends, cells, caps, ids, work=10 * len(ids))
         return Proxy(triangles.vertices, faces, ids)
 
-    def pieces(self, proxy: Proxy) -> np.ndarray:
-        """One piece: marching cubes wind all triangles by which side is inside."""
-        return np.ones(1, np.int16)
-
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
         """Samples with their parameters, see `lattice_samples_loops.fill`, and with lattice points as ids."""
         from rts_surfaces.implicit import lattice_samples_loops

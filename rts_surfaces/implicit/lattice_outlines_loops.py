@@ -15,6 +15,10 @@ BENT = 0.75
 NARROW = 0.5
 """Least distance of two rays, as a share of a cell: nearer ones tell no more than one."""
 
+OUTSIDE = 0.1
+"""Largest share of the rise across an outline that the inner ray's level may lie above zero: the outline of triangles is
+not quite that of interpolated levels."""
+
 DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 4
 """Steps along a ray towards a least level; the first, as a share of a cell; their growth; halvings of its bracket."""
 
@@ -156,7 +160,7 @@ def _crossing(field, z, place, rays, slope, at, near, work, points, params):
     step_along(rays[2], unit, t, least)
     inner, outer = level_at(*field, place, near, unit)[0], level_at(*field, least, near, unit)[0]
     rise = outer - inner
-    if not (inner <= 0 < outer < np.inf):
+    if not (inner <= OUTSIDE * rise and 0 < outer < np.inf):
         return 0
     along = 0.0
     for i in range(3):

@@ -97,10 +97,6 @@ class Projected(TriangleSurface):
         ids = np.concatenate([inner.ids, depths.view(np.int32)], axis=1)
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
 
-    def pieces(self, proxy: Proxy) -> np.ndarray:
-        """(1,), one piece for all triangles: an isosurface winds them alike, by the side that is inside."""
-        return np.ones(1, np.int16)
-
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
         """Samples refined by the surface in NDC, with its ids and its params.
 

@@ -41,7 +41,7 @@ def pose_of(target: np.ndarray, part: rts.Part, start: np.ndarray) -> tuple[np.n
         return part.replace(transform=rts.rigid(pose))
 
     camera = rts.Camera.perspective(40)
-    residuals = rts.ImageResiduals(posed, camera, SIZE, target, splatter="visible", background=None)
+    residuals = rts.ImageResiduals(posed, camera, SIZE, target, background=None)
     fit = rts.fit(residuals, start, method="lm", schedule=rts.pyramid(SIZE))
     return fit.parameters, fit.loss
 

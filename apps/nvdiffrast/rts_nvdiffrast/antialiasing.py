@@ -1,13 +1,13 @@
-"""`antialias`: outlines as means of samples, with the derivative of their splats.
+"""`antialias`: outlines as area averages, which move with their surface.
 
 nvdiffrast blends pairs of pixels across edges that it finds by triangles' corners, and differentiates the weights. Here
-the geometry is drawn again, with s² samples in pixels at outlines. A sample has the colour of one of the 3 × 3 shaded
-pixels around it. Its *value* is used as it is: a pixel is the mean of its samples, so that nothing is blurred. The
-*derivative* in positions is that of the same samples splatted.
+the geometry is drawn again, and the splatter `edges` finds its outlines. A pixel at an outline is the area average of
+the colours beside it. Each sample has the colour of one of the 3 × 3 shaded pixels around it.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,10 @@ from rts_nvdiffrast.triangles import Image, Topology, images
 
 NEAR = 1e-6
 """Difference of z/w that counts as much as a distance of one pixel, so that rounding does not choose among pixels."""
+PEELED = 3
+"""The fewest samples along each side of a pixel of a layer behind the front."""
+CALIBRATION = (1 + 2 * math.exp(-2)) / (8 * math.exp(-2))
+"""The factor with which splats of 0.5 cells that move a ramp of colour have its true derivative."""
 AROUND = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
 """Steps (x, y) to the pixels that may colour a sample, the sample's own first."""
 
@@ -86,17 +90,12 @@ def antialias(
         drawn = drawn._replace(ranges=None)
     elif drawn.ranges is None:
         drawn = drawn._replace(ranges=np.tile([[0, len(tri)]], (len(rast), 1)))
-    values, motions = [], []
-    for b, image in enumerate(images(pos, topology_hash, drawn.ranges)):
-        value, motion = _image(color[b], rast[b].detach(), image, drawn)
-        values.append(value)
-        motions.append(motion)
-    value = torch.stack(values)
-    if not pos.requires_grad:
-        return value
-    if rast.requires_grad and value.requires_grad:
+    moving = pos.detach() + pos_gradient_boost * (pos - pos.detach())
+    every = images(moving, topology_hash, drawn.ranges)
+    value = torch.stack([_image(color[b], rast[b].detach(), image, drawn) for b, image in enumerate(every)])
+    if pos.requires_grad and rast.requires_grad:
         value = _WithoutMotion.apply(value, rast)
-    return _WithMotion.apply(value, torch.stack(motions), pos_gradient_boost)
+    return value
 
 
 def _shown_ranges(rast: torch.Tensor) -> np.ndarray:
@@ -134,20 +133,6 @@ class _WithoutMotion(torch.autograd.Function):
         with torch.enable_grad():
             (share,) = torch.autograd.grad(value, rast, g, retain_graph=True, allow_unused=True)
         return g, None if share is None else -share
-
-
-class _WithMotion(torch.autograd.Function):
-    """An image itself, whose gradient also goes to another image, times a factor."""
-
-    @staticmethod
-    def forward(ctx: Any, value: torch.Tensor, motion: torch.Tensor, factor: float) -> torch.Tensor:
-        ctx.factor = factor
-        return value.view_as(value)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
-        (g,) = grad_outputs
-        return g, ctx.factor * g, None
 
 
 class _Shaded(NamedTuple):
@@ -209,33 +194,38 @@ class _Colors(rts.Shader):
         return torch.cat([rgb, torch.ones_like(rgb[:, :1])], dim=1)
 
 
-def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, drawn: Drawn) -> tuple[torch.Tensor, torch.Tensor]:
-    """An image (H, W, C) with antialiased outlines twice: with a derivative in colours, and with one in positions."""
+def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, drawn: Drawn) -> torch.Tensor:
+    """An image (H, W, C) with antialiased outlines, differentiable in colours and in positions."""
     shaded = _Shaded(rast[..., 3].long() - 1, rast[..., 2], image)
     vertices, camera = image.seen.vertices, image.seen.camera
     if not image.surface.face_count:
-        return color, color.detach() + 0 * vertices.sum()
+        return color + 0 * vertices.sum()
     background = _background(color, shaded.triangle < 0)
-    part = rts.Part(image.surface, {"vertices": vertices.detach()}, _Colors(shaded, color))
-    sampled = _sampled(part, camera, color.shape[:2], drawn)
+    part = rts.Part(image.surface, {"vertices": vertices}, _Colors(shaded, color))
+    if drawn.layer:
+        still = part.replace(shader=_Colors(shaded, color.detach()))
+        return _peeled(part, still, camera, background, drawn)
+    size, samples = (color.shape[0], color.shape[1]), drawn.samples
+    sampled = rts.sample(part, camera, size, sampler="raster", splatter="edges", supersample=samples)
+    return _over(rts.render_samples(sampled, part, camera, splatter="edges"), background)
+
+
+def _peeled(
+    part: rts.Part, still: rts.Part, camera: rts.Camera, background: torch.Tensor, drawn: Drawn
+) -> torch.Tensor:
+    """The image (H, W, C) of a layer behind the front, whose outlines are not found: means of samples, and splats.
+
+    The value, and the derivative in colours, are means of samples in each pixel. The derivative in positions is that of
+    the same samples splatted, with the colours of `still`, which are constants.
+    """
+    more, first = max(PEELED, drawn.samples), drawn.layer
+    options = {"sampler": "raster", "splatter": None, "supersample": more, "layers": first + 2}
+    sampled = rts.sample(part, camera, (background.shape[0], background.shape[1]), **options)
+    layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n, None)) is not None}
+    sampled = sampled.replace(**layers)
     value = _over(rts.render_samples(sampled, part, camera, splatter="none"), background)
-    if not vertices.requires_grad:
-        return value, value
-    part = part.replace(theta={"vertices": vertices}, shader=_Colors(shaded, color.detach()))
-    return value, _over(rts.render_samples(sampled, part, camera, splatter="visible"), background.detach())
-
-
-def _sampled(part: rts.Part, camera: rts.Camera, size: Any, drawn: Drawn) -> Any:
-    """Samples of a layer of surfaces and of the one behind it."""
-    if drawn.layer == 0:
-        more = rts.Adaptive(drawn.samples)
-        return rts.sample(part, camera, size, sampler="raster", splatter="visible", supersample=more)
-    # Outlines of the first layer tell nothing of deeper ones, so all pixels have s² samples.
-    first = drawn.layer
-    options = {"sampler": "raster", "splatter": None, "supersample": drawn.samples}
-    sampled = rts.sample(part, camera, size, layers=first + 2, **options)
-    layers = {n: x[first:] for n in ("row", "depth", "facing") if (x := getattr(sampled, n)) is not None}
-    return sampled.replace(**layers)
+    motion = _over(rts.render_samples(sampled, still, camera, splatter="multi"), background.detach())
+    return value + CALIBRATION * (motion - motion.detach()).nan_to_num()  # Infinite colours do not move.
 
 
 def _over(image: torch.Tensor, background: torch.Tensor) -> torch.Tensor:

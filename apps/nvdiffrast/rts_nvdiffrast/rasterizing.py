@@ -15,8 +15,8 @@ from rts_nvdiffrast.checks import check_corners, check_devices, check_finite, ch
 from rts_nvdiffrast.interpolation import scattered
 from rts_nvdiffrast.triangles import Image, Topology, images
 
-SAMPLES = 3
-"""Samples along each side of a pixel at outlines, unless a context says otherwise."""
+SAMPLES = 1
+"""Samples along each side of a pixel, unless a context says otherwise."""
 
 DRAWN = "rts_drawn"
 """The attribute of `rast` that has its `Drawn`."""
@@ -28,7 +28,7 @@ class Drawn(NamedTuple):
     """Facts about a call of `rasterize` that `antialias` is not told by its arguments.
 
     Attributes:
-        samples: number of samples along each side of a pixel at outlines.
+        samples: number of samples along each side of a pixel.
         ranges: (B, 2) ranges of triangles; None in instanced mode.
         layer: the layer of surfaces, 0 for the front.
     """
@@ -43,16 +43,16 @@ class RasterizeCudaContext:
 
     Args:
         device: accepted and ignored: tensors stay on the device that they are on.
-        samples: number of samples along each side of a pixel that `antialias` takes at outlines, from 2 to 16. More
-            give better derivatives of small images, and take longer.
+        samples: number of samples along each side of a pixel that `antialias` takes, from 1 to 16. More find what is
+            thinner than a pixel, and take longer.
 
     Raises:
         InputError: another number of samples.
     """
 
     def __init__(self, device: Any = None, *, samples: int = SAMPLES):
-        if not isinstance(samples, int) or not 2 <= samples <= 16:
-            raise InputError(f"samples is {samples!r}; expected an integer from 2 to 16")
+        if not isinstance(samples, int) or not 1 <= samples <= 16:
+            raise InputError(f"samples is {samples!r}; expected an integer from 1 to 16")
         self.samples = samples
 
     def set_context(self) -> None:

@@ -33,19 +33,18 @@ def test_inside_and_outside_nothing_changes():
     away = ((count > 0.999) | (count < 0.001)) & torch.ones_like(covered)
     away[:, :2] = away[:, -2:] = away[:, :, :2] = away[:, :, -2:] = False
     assert 500 < away.sum() < 2000
-    torch.testing.assert_close(image[away], color[away], atol=1e-6, rtol=0)
+    torch.testing.assert_close(image[away], color[away], atol=1e-5, rtol=0)
     assert (image != color).any()
 
 
-@pytest.mark.parametrize("samples", [2, 3, 4, 5])
-def test_a_pixel_at_an_outline_is_the_mean_of_its_samples(samples):
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_a_pixel_at_an_outline_is_the_area_inside(samples):
     shift = 0.013
-    pos = flat(SQUARE + torch.tensor([shift, 0, 0]))
+    pos = flat(SQUARE + torch.tensor([shift, 0.021, 0]))
     image = mask(pos, TWO, (16, 16), dr.RasterizeCudaContext(samples=samples))
-    x = (torch.arange(16 * samples) + 0.5) * 2 / (16 * samples) - 1
-    inside = ((x > -0.5 + shift) & (x < 0.5 + shift)).float().reshape(16, samples).mean(dim=1)
-    up = ((x > -0.5) & (x < 0.5)).float().reshape(16, samples).mean(dim=1)
-    torch.testing.assert_close(image[0, ..., 0], up[:, None] * inside, atol=1e-6, rtol=0)
+    first = torch.arange(16) / 8 - 1  # The lower side of each pixel.
+    along, up = ((0.5 + by - first).clamp(0, 1 / 8) - (-0.5 + by - first).clamp(0, 1 / 8) for by in (shift, 0.021))
+    torch.testing.assert_close(image[0, ..., 0], 64 * up[:, None] * along, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("matrix", ["perspective", "orthographic"])

@@ -12,7 +12,6 @@ from rts.diagnostics.explanation.baseline import nearest
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
-from rts.diagnostics.explanation.thin_features import on_host
 from rts.diagnostics.explanation.vanishing import why_constant
 from rts.diagnostics.smoothing import low_pass
 
@@ -29,8 +28,6 @@ STRONG = 0.1
 """The share of the largest error of a pixel from which a pixel counts as disagreeing."""
 ALIKE = 0.5
 """The least error of the baseline that tells a bias of the library, as a share of the scene's error."""
-SHORTER, DENSE = 0.25, 8
-"""For differences of fine colours: the step as a share of the usual one, and samples a pixel along each axis."""
 AGAIN = 4
 """Samples a pixel, along each axis, that experiments take instead of one."""
 
@@ -214,65 +211,16 @@ def _bounded(case: _Case, touched: Touched) -> None:
     )
 
 
-def _crossing(case: _Case, touched: Touched) -> None:
-    """Add a finding on lines where parts pass through one another, if much of the error is beside these lines."""
-    subject = case.subject
-    if len(subject.parts) < 2:
-        return
-    sampled = subject.sampled(layers=2)
-    apron, part = sampled.apron, on_host(sampled.part)
-    front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
-    mask = np.zeros(front.shape, bool)
-    for axis in (0, 1):
-        a, b = (tuple(slice(s, n) if i == axis else slice(None) for i in (0, 1)) for s, n in ((0, -1), (1, None)))
-        swaps = (front[a] != front[b]) & (front[a] == second[b]) & (second[a] == front[b]) & (second[a] >= 0)
-        mask[a] |= swaps
-        mask[b] |= swaps
-    _by_pixels(
-        case,
-        mask[apron:-apron, apron:-apron],
-        "crossing",
-        "parts pass through one another there, and their line of crossing moves otherwise than either",
-        'Take the splatter "edges", whose lines of crossing move, or more samples; or part them.',
-    )
-
-
-def _colors(case: _Case, touched: Touched) -> None:
-    """Add a finding on colours finer than pixels, if the error lies inside of surfaces, and more samples halve it."""
-    subject, number = case.subject, case.number
-    taken = subject.supersample
-    inside = ~subject.fineness.outlines
-    if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
-        return
-    step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
-    after, before = (subject.engine.to_numpy(subject.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
-    true, finer = (after.astype(np.float64) - before) / SHORTER, case.push(supersample=_more(taken))
-    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, finer))
-    if left > HALVED * was:
-        return
-    because = f"colours change within a sample there ({_each(taken)}), inside of surfaces"
-    times = was / max(left, 1e-30)
-    advice = f"Blur them to the size of a pixel, or take more samples: with supersample={_more(taken)} "
-    _by_pixels(case, inside, "colors", because, f"{advice}it is {times:.2g} times better.", widen=0)
-
-
 def _samples(case: _Case, touched: Touched) -> None:
-    """Add findings on too few samples, for thin shapes or for outlines, if more make the error much smaller."""
+    """Add a finding on too few samples, if more make the error much smaller."""
     taken = case.subject.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
         return
-    gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
-    thin, strong = case.subject.fineness.thin, case.strong(before)
-    better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
-    held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
-    if held >= LARGE_SHARE:
-        because = f"the scene is thinner than a sample there ({_each(taken)})"
-        case.findings.append(Finding("thin", because, f"Take more samples: {better}", strong & thin, share * held))
-    if 1 - held >= LARGE_SHARE:
-        because = f"{_each(taken)} is too little for these outlines"
-        advice = better[0].upper() + better[1:]
-        case.findings.append(Finding("samples", because, advice, strong & ~thin, share * (1 - held)))
+    times = before.norm / max(case.error.norm, 1e-30)
+    because = f"{_each(taken)} is too little for these outlines and colours"
+    advice = f"With supersample={_more(taken)} it is {times:.2g} times better."
+    case.findings.append(Finding("samples", because, advice, case.strong(before), case.gained(before)))
 
 
 def _more(taken: int) -> int:
@@ -347,9 +295,7 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _transparent,
     _outlines,
     _layers,
-    _crossing,
     _bounded,
-    _colors,
     _samples,
     _bias,
 )

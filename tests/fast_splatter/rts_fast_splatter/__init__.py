@@ -13,26 +13,25 @@ WORK = 8
 """Nanoseconds that a cell takes, roughly."""
 
 
-def _array_code(positions, rgba, row, settled, *, numbers, border):
-    cells = Cells(row, settled=settled if settled.shape[0] else None)
-    return specification.Single(*numbers).cropped(Splats(positions, rgba, cells, border=border))
+def _array_code(positions, rgba, row, *, numbers, border):
+    return specification.Single(*numbers).cropped(Splats(positions, rgba, Cells(row), border=border))
 
 
-def _shape(positions, rgba, row, settled, *, numbers, border):
+def _shape(positions, rgba, row, *, numbers, border):
     return *(max(0, n - 2 * border) for n in row[1:]), 4
 
 
 def _arguments(operands, numbers, border, checked=None):
     """Arguments of every loop after its range; rows that refer to no sample are refused."""
-    positions, rgba, row, settled = operands
+    positions, rgba, row = operands
     row = row[:1]
     if not checked:
-        specification.Single.check(row, len(rgba), settled if len(settled) else None)
+        specification.check_rows(row, len(rgba))
     sigma, epsilon, gamma = numbers
     scale = 1 / (2 * sigma**2)
     peak = math.sqrt(1 + epsilon) / (1 + 2 * math.exp(-scale))
     reals = map(positions.dtype.type, (scale, peak, gamma))
-    return positions, rgba, read_only(row[0], np.int32), read_only(settled, np.int32), *reals, border
+    return positions, rgba, read_only(row[0], np.int32), *reals, border
 
 
 def _forward(operands, out, *, numbers, border):
@@ -55,28 +54,26 @@ def _splat(given, along, out):
 
 
 def _pull(operands, g, results, *, numbers, border, kept):
-    from .bands import collect, pull, repeats
+    from .bands import pull, repeats
 
     given = _arguments(operands, numbers, border, kept)
-    (rgba, row, settled), g = given[1:4], read_only(g)
+    (rgba, row), g = given[1:3], read_only(g)
     none = (np.empty((0, n), g.dtype) for n in (3, 4))
     gradients = [n if x is None else x for n, x in zip(none, results, strict=True)]
     if repeats(row, np.zeros(len(rgba), np.bool_)):  # Threads would add to one sample at once.
         pull(0, len(row), *given, g, *gradients)
     else:
         parallel(pull, len(row), *given, g, *gradients, work=WORK * row.size)
-    if len(settled) and results[1] is not None:
-        collect(settled, border, g, gradients[1])
 
 
 def _used(operands):
-    return 1 + max(int(x.max(initial=0)) for x in operands[2:])
+    return 1 + int(operands[2].max(initial=0))
 
 
 IMAGE = Operation(
     "rts_fast_splatter.image",
     _array_code,
-    ranks=(2, 2, 3, 2),
+    ranks=(2, 2, 3),
     shape=_shape,
     forward=_forward,
     push=_push,
@@ -101,14 +98,8 @@ class FastSingle(specification.Single):
         """See `rts.Splatter`."""
         return _image(self, splats) if splats.rgba.shape[0] else super().cropped(splats)
 
-    @property
-    def fills_interiors(self):
-        """See `rts.Splatter`; promised of this image, too."""
-        return super().fills_interiors
-
 
 def _image(splatter, splats):
     """The image without the border."""
-    settled = splats.row[0, :0, :] if splats.settled is None else splats.settled
     numbers = splatter.sigma, splatter.epsilon, splatter.gamma
-    return IMAGE(splats.positions, splats.rgba, splats.row, settled, numbers=numbers, border=splats.border)
+    return IMAGE(splats.positions, splats.rgba, splats.row, numbers=numbers, border=splats.border)

@@ -36,7 +36,7 @@ def tile(width, t):
 
 
 @loop
-def splat(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, t_positions, t_rgba, out):
+def splat(start, stop, positions, rgba, row, scale, peak, gamma, border, t_positions, t_rgba, out):
     """Fill rows of out (T, H, W, 4), the cells without `border`: tangents, or with none (0, ·) the image (1, H, W, 4).
 
     Tangents of zeros may be absent: (T, 0, ·).
@@ -70,22 +70,10 @@ def splat(start, stop, positions, rgba, row, settled, scale, peak, gamma, border
                 for j in range(count):
                     for c in range(4):
                         out[n, y - 1 - border, left + j, c] = planes[c * PITCH + j] if some else kind(0)
-                if len(settled) > 0:
-                    own = out[n, y - 1 - border, left : left + count]
-                    paint(own, t_rgba[n] if many > 0 else rgba, settled[y - 1, left + border :])
-
-
-@compiled
-def paint(image, rgba, settled):
-    """Give settled targets of a row the colours of samples, zeros if there are none."""
-    for j in range(len(image)):
-        if settled[j] >= 0:
-            for c in range(4):
-                image[j, c] = rgba[settled[j], c] if len(rgba) > 0 else image.dtype.type(0)
 
 
 @loop
-def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, g, g_positions, g_rgba):
+def pull(start, stop, positions, rgba, row, scale, peak, gamma, border, g, g_positions, g_rgba):
     """Add to the gradients of the samples of rows of cells; each collects from its nine targets."""
     width, zero = row.shape[1], g.dtype.type(0)
     sources, total, filled = np.empty(3 * SOURCE, g.dtype), np.empty(SUM, g.dtype), np.empty(3, np.bool_)
@@ -103,7 +91,7 @@ def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
             if not (filled[0] | filled[1] | filled[2]):
                 continue
             adjoint = slot(adjoints, y, SUM)
-            if load_gradient(given, g, settled, border, y, left - 1, count + 2):
+            if load_gradient(given, g, border, y, left - 1, count + 2):
                 active[(y + 3) % 3] = True
                 normalised(total, sources, filled, y, count + 2)
                 to_sums(adjoint, total, given, count + 2)
@@ -116,8 +104,8 @@ def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
 
 
 @compiled
-def load_gradient(to, g, settled, border, y, first, count):
-    """Fill planes with the gradient of a row, zero beyond the image and where settled; returns whether any is not."""
+def load_gradient(to, g, border, y, first, count):
+    """Fill planes with the gradient of a row, zero beyond the image; returns whether any is not."""
     some, zero, left = False, to.dtype.type(0), max(first - border, 0)
     to[:ONE] = zero
     if not 0 <= y - border < g.shape[0]:
@@ -127,12 +115,6 @@ def load_gradient(to, g, settled, border, y, first, count):
     for j in range(len(inner)):
         for c in range(4):
             planes[c * PITCH + j] = inner[j, c]
-    if len(settled) > 0:
-        amid = settled[y, left + border : left + border + len(inner)]
-        for j in range(len(inner)):
-            if amid[j] >= 0:
-                for c in range(4):
-                    planes[c * PITCH + j] = zero
     for p in range(ONE):
         some |= to[p] != zero
     return some
@@ -176,14 +158,3 @@ def repeats(row, seen):
                     return True
                 seen[i] = True
     return False
-
-
-@loop
-def collect(settled, border, g, g_rgba):
-    """Add the gradient of settled targets to those of the samples that they show."""
-    for y in range(g.shape[0]):
-        for x in range(g.shape[1]):
-            i = settled[y + border, x + border]
-            if i >= 0:
-                for c in range(4):
-                    g_rgba[i, c] += g[y, x, c]
