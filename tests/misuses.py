@@ -172,10 +172,6 @@ def open_in(function, *names, **fixed):
 
 
 GROUPS = {
-    "Adaptive": open_in(
-        lambda **o: rts.render(PART, CAMERA, SIZE, supersample=rts.Adaptive(**{"samples": 2, **o})),
-        *("samples", "dilated", "contrast"),
-    ),
     "BSpline": open_in(rts.BSpline, "tolerance", shape=(4, 4)),
     "Camera": {"aspect": lambda v: rts.render(PART, Camera(CAMERA.view, CAMERA.projection, v), SIZE)},
     "Fragments": open_in(lambda **o: drawn(Card(), sampler=Raster(**o)), "triangle_ids", "barycentrics", "depth"),
@@ -275,7 +271,7 @@ GROUPS = {
     ),
     "sample": open_in(
         lambda **o: rts.sample(**{"parts": PART, "camera": CAMERA, "size": SIZE, "splatter": None, **o}),
-        *("camera", "sampler", "supersample", "capacity", "engine", "settles"),
+        *("camera", "sampler", "supersample", "capacity", "engine"),
     ),
     "tune": open_in(
         tuned,

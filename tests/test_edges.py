@@ -8,7 +8,6 @@ import trimesh
 from polygons import covered
 
 import rts
-from rts import InputError
 from rts.contracts.records import Outlines
 
 torch = pytest.importorskip("torch")

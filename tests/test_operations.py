@@ -15,7 +15,6 @@ from rts.operations.take import TAKE, take
 from rts.plugin_api.operations import Operation
 from rts.scene.rigid import RIGID
 from rts.testing import OperationConformance
-from rts.testing.splatters import scattered
 
 pytestmark = pytest.mark.engines
 

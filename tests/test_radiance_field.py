@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, gradient, icosphere, mesh_part, relative_error, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, gradient, icosphere, mesh_part, relative_error, to_numpy
 
 import rts
 from rts import Camera, InputError, Ndc
