@@ -18,7 +18,7 @@ CAMERA = Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
 PART = rts.Mesh.example()
 FACES, VERTICES = np.array([(0, 1, 2), (0, 2, 3)], np.int32), np.eye(4, 3, dtype=np.float32)
 POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
-SAMPLED = rts.sample(PART, CAMERA, SIZE, splatter=None)
+SAMPLED = rts.sample(PART, CAMERA, SIZE)
 SAMPLES = SAMPLED.samples[0]
 NDC = rts.Ndc((1.0, 1.0))
 STEPS = rts.LargeSteps(FACES, 4)

@@ -24,7 +24,7 @@ PART = Mesh.example()
 Bezier = rts.plugin("surfaces", "bezier")
 Sdf = rts.plugin("surfaces", "sdf")
 PATCH, VASE, PAWN = (rts.plugin("surfaces", name).example() for name in ("bezier", "bspline", "revolution"))
-SAMPLED = rts.sample(PART, CAMERA, SIZE, splatter=None)
+SAMPLED = rts.sample(PART, CAMERA, SIZE)
 K = np.array([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]])
 
 
