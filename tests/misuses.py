@@ -19,6 +19,7 @@ PART = rts.Mesh.example()
 FACES, VERTICES = np.array([(0, 1, 2), (0, 2, 3)], np.int32), np.eye(4, 3, dtype=np.float32)
 POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
+BARE = rts.sample(PART, CAMERA, SIZE, splatter="none")
 SAMPLES = SAMPLED.samples[0]
 NDC = rts.Ndc((1.0, 1.0))
 STEPS = rts.LargeSteps(FACES, 4)
@@ -200,7 +201,9 @@ GROUPS = {
     "RayHits": open_in(lambda **o: drawn(Ball(**o), {}), "hit", "distance", "params", "ids"),
     "Revolution": open_in(rts.Revolution, "ends", "tolerance", heights=np.arange(5.0)),
     "Samples": open_in(
-        lambda **o: rts.render_samples(replace(SAMPLED, samples=[SAMPLES.replace(**o)]), PART, CAMERA),
+        lambda **o: rts.render_samples(
+            replace(BARE, samples=[BARE.samples[0].replace(**o)]), PART, CAMERA, splatter="none"
+        ),
         *("ids", "params", "row", "depth"),
     ),
     "Sdf": open_in(lambda **o: rts.Sdf(lambda t, p: p[:, 0], **o), "isovalue", "inside", "reads", "attributes"),
