@@ -20,7 +20,6 @@ FACES, VERTICES = np.array([(0, 1, 2), (0, 2, 3)], np.int32), np.eye(4, 3, dtype
 POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 BARE = rts.sample(PART, CAMERA, SIZE, splatter="none")
-SAMPLES = SAMPLED.samples[0]
 NDC = rts.Ndc((1.0, 1.0))
 STEPS = rts.LargeSteps(FACES, 4)
 DOUBLE = Operation(

@@ -16,7 +16,7 @@ from helpers import (
 )
 
 import rts
-from rts.splatting import Edges, Multi, Plain, Single, exact_calibration
+from rts.splatting import Multi, Plain, Single, exact_calibration
 
 pytestmark = pytest.mark.splatting
 
