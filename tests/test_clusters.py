@@ -18,10 +18,9 @@ pytestmark = pytest.mark.sampling
 
 pytest.importorskip("numba")
 
-from rts_backends.raster.cells import Blocks  # noqa: E402
 
 from rts_backends.raster import sampler as raster_sampler  # noqa: E402
-from rts_backends.raster.clusters import BACKS, FRONTS, Clusters  # noqa: E402
+from rts_backends.raster.clusters import Clusters  # noqa: E402
 from rts_backends.raster.sampler import Raster  # noqa: E402
 from rts_backends.triangles import facing, pixel_matrix  # noqa: E402
 
@@ -102,12 +101,10 @@ def test_a_cone_holds_the_normals_of_its_cluster():
         np.testing.assert_allclose(lengths[clusters == n].min(), made.cones[4, n], rtol=1e-12)
 
 
-def seen(made, camera, cull, both=False):
-    """Bits of the sides that each cluster of a mesh may show; 0 for a cluster that cannot be seen."""
-    size = (64, 64)
-    found, sides, _ = made.seen(pixel_matrix(camera, size), size, facing(camera, cull), both)
-    every = np.zeros(made.boxes.shape[1], np.uint8)
-    every[found] = sides
+def seen(made, camera, cull):
+    """(C,) bool, the clusters that may show triangles."""
+    size, every = (64, 64), np.zeros(made.boxes.shape[1], bool)
+    every[made.seen(pixel_matrix(camera, size), size, facing(camera, cull))[0]] = True
     return every
 
 
@@ -122,17 +119,13 @@ def test_clusters_are_refused_where_all_their_triangles_face_away(eye, flip):
     some, all_of = np.logical_or.reduceat(fronts, split), np.logical_and.reduceat(fronts, split)
     camera = Camera.look_at(eye, (0, 0, 0), fov_y=3 if eye[2] == 100 else 120, near=1e-3, far=1e3)
     camera = camera.replace(projection=np.diag([1, flip, 1, 1]) @ camera.projection)
-    beside, behind = seen(made, camera, "none") > 0, seen(made, camera, "back", both=True)
-    assert (seen(made, camera, "back") > 0)[some & beside].all()
-    assert (seen(made, camera, "front") > 0)[~all_of & beside].all()
-    np.testing.assert_array_equal(behind & FRONTS, seen(made, camera, "back") & FRONTS)
-    np.testing.assert_array_equal(behind & BACKS, (seen(made, camera, "front") & FRONTS) * BACKS)
+    beside, back, front = (seen(made, camera, cull) for cull in ("none", "back", "front"))
+    assert back[some & beside].all() and front[~all_of & beside].all()
     inside = np.linalg.norm(eye) < 1
     assert inside == (not some.any())
-    refused = (behind & FRONTS == 0) & beside
-    assert refused.sum() > 0.6 * (~some & beside).sum() > 20
+    assert (~back & beside).sum() > 0.6 * (~some & beside).sum() > 20
     if not inside:
-        assert ((behind & BACKS == 0) & beside).sum() > 0.5 * (all_of & beside).sum() > 20
+        assert (~front & beside).sum() > 0.5 * (all_of & beside).sum() > 20
 
 
 def test_clusters_out_of_view_are_refused():
@@ -140,7 +133,7 @@ def test_clusters_out_of_view_are_refused():
     made = Clusters.of(Proxy(vertices.astype(np.float32), faces.astype(np.int32)))
     (x0, y0, _), (_, y1, _) = made.boxes[:3], made.boxes[3:]
     # It sees x from −1.8 to −0.8 and y from −0.5 to 0.5; pixels are 1 / 64.
-    found = seen(made, Camera.orthographic((-1.3, 0, 9), (-1.3, 0, 0), height=1.0, near=1, far=20), "none") > 0
+    found = seen(made, Camera.orthographic((-1.3, 0, 9), (-1.3, 0, 0), height=1.0, near=1, far=20), "none")
     assert found[(x0 < -0.8) & (y0 < 0.5) & (y1 > -0.5)].all() and 5 < found.sum() < 60
     assert not found[(x0 > -0.78) | (y0 > 0.52) | (y1 < -0.52)].any()
     for camera in (Camera.look_at((0, 0, 3), (0, 0, 6)), Camera.look_at((0, 0, 3), (0, 0, 0), near=5)):
@@ -157,41 +150,13 @@ def test_fragments_of_clusters_are_those_of_the_triangles(kind):
     sampler, size = Raster(), SIZE
     proxy = Proxy(*mesh(kind))
     made, refused = Clusters.of(proxy), 0
-    rng = np.random.default_rng(1)
     for n, camera in enumerate([*CAMERAS.values(), *looks()]):
         for layers, cull in ((1 + n % 3, "none"), (1 + n % 2, "back"), (1, "front")):
             view = camera, size, layers, cull
             assert_same(sampler.rasterize(made, *view), sampler.rasterize(proxy, *view))
-            found, _, _ = made.seen(pixel_matrix(camera, size), size, facing(camera, cull), False)
+            found, _ = made.seen(pixel_matrix(camera, size), size, facing(camera, cull))
             refused += made.boxes.shape[1] - len(found)
-        cells = rng.permutation(size[0] * size[1])[:90].astype(np.int32)[None]
-        view = camera, size, 2, "back", cells
-        assert_same(sampler.rasterize_cells(made, *view), sampler.rasterize_cells(proxy, *view))
-        view = camera, size, 2, lambda _, cells=cells: cells
-        (fronts, _, backs), expected = sampler.rasterize_exits(made, *view), sampler.rasterize_exits(proxy, *view)
-        assert_same((*fronts, *backs), (*expected[0], *expected[2]))
     assert refused > 50
-
-
-def test_clusters_that_touch_no_cells_that_are_asked_for_are_refused():
-    vertices, faces = icosphere(6)
-    proxy, size, sampler = Proxy(vertices.astype(np.float32), faces.astype(np.int32)), (150, 200), Raster()
-    made, rng = Clusters.of(proxy), np.random.default_rng(3)
-    # A pixel is 1 / 50, and its middle that of the ball.
-    plain = Camera.orthographic((0, 0, 9), (0, 0, 0), height=3.0, aspect=200 / 150, near=1, far=20)
-    low, high = (100 + 50 * made.boxes[0], 75 - 50 * made.boxes[4]), (100 + 50 * made.boxes[3], 75 - 50 * made.boxes[1])
-    for n, camera in enumerate([plain] * 6 + [*CAMERAS.values(), *looks()]):
-        y, x = rng.integers(20, 120), rng.integers(50, 150)
-        cells = (np.arange(y, y + 7)[:, None] * size[1] + np.arange(x, x + 9 - n % 9)).astype(np.int32)
-        view = camera, size, 2, ("none", "back")[n % 2], cells
-        assert_same(sampler.rasterize_cells(made, *view), sampler.rasterize_cells(proxy, *view))
-        if camera is plain:
-            found, _, _ = made.seen(pixel_matrix(camera, size), size, 0.0, False, Blocks.of(cells, size))
-            left, right, top, bottom = x, x + 9 - n % 9, y, y + 7
-            touches = (low[0] < right) & (high[0] > left) & (low[1] < bottom) & (high[1] > top)
-            off = (low[0] > right + 17) | (high[0] < left - 17) | (low[1] > bottom + 17) | (high[1] < top - 17)
-            assert np.isin(np.flatnonzero(touches), found).all() and touches.any()
-            assert not np.isin(np.flatnonzero(off), found).any() and off.any()
 
 
 def test_soups_of_all_kinds_are_drawn_as_ever():
@@ -240,19 +205,18 @@ def test_samples_of_what_is_prepared_are_those_of_the_part(few, cull):
     part = Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices}, "normals", cull=cull)
     handle = rts.prepare(part, "raster")
     assert isinstance(handle.entries[0].prepared, Clusters)
-    sampler, asked = handle.samplers[0], Request(facing=True) if cull == "none" else Request(exits=True)
+    sampler, asked = handle.samplers[0], Request(triangles=True)
     for transform in moves():
         moved, posed = part.replace(transform=transform), handle.replace(transform=transform)
         found, expected = (
             sampler.sample(moved, VIEW, (40, 40), 2, replace(asked, entry=posed.entries[0])),
             sampler.sample(moved, VIEW, (40, 40), 2, asked),
         )
-        for name in ("ids", "params", "row", "depth", "overflow", "facing", "exit"):
+        for name in ("ids", "params", "row", "depth", "overflow", "triangle"):
             x, y = getattr(found, name), getattr(expected, name)
             assert (x is None) == (y is None)
             assert x is None or np.array_equal(x, y)
-        assert ((found.facing if cull == "none" else found.exit) > 0).any()
-        for samples in (1, rts.Adaptive(2)):
+        for samples in (1, 2):
             expected = rts.render(moved, VIEW, (40, 40), sampler="raster", supersample=samples)
             np.testing.assert_array_equal(rts.render(posed, VIEW, (40, 40), supersample=samples), expected)
 

@@ -301,12 +301,6 @@ class TestEdges(SplatterConformance):
         return "edges"
 
 
-class TestVisible(SplatterConformance):
-    @pytest.fixture
-    def splatter(self):
-        return "visible"
-
-
 # ---------------------------------------------------------------------------------------------- broken plugins
 #
 # Each differs from a plugin that conforms in one respect.
@@ -331,14 +325,6 @@ class OddRaster(Raster):
         seen = self.camera(camera, size)
         fragments = super().rasterize(prepared, seen, size, layers, self.cull or cull)
         return self.alter(fragments, (prepared, camera, size))
-
-
-class Hoarder(OddRaster):
-    """A rasterizer that is told what is needed, and keeps everything."""
-
-    def sample(self, part, camera, size, layers, request):
-        found = super().sample(part, camera, size, layers, replace(request, hidden=None))
-        return found.replace(followed=("hidden",))
 
 
 class OddSampler(rts.Sampler):
@@ -475,16 +461,6 @@ def covering(samples, part):
     return samples.replace(row=samples.row * 0, depth=samples.depth * 0 + 1)
 
 
-class Misplaced(type(rts.plugin("samplers", "raster")())):
-    """Samples other cells than those that are listed."""
-
-    def sample(self, part, camera, size, layers, request):
-        cells = request.cells
-        if cells is not None:
-            request = replace(request, cells=np.where(cells >= 0, cells ^ 1, cells))
-        return super().sample(part, camera, size, layers, request)
-
-
 class Aside(type(rts.plugin("samplers", "raster")())):
     """Samples half a cell beside the points that are asked for."""
 
@@ -494,32 +470,16 @@ class Aside(type(rts.plugin("samplers", "raster")())):
         return super().sample(part, camera, size, layers, request)
 
 
-class OddExits(type(rts.plugin("samplers", "raster")())):
-    """Tells exits that are altered."""
+class OddTriangles(type(rts.plugin("samplers", "raster")())):
+    """Tells triangles, or cells of one row, that are altered."""
 
-    def __init__(self, alter):
-        self.alter = alter
+    def __init__(self, alter, uniform=False):
+        self.alter, self.uniform = alter, uniform
 
-    def sample(self, *args):
-        found = super().sample(*args)
-        return found if found.exit is None else found.replace(exit=self.alter(found))
-
-
-class OddBetween(type(rts.plugin("samplers", "raster")())):
-    """Tells what lies between centres from altered depths, or tells what is altered."""
-
-    def __init__(self, depth=lambda x: x, told=lambda x: x):
-        self.seen, self.told = depth, told
-
-    def between(self, prepared, camera, size, cull, depth):
-        return self.told(super().between(prepared, camera, size, cull, self.seen(depth)))
-
-
-def turned_about(x):
-    """Numbers in the reverse order, where there are any."""
-    found = x.copy()
-    found[x >= 0] = x[x >= 0][::-1]
-    return found
+    def sample(self, part, camera, size, layers, request):
+        found = super().sample(part, camera, size, layers, request)
+        asked = request.uniform if self.uniform else found.triangle is not None
+        return self.alter(found) if asked else found
 
 
 SAMPLERS = {
@@ -532,23 +492,14 @@ SAMPLERS = {
         "no perspective": OddRaster(affine_barycentrics),
         "depth of another scale": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.1))),
     },
-    "hidden_samples_are_left_out_where_it_says_so": {"keeps everything": Hoarder()},
-    "exits_lie_on_the_part_behind_its_front": {
-        "fronts": OddExits(lambda found: found.row[:1]),
-        "none": OddExits(lambda found: np.full_like(found.exit, -1)),
-        "nothing told": OddExits(lambda found: None),
-        "others' exits": OddExits(lambda found: turned_about(found.exit)),
-        "everywhere": OddExits(lambda found: np.maximum(found.exit, found.exit.max())),
+    "triangles_are_told_where_it_says_so": {
+        "everywhere": OddTriangles(lambda found: found.replace(triangle=np.maximum(found.triangle, 0))),
+        "others": OddTriangles(lambda found: found.replace(triangle=found.triangle + (found.triangle == 0))),
     },
-    "what_lies_between_centres_is_told_where_it_says_so": {
-        "nothing": OddBetween(told=np.zeros_like),
-        "everywhere": OddBetween(told=lambda x: np.full_like(x, 3.5)),
-        "what is seen, too": OddBetween(depth=np.zeros_like),
-        "what a fine mesh shows": OddBetween(depth=lambda x: x + np.float32(x.min() > 0)),
-        "rows upside down": OddBetween(told=lambda x: x[::-1].copy()),
-        "other depths": OddBetween(told=lambda x: 1.01 * x),
+    "one_row_stands_for_all_cells_where_it_says_so": {
+        "fronts lost": OddTriangles(lambda found: found.replace(row=found.row * 0 - 1), uniform=True),
+        "no such row": OddTriangles(lambda found: found.replace(row=found.row + (found.row >= 0)), uniform=True),
     },
-    "listed_cells_are_those_of_the_whole_grid": {"those beside them": Misplaced()},
     "points_are_sampled_as_centres_are": {"half a cell aside": Aside()},
     "it_agrees_with_the_reference": {
         "nothing culled": OddRaster(cull="none"),
@@ -852,26 +803,8 @@ def all_rows(image, positions, rgba, row):
     return image + 1e-3 * xp.mean(rgba)
 
 
-class Frugal(OddMulti):
-    def needed(self, covered, depth):
-        return covered & (np.arange(len(covered)) == 0)[:, None, None]
-
-
-class Naming(OddMulti):
-    """Settled cells show the colour of some sample, or what is splatted there."""
-
-    fills_interiors = True
-
-    def __init__(self, show):
-        super().__init__()
-        object.__setattr__(self, "show", show)
-
-    def image(self, splats):
-        image = super().image(splats)
-        if splats.settled is None:
-            return image
-        xp, amid, named = namespace(image), splats.settled >= 0, splats.settled
-        return self.show(xp, image, amid[..., None], splats.rgba, xp.where(amid, named, 0))
+class Curious(OddMulti):
+    reads = frozenset({"depths"})
 
 
 class Cutting(OddMulti):
@@ -890,6 +823,7 @@ class Dark(Single):
 
 
 SPLATTERS = {
+    "it_reads_what_there_is": {"depths": Curious()},
     "a_constant_interior_stays": {"dimmed": OddMulti(made=lambda image, *_: 0.99 * image)},
     "the_front_layer_hides_those_behind": {"back to front": OddMulti(lambda p, c, r: (p, c, r[::-1]))},
     "light_passes_through_translucent_layers": {"fronts only": Dark()},
@@ -902,12 +836,6 @@ SPLATTERS = {
         "by number": OddMulti(lambda p, c, r: (p, c * np.linspace(0, 1, len(c))[:, None], r))
     },
     "rows_of_no_cell_have_no_effect": {"all rows": OddMulti(made=all_rows)},
-    "what_it_does_not_need_has_no_effect": {"fronts only": Frugal()},
-    "settled_cells_show_the_colors_that_they_name": {
-        "not read": Naming(lambda xp, image, amid, rgba, row: image),
-        "one for all": Naming(lambda xp, image, amid, rgba, row: xp.where(amid, rgba[0], image)),
-        "constant": Naming(lambda xp, image, amid, rgba, row: xp.where(amid, stopped(rgba[row]), image)),
-    },
     "cells_of_the_border_only_splat": {"cut off": Cutting()},
     "a_shape_that_moves_brightens_what_it_moves_into": {"mirrored": OddMulti(from_centres), "none": Plain()},
     "every_engine_gives_the_same_image": {"not in torch": OddMulti(made=lambda image, *_: wrong_in_torch(image))},

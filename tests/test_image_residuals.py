@@ -190,7 +190,7 @@ def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
     sweeps = count_sweeps(monkeypatch)
     monkeypatch.setattr(settings, "BAND", 3000)
     found = check(residuals, start(target), 1e-4)
-    assert len(sweeps) == 6 and {len(args[3]) for args in sweeps} == {4, 5}  # Rows of unlike number.
+    assert len(sweeps) == 6 and {len(args[1][2]) for args in sweeps} == {4, 5}  # Rows of unlike number.
     for a, b in zip(map(to_numpy, found), map(to_numpy, whole), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=3e-5 * np.abs(b).max())
 
@@ -307,11 +307,10 @@ def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
     part = block()
     camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40)
     moved = lambda p: part.replace(transform=rts.rigid(p))  # noqa: E731
-    options = {"splatter": "single", "layers": 1}
-    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (40, 40), **options)[..., 3]
+    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (40, 40))[..., 3]
     there = arrays(target, goal)
     calls = []
-    known = rts.ImageResiduals(moved, camera, (40, 40), goal, **options)
+    known = rts.ImageResiduals(moved, camera, (40, 40), goal)
     sweeps = count_sweeps(monkeypatch)
     ours = rts.fit(known, arrays(target, np.zeros(6)), method="lm", jit=jit)
     assert len(sweeps) > 3
@@ -319,7 +318,7 @@ def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
 
     def residuals(p):
         calls.append(p)
-        return rts.render(moved(p), camera, (40, 40), **options)[..., 3] - there
+        return rts.render(moved(p), camera, (40, 40))[..., 3] - there
 
     theirs = rts.fit(residuals, arrays(target, np.zeros(6)), method="lm", jit=jit)
     assert calls and not sweeps

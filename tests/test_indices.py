@@ -215,7 +215,7 @@ def test_samples_made_by_hand_are_looked_at(wrong, splatter, target):
     sampled = sample(part, CAMERA, SIZE, splatter=splatter)
     own = sampled.samples[0]
     if wrong == "row":
-        row = sampled.row + np.int32(1) * (sampled.row >= 0)
+        row = sampled.row + np.int32(len(own.ids)) * (sampled.row >= 0)
         sampled = sampled.replace(row=row.astype(np.int32))
     else:
         ids = own.ids.copy()

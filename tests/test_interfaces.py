@@ -36,8 +36,8 @@ def test_what_a_class_overrides_is_read_off_it():
         refine = rts.TriangleSurface.refine
 
     class Mixin:
-        def needed(self, covered, depth):
-            return covered
+        def cropped(self, splats):
+            return self.image(splats)
 
     class Mixed(Mixin, splatting.Plain):
         pass
@@ -45,8 +45,8 @@ def test_what_a_class_overrides_is_read_off_it():
     faces = icosphere(0)[1]
     assert not MESH(faces).refines and Refining(faces).refines and not Still(faces).refines
     assert type("Below", (Refining,), {})(faces).refines and not type("BelowStill", (Still,), {})(faces).refines
-    assert all(overrides(kind, "needed", rts.Splatter) for kind in (splatting.Multi, Mixed, splatting.Plain()))
-    assert not overrides(Far, "needed", rts.Splatter) and not overrides(RASTER, "needed", rts.Splatter)
+    assert all(overrides(kind, "cropped", rts.Splatter) for kind in (Mixed, Mixed()))
+    assert not overrides(Far, "cropped", rts.Splatter) and not overrides(RASTER, "cropped", rts.Splatter)
     assert overrides(rts.plugin("samplers", "embree"), "prepare", rts.TriangleSampler)
     assert not overrides(RASTER, "prepare", rts.TriangleSampler)
 

@@ -4,22 +4,18 @@ import dataclasses
 import math
 from fractions import Fraction
 
-import numba
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, icosphere, quad, quick, to_numpy
-from rts_backends.fused.losses import NUMBERS, cost_and_weight, curvature, in_numbers
+from helpers import DIFFERENTIABLE, arrays, icosphere, quad, to_numpy
 from scipy.optimize import least_squares
 
 import rts
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
-from rts.fitting.losses import FORMS, _Form
 
 pytestmark = pytest.mark.fitting
 
-compiled_cost = numba.njit(lambda r, loss: cost_and_weight(r, loss))
 ROBUST = ("soft_l1", "huber", "cauchy")
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 losses = pytest.mark.parametrize("name", ROBUST)
@@ -128,63 +124,17 @@ def test_an_image_of_one_colour_has_the_loss_of_that_colour(name, target):
 @losses
 @pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
 def test_losses_of_huge_residuals_are_finite_and_right(name, target):
-    """In float32, where (r / s)² is too large a number; in array code and compiled."""
+    """In float32, where (r / s)² is too large a number."""
     for s in (1e-10, 1e-3, 0.1, 1e3):
         loss = rts.Loss(name, s)
         for r in (0.9e8 * s, 1.1e8 * s, 1e12, 1e18, -1e20):
             expected = cost(name, r, s), slope(name, r, s)
             given = arrays(target, np.array([r], np.float32))
             assert float(loss(given)) == pytest.approx(expected[0], rel=1e-5)
-            found = compiled_cost(np.float32(r), in_numbers(loss, np.float32))
-            assert float(found[0]) == pytest.approx(expected[0], rel=1e-5)
-            assert 2 * r * float(found[1]) == pytest.approx(expected[1], rel=1e-5, abs=3e-38 * abs(r))
             weights, curvatures = map(to_numpy, loss.weights(given))
             assert 0 <= curvatures[0] <= weights[0] <= 1
             if target != "numpy":
                 np.testing.assert_allclose(gradient(loss, given), [expected[1]], rtol=1e-5, atol=1e-30)
-
-
-# ----------------------------------------------------------------------------------- losses that are not compiled
-
-
-def geman_mcclure(monkeypatch):
-    """A fifth loss of this name, ρ(z) = z / (1 + z), of which there is array code alone."""
-    form = _Form(
-        lambda xp, r, s: r * r / (1 + (r / s) ** 2),
-        lambda xp, r, s: 1 / (1 + (r / s) ** 2) ** 2,
-        lambda xp, weight: 4 * xp.sqrt(weight) - 3,
-    )
-    monkeypatch.setitem(FORMS, "geman_mcclure", form)
-    return "geman_mcclure"
-
-
-@pytest.mark.parametrize("target", quick(DIFFERENTIABLE))
-def test_normal_equations_of_a_loss_that_is_not_compiled_are_array_code(target, monkeypatch):
-    pose, name = arrays(target, POSE), geman_mcclure(monkeypatch)
-    swept = residuals("lambert", 3, loss=name, f_scale=0.1)
-    r = swept(pose)
-    expected = to_numpy(normal_equations(swept, pose, engine_of(pose), swept.loss))
-    assert float(expected[0]) == pytest.approx(float((r**2 / (1 + (r / 0.1) ** 2)).mean()), rel=1e-5)
-    for found, array in zip(swept.normal_equations(pose), expected, strict=True):
-        np.testing.assert_allclose(to_numpy(found), array, rtol=1e-4, atol=1e-7)
-
-
-def test_every_loss_is_compiled_and_another_number_is_an_error():
-    assert set(NUMBERS) == set(FORMS)
-    compiled_curvature = numba.njit(lambda weight, loss: curvature(weight, loss))
-    for name, number in NUMBERS.items():
-        loss = rts.Loss(name, 0.5)
-        assert in_numbers(loss, np.float64) == (number, loss.f_scale)
-        for r in (-3.0, 0.2, 0.7):
-            value, weight = compiled_cost(r, in_numbers(loss, np.float64))
-            expected = loss.weights(np.array([r]))
-            assert value == pytest.approx(float(loss(np.array([r]))), rel=1e-12)
-            found = weight, compiled_curvature(weight, in_numbers(loss, np.float64))
-            np.testing.assert_allclose(found, np.ravel(expected), rtol=1e-12)
-    unknown = max(NUMBERS.values()) + 1, np.float64(0.5)
-    for compiled in compiled_cost, compiled_curvature:
-        with pytest.raises(ValueError, match="not compiled"):
-            compiled(0.7, unknown)
 
 
 # ------------------------------------------------------------------------------------- other implementations

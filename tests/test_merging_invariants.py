@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from strategies import PROPERTIES, masks, rows_of, steps, told_apart
 
 from rts.compiling import threads
-from rts.contracts.records import Cells
 from rts.sampling import merging
 from rts.sampling.merging import merge
 
@@ -28,9 +27,8 @@ def parts(draw, least=1, most=4, reals=REALS):
         shape = draw(st.integers(1, 3)), *size
         row, total = draw(rows_of(draw(masks(shape))))
         depth = np.sort(draw(steps(shape, -2, 4, dtype=draw(reals))), axis=0)
-        facing = np.random.default_rng(draw(st.integers(0, 9))).integers(-3, 4, shape)
-        facing += np.where(facing > 2, Cells.MORE_BEHIND, np.where(facing < -2, -Cells.MORE_BEHIND, 0))
-        told = told_apart(row, total, depth).replace(facing=facing.astype(np.int16))
+        triangle = np.random.default_rng(draw(st.integers(0, 9))).integers(0, 9, shape)
+        told = told_apart(row, total, depth).replace(triangle=np.where(row >= 0, triangle, -1).astype(np.int32))
         found.append(replace(told, overflow=np.int32(draw(st.integers(0, 3)))))
     return found, draw(st.integers(1, 6))
 
@@ -41,23 +39,20 @@ def offsets_of(samples):
 
 
 def by_hand(samples, layers):
-    """Part, row within it, depth and facing, (K, H, W) each, of sorted cells."""
+    """Part, row within it, depth and triangle, (K, H, W) each, of sorted cells."""
     shape = min(layers, sum(len(s.row) for s in samples)), *samples[0].row.shape[1:]
-    part, row, depth, facing = np.full(shape, -1), np.full(shape, -1), np.zeros(shape), np.zeros(shape, int)
+    part, row, depth, triangle = np.full(shape, -1), np.full(shape, -1), np.zeros(shape), np.full(shape, -1)
     for y, x in np.ndindex(shape[1:]):
         cell = [(s.depth[k, y, x], i, k, s.row[k, y, x]) for i, s in enumerate(samples) for k in range(len(s.row))]
         for k, (z, i, own_layer, own) in enumerate(sorted(c for c in cell if c[3] >= 0)[:layers]):
             part[k, y, x], row[k, y, x], depth[k, y, x] = i, own, z
-            told = int(samples[i].facing[own_layer, y, x])
-            number = (abs(told) % Cells.MORE_BEHIND) * len(samples) + i
-            more = abs(told) >= Cells.MORE_BEHIND or k == shape[0] - 1
-            facing[k, y, x] = np.sign(told) * (number + more * Cells.MORE_BEHIND)
-    return part, row, depth, facing
+            triangle[k, y, x] = samples[i].triangle[own_layer, y, x]
+    return part, row, depth, triangle
 
 
 def given_to(interleave, samples, layers, target="numpy"):
-    """Part, row, depth and facing from one of the two ways to interleave."""
-    given = *(s.row for s in samples), *(s.depth for s in samples), *(s.facing for s in samples)
+    """Part, row, depth and triangle from one of the two ways to interleave."""
+    given = *(s.row for s in samples), *(s.depth for s in samples), *(s.triangle for s in samples)
     given = given if target == "numpy" else map(lambda x: arrays(target, x, x.dtype), given)
     return to_numpy(interleave(layers, [len(s.ids) for s in samples], *given))
 
@@ -84,8 +79,8 @@ def test_in_array_code_it_is_what_one_does_by_hand(target, given):
     expected = by_hand(samples, layers)
     for values, own in zip((part, row), expected[:2], strict=True):
         np.testing.assert_array_equal(values, own)
-    for values, own in zip(others, expected[2:], strict=True):
-        np.testing.assert_array_equal(np.where(row >= 0, values, 0), own)
+    for values, own, empty in zip(others, expected[2:], (0, -1), strict=True):
+        np.testing.assert_array_equal(np.where(row >= 0, values, empty), own)
 
 
 @PROPERTIES

@@ -92,7 +92,8 @@ def test_parts_merged_by_depth_are_the_image_of_one_merged_mesh(target):
         np.testing.assert_array_equal(to_numpy(sampled.depth), to_numpy(expected.depth))
         seen = np.unique(to_numpy(sampled.part))
         assert {0, 1, 2} <= set(seen)
-        np.testing.assert_allclose(*(show(x, camera, layers=layers) for x in (parts_, one_)), rtol=0, atol=1e-5)
+        images = (show(x, camera, layers=layers, splatter="multi") for x in (parts_, one_))
+        np.testing.assert_allclose(*images, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("target", ALL)

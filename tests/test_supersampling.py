@@ -91,7 +91,8 @@ def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
             calls.append(splats.row.shape)
             return super().image(splats)
 
-    bands = len(settings.RenderSettings(None, 2, 3, None).bands(SIZE))
+    bands = len(settings.RenderSettings(None, 1, 3, None).bands(SIZE))
+    assert bands > 1
     gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))
     assert len(calls) == 2 * bands
 
@@ -119,7 +120,7 @@ def test_between_forward_and_backward_bands_keep_next_to_nothing(monkeypatch):
     whole, _ = memory(lambda s, size: image(vertices, s, size))
     monkeypatch.setattr(settings, "BAND", 2**15)
     banded, _ = memory(lambda s, size: image(vertices, s, size))
-    assert banded < 0.25 * whole  # What splatters have decided of each cell, four bytes.
+    assert banded < 0.35 * whole  # What is left is the image itself, and the graph of each band.
 
 
 @pytest.mark.parametrize("splatter", ["multi", "edges"])
@@ -166,7 +167,7 @@ def test_prepared_parts_are_rendered_in_bands(narrow_bands):
 def test_sampled_knows_its_samples_a_pixel():
     part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
     sampled = rts.sample(part, CAMERA, SIZE, supersample=2)
-    assert sampled.row.shape == (2, *(2 * n + 2 * sampled.apron for n in SIZE)) and sampled.supersample == 2
+    assert sampled.row.shape == (1, *(2 * n + 2 * sampled.apron for n in SIZE)) and sampled.supersample == 2
     np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA), image(CORNERS, 2))
 
 
@@ -185,13 +186,12 @@ def test_an_edge_is_felt_whole_at_any_number_of_samples(target, s):
     np.testing.assert_allclose(slope.sum(axis=1), 1, atol=2e-3)
 
 
-def test_coverage_of_an_edge_gets_nearer_the_area_with_samples():
+def test_coverage_of_an_edge_is_the_area_at_any_number_of_samples():
     vertices, faces = quad(-100, 0.3, -100, 100)
     camera = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)
-    part = rts.Part(MESH(faces), {"vertices": vertices})
-    area = np.clip(8.3 - np.arange(16), 0, 1)
-    errors = [np.abs(rts.render(part, camera, (16, 16), supersample=s)[8, :, 3] - area).sum() for s in (1, 4, 16)]
-    assert errors[0] > 0.29 and errors[1] < errors[0] / 3 and errors[2] < errors[1] / 3
+    part, area = rts.Part(MESH(faces), {"vertices": vertices}), np.clip(8.3 - np.arange(16), 0, 1)
+    for s in (1, 4):
+        np.testing.assert_allclose(rts.render(part, camera, (16, 16), supersample=s)[8, :, 3], area, atol=1e-6)
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, True, "2", None])

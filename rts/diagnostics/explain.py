@@ -85,7 +85,7 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
     watched = [part.replace(shader=own) for part, own in zip(parts, shaders, strict=True)]
     small = min(size[0], FEW), min(size[1], FEW)
     sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, splatter=None, layers=1)
-    render_samples(sampled, watched, camera.for_size(size).replace(aspect=None))
+    render_samples(sampled, watched, camera.for_size(size).replace(aspect=None), splatter="none")
     return [own.read for own in shaders]
 
 

@@ -34,7 +34,8 @@ from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
-from rts.rendering.samples import sample
+from rts.rendering.samples import sampled_scene
+from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
 from rts.sampling.prepared import Prepared
@@ -317,11 +318,11 @@ class ImageResiduals(Residuals):
             # The ratio of a window is free.
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
-        sampled = sample(parts, window(camera), size, sampler=self._sampler, **vars(self._settings))
-        checked, _ = _checked(parts, camera)
-        self._refuse_other(checked[0].shader.channels)
+        scene = Scene.of(parts, window(camera), self._sampler, None).at(size)
+        sampled = sampled_scene(scene, scene.camera, size, self._settings)
+        self._refuse_other(scene.channels)
         # Opaque samples have an alpha of one, whatever their colours.
-        colored = self._channels > 1 or not all(part.shader.opaque for part in checked)
+        colored = self._channels > 1 or not all(scene.opaque)
         target, weights, background = (None if x is None else x[top : top + rows] for x in self._constants(vector))
 
         def splats(v: Array) -> Splats:

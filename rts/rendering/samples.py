@@ -61,11 +61,16 @@ def sample(
         size, "auto" if splatter is None else splatter, layers, supersample, capacity
     )
     scene, settings = scene.at(size), replace(settings, splatter=None) if splatter is None else settings
-    return sampled_scene(scene, scene.camera, size, settings)
+    return sampled_scene(scene, scene.camera, size, settings, one_shader=False)
 
 
-def sampled_scene(scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
-    """The samples of a window of the image, through the camera of this window; see `sample`."""
+def sampled_scene(
+    scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings, one_shader: bool = True
+) -> Sampled:
+    """The samples of a window of the image, through the camera of this window; see `sample`.
+
+    With `one_shader` they serve the shaders of the scene alone, so that cells of one colour may name one sample.
+    """
     settings = settings.of(scene)
     side, capacity = settings.supersample, settings.capacity
     height, width = side * size[0], side * size[1]
@@ -73,7 +78,7 @@ def sampled_scene(scene: Scene, camera: Camera, size: tuple[int, int], settings:
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     scene = with_entries(scene, grid) if outlines else scene
     # Inside of one colour nothing depends on where a sample lies.
-    uniform = outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
+    uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
     taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines, uniform=uniform))
     layers = settings.layers
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)

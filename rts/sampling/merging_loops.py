@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling.loops import loop
+from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel, read_only
 
 
@@ -74,30 +74,38 @@ def _merge(
         merged_depth: to be filled; 0 in empty layers.
         merged_triangle: to be filled; −1 in empty layers.
     """
-    before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(merged_triangle) > 0
     for y in range(start, stop):
         for x in range(row.shape[2]):
-            a = b = 0
-            for k in range(layers):
-                while a < before and row[a, y, x] < 0:
-                    a += 1
-                while b < deepest and own_row[b, y, x] < 0:
-                    b += 1
-                told = -1
-                if b < deepest and (a == before or own_depth[b, y, x] < depth[a, y, x]):
-                    merged_part[k, y, x], merged_row[k, y, x] = number, own_row[b, y, x]
-                    merged_depth[k, y, x] = own_depth[b, y, x]
-                    if tells:
-                        told = own_triangle[b, y, x]
-                    b += 1
-                elif a < before:
-                    merged_part[k, y, x] = part[a, y, x] if len(part) > 0 else 0
-                    merged_row[k, y, x], merged_depth[k, y, x] = row[a, y, x], depth[a, y, x]
-                    if tells:
-                        told = triangle[a, y, x]
-                    a += 1
-                else:
-                    merged_part[k, y, x] = merged_row[k, y, x] = -1
-                    merged_depth[k, y, x] = 0
-                if tells:
-                    merged_triangle[k, y, x] = told
+            known, own = (part[:, y, x], row[:, y, x], depth[:, y, x], triangle[:, y, x]), own_row[:, y, x]
+            made = merged_part[:, y, x], merged_row[:, y, x], merged_depth[:, y, x], merged_triangle[:, y, x]
+            _merge_cell(known, own, own_depth[:, y, x], own_triangle[:, y, x], number, made)
+
+
+@compiled
+def _merge_cell(known, own_row, own_depth, own_triangle, number, made):
+    """`_merge` of one cell: `known` are the arrays of the parts before, and `made` those to be filled."""
+    part, row, depth, triangle = known
+    merged_part, merged_row, merged_depth, merged_triangle = made
+    before, deepest, tells, a, b = len(row), len(own_row), len(merged_triangle) > 0, 0, 0
+    for k in range(len(merged_part)):
+        while a < before and row[a] < 0:
+            a += 1
+        while b < deepest and own_row[b] < 0:
+            b += 1
+        told = -1
+        if b < deepest and (a == before or own_depth[b] < depth[a]):
+            merged_part[k], merged_row[k], merged_depth[k] = number, own_row[b], own_depth[b]
+            if tells:
+                told = own_triangle[b]
+            b += 1
+        elif a < before:
+            merged_part[k] = part[a] if len(part) > 0 else 0
+            merged_row[k], merged_depth[k] = row[a], depth[a]
+            if tells:
+                told = triangle[a]
+            a += 1
+        else:
+            merged_part[k] = merged_row[k] = -1
+            merged_depth[k] = 0
+        if tells:
+            merged_triangle[k] = told

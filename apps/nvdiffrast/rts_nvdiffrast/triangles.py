@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 
 from rts import GBuffer, TriangleSurface
 from rts.plugin_api.arrays import Tree
-from rts.plugin_api.checks import fingerprint, pieces
+from rts.plugin_api.checks import fingerprint
 from rts.plugin_api.operations import interpolate
 from rts.plugin_api.records import Proxy, Samples
 from rts_nvdiffrast.clip_space import Seen, seen
@@ -22,7 +21,7 @@ KEPT = 8
 
 
 class Topology:
-    """A table of triangles on the host, and which of them are wound alike along common edges.
+    """A table of triangles on the host.
 
     `antialias_construct_topology_hash` gives it.
     """
@@ -43,11 +42,6 @@ class Topology:
         while len(cls._kept) > KEPT:
             cls._kept.popitem(last=False)
         return cls._kept[key]
-
-    @cached_property
-    def pieces(self) -> np.ndarray:
-        """(T,) int16, see `rts.TriangleSurface.pieces`."""
-        return pieces(self.faces)
 
 
 class Triangles(TriangleSurface):
@@ -76,10 +70,6 @@ class Triangles(TriangleSurface):
         """The triangles, each with its number."""
         faces = self.topology.faces if self._all else self.topology.faces[self._ids]
         return Proxy(np.ascontiguousarray(inputs, np.float32), faces, self._ids[:, None])
-
-    def pieces(self, proxy: Proxy) -> np.ndarray:
-        """See `rts.TriangleSurface`."""
-        return self.topology.pieces if self._all else self.topology.pieces[self._ids]
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, and "triangle" (N, 1), the number of the triangle as a float."""

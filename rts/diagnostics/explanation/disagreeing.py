@@ -28,8 +28,6 @@ STRONG = 0.1
 """The share of the largest error of a pixel from which a pixel counts as disagreeing."""
 ALIKE = 0.5
 """The least error of the baseline that tells a bias of the library, as a share of the scene's error."""
-SHORTER, DENSE = 0.25, 8
-"""For differences of fine colours: the step as a share of the usual one, and samples a pixel along each axis."""
 AGAIN = 4
 """Samples a pixel, along each axis, that experiments take instead of one."""
 
@@ -213,42 +211,16 @@ def _bounded(case: _Case, touched: Touched) -> None:
     )
 
 
-def _colors(case: _Case, touched: Touched) -> None:
-    """Add a finding on colours finer than pixels, if the error lies inside of surfaces, and more samples halve it."""
-    subject, number = case.subject, case.number
-    taken = subject.supersample
-    inside = ~subject.fineness.outlines
-    if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
-        return
-    step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
-    after, before = (subject.engine.to_numpy(subject.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
-    true, finer = (after.astype(np.float64) - before) / SHORTER, case.push(supersample=_more(taken))
-    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, finer))
-    if left > HALVED * was:
-        return
-    because = f"colours change within a sample there ({_each(taken)}), inside of surfaces"
-    times = was / max(left, 1e-30)
-    advice = f"Blur them to the size of a pixel, or take more samples: with supersample={_more(taken)} "
-    _by_pixels(case, inside, "colors", because, f"{advice}it is {times:.2g} times better.", widen=0)
-
-
 def _samples(case: _Case, touched: Touched) -> None:
-    """Add findings on too few samples, for thin shapes or for outlines, if more make the error much smaller."""
+    """Add a finding on too few samples, if more make the error much smaller."""
     taken = case.subject.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
         return
-    gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
-    thin, strong = case.subject.fineness.thin, case.strong(before)
-    better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
-    held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
-    if held >= LARGE_SHARE:
-        because = f"the scene is thinner than a sample there ({_each(taken)})"
-        case.findings.append(Finding("thin", because, f"Take more samples: {better}", strong & thin, share * held))
-    if 1 - held >= LARGE_SHARE:
-        because = f"{_each(taken)} is too little for these outlines"
-        advice = better[0].upper() + better[1:]
-        case.findings.append(Finding("samples", because, advice, strong & ~thin, share * (1 - held)))
+    times = before.norm / max(case.error.norm, 1e-30)
+    because = f"{_each(taken)} is too little for these outlines and colours"
+    advice = f"With supersample={_more(taken)} it is {times:.2g} times better."
+    case.findings.append(Finding("samples", because, advice, case.strong(before), case.gained(before)))
 
 
 def _more(taken: int) -> int:
@@ -324,7 +296,6 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _outlines,
     _layers,
     _bounded,
-    _colors,
     _samples,
     _bias,
 )

@@ -19,11 +19,8 @@ KINDS = {
     "outlines": ("red", (255, 40, 40)),
     "transparent": ("cyan", (0, 255, 255)),
     "layers": ("magenta", (255, 60, 220)),
-    "thin": ("yellow", (250, 230, 40)),
-    "colors": ("green", (40, 200, 70)),
     "samples": ("olive", (150, 150, 30)),
     "bounded": ("violet", (150, 60, 255)),
-    "crossing": ("teal", (0, 140, 130)),
     "bias": ("pink", (255, 150, 170)),
     "reach": ("brown", (170, 95, 30)),
     "infinite": ("gold", (200, 160, 0)),
@@ -40,11 +37,8 @@ KINDS = {
 - outlines: the splatter gives outlines no derivative.
 - transparent: shaders are not opaque, and the splatter takes them to be.
 - layers: surfaces lie deeper than K layers.
-- thin: shapes are thinner than a sample.
-- colors: colours finer than pixels.
-- samples: too few samples a pixel, for other reasons.
+- samples: too few samples a pixel, such as for colours finer than pixels.
 - bounded: near-singular crossings, whose derivatives the surface bounds.
-- crossing: parts pass through one another.
 - bias: a bias of the library that a sphere or a box shows, too.
 - reach: the loss is flat here, beyond the reach of a pixel.
 - infinite: the derivative is NaN, or infinite.

@@ -14,13 +14,10 @@ from rts.arrays.array_functions import kind_of
 from rts.arrays.engines import Engine, is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import CheckedPart, check_colors, check_scene, check_splatter
-from rts.contracts.records import Sampled
-from rts.diagnostics.explanation.thin_features import Fineness, fineness
 from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves
 from rts.rendering.image import render
-from rts.rendering.samples import sample
 from rts.sampling.prepared import Prepared
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -318,23 +315,10 @@ class Subject:
         parts, camera = self.shown(self.parameters)
         return check_scene(listed_parts(parts), camera)[0]
 
-    def sampled(self, **options: Any) -> Sampled:
-        """All samples of the scene at the current parameters, by `rts.sample` with these options.
-
-        Of the subject's own options, only the sampler and the engine are passed on.
-        """
-        given = {name: self.options[name] for name in ("sampler", "engine") if name in self.options}
-        return sample(*self.shown(self.parameters), self.size, splatter=None, **given, **options)
-
     @cached_property
     def supersample(self) -> int:
         """Samples along each axis of a pixel."""
         return int(self.options.get("supersample", 1))
-
-    @cached_property
-    def fineness(self) -> Fineness:
-        """Masks of shapes thinner than a sample, and of outlines."""
-        return fineness(self.sampled, self.size, self.supersample)
 
     def splats_as(self, name: str) -> bool:
         """True if the scene's splatter is of the kind with this name."""
