@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
+from rts.arrays.engines import engine_of, exemplar, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart
@@ -517,15 +517,19 @@ class Points:
 
     def _layers(self, points: np.ndarray, count: int) -> Fronts:
         """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
-        part, depth = np.full((count, len(points)), -1, np.int32), np.full((count, len(points)), np.inf)
-        for index, opaque in enumerate(self._scene.opaque):
-            samples = self.sample(index, points, layers=1 if opaque else count)
-            row, z = host_value(samples.row)[:, 0], host_value(samples.depth)[:, 0]
+        scene, none = self._scene, (count, len(points))
+        given = [part.theta for part in scene.parts], self._grid.camera
+        more = engine_of(*given).room(len(points), exemplar(*given)) - len(points)
+        asked = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
+        part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
+        for index, opaque in enumerate(scene.opaque):
+            samples = self.sample(index, asked, layers=1 if opaque else count)
+            row, z = (host_value(x)[:, 0, : len(points)] for x in (samples.row, samples.depth))
             part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])
             order = np.argsort(depth, axis=0, kind="stable")[:count]
             part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
-        return _lit(Fronts(part, np.full(part.shape, -1, np.int32), depth), np.array(self._scene.opaque))
+        return _lit(Fronts(part, np.full(none, -1, np.int32), depth), np.array(scene.opaque))
 
 
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:

@@ -294,7 +294,7 @@ class _Change(NamedTuple):
         level = np.abs(b.depth - a.depth) <= 10 * FINE * oracle.widths(np.maximum(a.depth, b.depth))
         meets = np.flatnonzero((a.part >= 0) & (b.part >= 0) & (a.part != b.part) & level)
         if len(meets):
-            slopes = _sampled_slopes(found.at(meets), a.at(meets), b.at(meets), gaps, oracle)
+            slopes = _sampled_slopes(found.at(meets), self.first[meets], gaps, oracle)
             turn = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
             there = turn > 1e-4 * oracle.widths(a.depth[meets])  # False for NaN.
             near[meets[there]], slope[meets[there]] = 2, slopes[there]
@@ -329,13 +329,14 @@ def _numbers(part: np.ndarray) -> np.ndarray:
     return np.stack([(part[:k] == own).sum(0) for k, own in enumerate(part)])
 
 
-def _sampled_slopes(found: _Intervals, a: Fronts, b: Fronts, gaps: _Lines, oracle: Oracle) -> np.ndarray:
-    """Slopes of depth (M, 2, 2) on both sides of intervals, of the surfaces seen at their ends; NaN where unknown."""
+def _sampled_slopes(found: _Intervals, layer: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:
+    """Slopes of depth (M, 2, 2) of a layer (M,) on both sides of intervals; NaN where they are unknown."""
     slopes = np.full((len(found.gap), 2, 2), np.nan)
-    for side, (front, place, way) in enumerate(((a, found.low, -1), (b, found.high, 1))):
+    for side, (seen, place, way) in enumerate(((found.before, found.low, -1), (found.behind, found.high, 1))):
+        front, number = seen.of_layer(layer), _numbers(seen.part)[layer, np.arange(len(layer))]
         at, step = gaps.points(found.gap, place), gaps.step[found.gap]
         inward, across = way * BESIDE * step, BESIDE * step[:, ::-1]
-        told = [_depth_of(front, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
+        told = [_depth_of(front, number, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
         same = [np.isfinite(t) for t in told]
         along = (told[0] - front.depth) / (way * BESIDE)
         both = (told[1] - told[2]) / (2 * BESIDE)
@@ -345,8 +346,7 @@ def _sampled_slopes(found: _Intervals, a: Fronts, b: Fronts, gaps: _Lines, oracl
     return slopes
 
 
-def _depth_of(front: Fronts, layers: Fronts) -> np.ndarray:
-    """The depth (M,) of the layer of the same part as a front that is the nearest to it; NaN where there is none."""
-    apart = np.where(layers.part == front.part, np.abs(layers.depth - front.depth), np.inf)
-    at = apart.argmin(0)
-    return np.where(np.isfinite(apart.min(0)), layers.of_layer(at).depth, np.nan)
+def _depth_of(front: Fronts, number: np.ndarray, layers: Fronts) -> np.ndarray:
+    """The depth (M,) of the layer of a front's part with as many of the same part before it; NaN if there is none."""
+    same = (layers.part == front.part) & (_numbers(layers.part) == number)
+    return np.where(same.any(0), layers.of_layer(same.argmax(0)).depth, np.nan)
