@@ -31,7 +31,7 @@ from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter
-from rts.contracts.surface import RaySurface, Surface, TriangleSurface
+from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradients import check_gradient, gradient_image
 from rts.errors import InputError, PluginError, RtsError, RtsWarning
