@@ -496,6 +496,7 @@ def test_a_command_tells_its_own_help():
     assert "cheapest" in CliRunner().invoke(app, ["tune", "--help"]).output
 
 
+@pytest.mark.filterwarnings("ignore:splatter 'visible' is deprecated")
 @pytest.mark.parametrize("group", BASES)
 def test_what_the_library_registers_are_classes_of_which_one_object_serves_a_name(group):
     for name in rts.plugins(group):
