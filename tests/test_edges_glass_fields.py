@@ -137,6 +137,22 @@ def test_balls_of_glass_are_as_good_as_those_of_triangles(name):
             assert error(name, moves, motion) <= max(0.04, 1.5 * error(name, moves, motion, mesh))
 
 
+@pytest.mark.parametrize("size", [32, 36])
+def test_two_lines_of_crossing_that_are_close_are_told_apart(size):
+    """Where fronts cross, and where backs do, in a plane that is seen nearly from its edge."""
+    ball, other = {"center": (-0.2, 0.02, 0), "radius": 0.5}, {"center": (0.2, 0.1, 0), "radius": 0.5}
+
+    def derivative(kind):
+        def scene(t):
+            parts = kind(moved(ball, t, GROW), PINK), kind(tensors(other), GREEN)
+            return rts.render(parts, CAMERA, (size, size), splatter="edges", layers=5)
+
+        return pushed(scene)[1]
+
+    true = derivative(mesh)
+    assert np.linalg.norm(derivative(field) - true) < 0.05 * np.linalg.norm(true)
+
+
 def test_a_ball_of_half_light_gains_by_its_radius_what_its_area_does():
     """Two layers of alpha 1/2, on a circle of focal · r / √(D² − r²) pixels."""
     ball = {"center": (0.03, 0.02, 0), "radius": 0.7}

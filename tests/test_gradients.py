@@ -202,7 +202,7 @@ def test_images_that_jax_cannot_trace_and_arrays_of_two_engines():
     parameters = parameters_of("jax")
     for image, kind, said in (
         (lambda q: rts.render(*card(q), SIZE) * float(q["shift"][0]), rts.InputError, "jax cannot trace the function"),
-        (lambda q: rts.render(*card(q), SIZE) * torch.ones(1), rts.EngineError, "torch and jax arrays met"),
+        (lambda q: rts.render(*card(q), SIZE) * torch.ones(1), rts.errors.EngineError, "torch and jax arrays met"),
     ):
         with pytest.raises(kind, match=said) as error:
             rts.gradient_image(image, parameters, ALONG)

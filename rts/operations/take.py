@@ -60,6 +60,4 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
         take_loops.add(np.ascontiguousarray(g), operands[1], results[0])
 
 
-TAKE = Operation(
-    "rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, packed=(1,), packed_result=True
-)
+TAKE = Operation("rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, packed=(1,), packed_result=True)

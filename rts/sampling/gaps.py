@@ -187,9 +187,20 @@ def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
         change.parts(near),
         joined,
         np.full((len(number), 4), -1, np.int32),
-        np.zeros((len(number), 2)),
+        lines_of_crossing(slope),
     )
     return breaks, change.stacks(near, points, beside)
+
+
+def lines_of_crossing(slope: np.ndarray) -> np.ndarray:
+    """Unit directions (B, 2) in the image of the lines where surfaces cross, from both slopes; 0 where they are equal.
+
+    Args:
+        slope: (B, 2, 2), see `Breaks.slope`.
+    """
+    apart = slope[:, 1] - slope[:, 0]
+    length = np.hypot(*apart.T)
+    return np.column_stack([apart[:, 1], -apart[:, 0]]) / np.where(length > 0, length, 1.0)[:, None]
 
 
 def _ends(gap: np.ndarray, layers: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
@@ -267,6 +278,11 @@ class _Change(NamedTuple):
         a, b = (Fronts(*(np.expand_dims(x, axis) for x in side)) for side, axis in zip(sides, (1, 0), strict=True))
         apart = np.where(_level(a, b, oracle) & (a.part >= 0), np.abs(a.depth - b.depth), np.inf)
         one = (apart == apart.min(0)) & (apart == apart.min(1)[:, None]) & np.isfinite(apart)
+        # Within the same parts the layer whose depth changes most ends, as others may be steep.
+        count, alike = len(one), (found.before.part == found.behind.part).all(0)
+        most = np.abs(found.before.depth - found.behind.depth).argmax(0)
+        in_order = np.eye(count, dtype=bool)[..., None] & (np.arange(count)[:, None] != most)[:, None] & (a.part >= 0)
+        one = np.where(alike, in_order, one)
         behind, before = (np.where(one.any(axis), one.argmax(axis), -1) for axis in (1, 0))
         first = (~one[index, index] & ((found.before.part >= 0) | (found.behind.part >= 0))).argmax(0)
         lone = [(side.part >= 0) & (other < 0) for side, other in zip(sides, (behind, before), strict=True)]

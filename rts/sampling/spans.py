@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import INNER, Breaks, Fronts
+from rts.sampling.gaps import INNER, Breaks, Fronts, lines_of_crossing
 from rts.sampling.sheets import Gaps, Sheets
 
 
@@ -134,8 +134,7 @@ def tangents(
 
     Arguments as of `crossings`, with slopes.
     """
-    apart = slope[:, 1] - slope[:, 0]
-    found = np.column_stack([apart[:, 1], -apart[:, 0]])
+    found = lines_of_crossing(slope)
     side = np.where(near == 1, 1, 0)
     index = np.arange(len(near))
     part, triangle = parts[index, side], triangles[index, side]
