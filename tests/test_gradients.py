@@ -239,7 +239,15 @@ def square(shift):
 
 
 def checked(target, loss, **options):
-    given = {"entries": 3, "samples": 2, "hessian": True, "budget_s": 600, "splatter": CALIBRATED, "layers": 2} | options
+    given = {
+        "entries": 3,
+        "samples": 2,
+        "hessian": True,
+        "budget_s": 600,
+        "splatter": CALIBRATED,
+        "layers": 2,
+        **options,
+    }
     return rts.check_gradient(square, arrays(target, np.array([0.1, 0.2, 0.0])), (20, 20), loss=loss, **given)
 
 
