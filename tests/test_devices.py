@@ -163,7 +163,7 @@ CASES = {
     "rays": lambda: Case((rts.Part(Torus(), {"radii": np.array([0.9, 0.35])}, "normals"),), {"sampler": "rays"}),
     **{
         name: lambda name=name: Case((ball(),), {"splatter": name, "layers": 1 if name == "single" else 2})
-        for name in ("none", "single", "multi", "visible")
+        for name in ("none", "single", "multi", "edges")
     },
     "translucent": lambda: Case((ball(glass), ball("unlit", (0.4, 0.2, -1.5))), {"layers": 4}),
     **{

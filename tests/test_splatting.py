@@ -340,7 +340,7 @@ def test_none_composites_the_layers_front_to_back(target):
             if row[k, y, x] >= 0:
                 expected[y, x] += through * rgba[row[k, y, x]]
                 through *= 1 - rgba[row[k, y, x], 3]
-    found = to_numpy(Plain().splat(*arrays(target, (positions, rgba, row))))
+    found = to_numpy(Plain().splat(*arrays(target, (positions, rgba, row)), opaque=False))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
