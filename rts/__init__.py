@@ -15,24 +15,20 @@ The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`
 
 import importlib
 
-from rts import errors, registry, regularizers
+from rts import errors as errors
+from rts import registry
+from rts import regularizers as regularizers
 from rts.arrays.engines import Engine, engine_of, namespace
 from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import Shader
-from rts.contracts.splatter import Splatter, SummingSplatter
-from rts.contracts.surface import Rate, RaySurface, Surface, TriangleSurface
+from rts.contracts.splatter import Splatter
+from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradients import check_gradient, gradient_image
-from rts.errors import (
-    EngineError,
-    InputError,
-    PluginError,
-    RtsError,
-    RtsWarning,
-)
+from rts.errors import InputError, PluginError, RtsError, RtsWarning
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.files.views.loading import load_views
@@ -56,10 +52,11 @@ from rts.scene.rigid import rigid
 from rts.scene.view import View
 
 _MOVED = {
-    "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "
+    "rts.errors": "AspectWarning EmptyImageWarning EngineError FileWarning InputWarning "
     "LayersWarning SamplerWarning ToleranceWarning",
     "rts.plugin_api.operations": "Operation combine gradient",
-    "rts.plugin_api.records": "ArraySpec Fragments Proxy RayHits Rays Samples Splats",
+    "rts.plugin_api.records": "ArraySpec Fragments Proxy Rate RayHits Rays Samples Splats",
+    "rts.plugin_api.splats": "SummingSplatter",
     "rts.splatting": "exact_calibration",
 }
 """Module → names that moved there from `rts`, separated by spaces."""
@@ -84,16 +81,14 @@ __version__ = "0.3.0.dev0"
 __all__ = [
     "Camera",
     "Engine",
-    "EngineError",
+    "Evaluator",
     "GBuffer",
     "ImageResiduals",
     "InputError",
     "LargeSteps",
     "Loss",
-    "Ndc",
     "Part",
     "PluginError",
-    "Rate",
     "RaySurface",
     "Residuals",
     "RtsError",
@@ -102,7 +97,6 @@ __all__ = [
     "Shader",
     "Splatter",
     "Stage",
-    "SummingSplatter",
     "Surface",
     "TriangleSampler",
     "TriangleSurface",
@@ -110,7 +104,6 @@ __all__ = [
     "ViewResiduals",
     "check_gradient",
     "engine_of",
-    "errors",
     "explain",
     "fit",
     "gradient_image",
@@ -123,7 +116,6 @@ __all__ = [
     "plugins",
     "prepare",
     "pyramid",
-    "regularizers",
     "render",
     "render_samples",
     "render_views",

@@ -21,7 +21,6 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rts import errors, regularizers
 from rts import registry as registry
 from rts.arrays.engines import Engine, engine_of, namespace
 from rts.arrays.trees import Array, Tree
@@ -31,11 +30,11 @@ from rts.contracts.records import Proxy, RayHits, Samples
 from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import Shader
-from rts.contracts.splatter import Splatter, SummingSplatter
-from rts.contracts.surface import Rate, RaySurface, Surface, TriangleSurface
+from rts.contracts.splatter import Splatter
+from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradients import check_gradient, gradient_image
-from rts.errors import EngineError, InputError, PluginError, RtsError, RtsWarning
+from rts.errors import InputError, PluginError, RtsError, RtsWarning
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.files.views.loading import load_views
@@ -62,16 +61,14 @@ __version__: str
 __all__ = [
     "Camera",
     "Engine",
-    "EngineError",
+    "Evaluator",
     "GBuffer",
     "ImageResiduals",
     "InputError",
     "LargeSteps",
     "Loss",
-    "Ndc",
     "Part",
     "PluginError",
-    "Rate",
     "RaySurface",
     "Residuals",
     "RtsError",
@@ -80,7 +77,6 @@ __all__ = [
     "Shader",
     "Splatter",
     "Stage",
-    "SummingSplatter",
     "Surface",
     "TriangleSampler",
     "TriangleSurface",
@@ -88,7 +84,6 @@ __all__ = [
     "ViewResiduals",
     "check_gradient",
     "engine_of",
-    "errors",
     "explain",
     "fit",
     "gradient_image",
@@ -101,7 +96,6 @@ __all__ = [
     "plugins",
     "prepare",
     "pyramid",
-    "regularizers",
     "render",
     "render_samples",
     "render_views",

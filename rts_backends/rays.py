@@ -68,12 +68,12 @@ class Rays(Sampler):
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
         followed = () if request.points is None else ("points",)
         samples = Samples(ids, params, Cells(row, depth), overflow, followed=followed)
-        asked = request.pairs and request.points is not None and hits.entering is not None
-        if not asked or type(surface).deepest is RaySurface.deepest:
+        entering, asked = hits.entering, request.pairs and request.points is not None
+        if entering is None or not asked or type(surface).deepest is RaySurface.deepest:
             return samples
         width = xp.reshape(rays.spread[0] + rays.spread[1] * depth[0, ...], (-1,))
         start = origins + xp.reshape(hits.distance[0, ...], (-1, 1)) * directions
-        return _with_deepest(samples, surface, theta, hits.entering[0, ...], start, directions, REACH * width)
+        return _with_deepest(samples, surface, theta, entering[0, ...], start, directions, REACH * width)
 
 
 def _with_deepest(

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts import Camera, Part, Rate
+from rts import Camera, Part
 from rts.plugin_api.arrays import Tree
+from rts.plugin_api.records import Rate
 from rts_compare.moving_scenes import SceneFunction, parts_of
 
 
 class SceneAtRate(NamedTuple):
-    """A scene some of whose surfaces have another rate (`rts.Rate`).
+    """A scene some of whose surfaces have another rate (`rts.plugin_api.records.Rate`).
 
     Attributes:
         at: parameters → (parts, camera).

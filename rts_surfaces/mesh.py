@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rts import GBuffer, InputError, Part, Rate, TriangleSurface, engine_of, namespace
+from rts import GBuffer, InputError, Part, TriangleSurface, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, exemplar, unit
 from rts.plugin_api.checks import fingerprint, index_table, quoted
 from rts.plugin_api.operations import filled_up, interpolate, take, with_room
-from rts.plugin_api.records import Proxy, Samples
+from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from rts import Camera, InputError, Rate, TriangleSurface, engine_of
+from rts import Camera, InputError, TriangleSurface, engine_of
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_positive, is_count
-from rts.plugin_api.records import Proxy, Rays, Samples
+from rts.plugin_api.records import Proxy, Rate, Rays, Samples
 from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_error, shapes, split, triangles, uniform
 from rts_surfaces.view_cells import view_key, view_of
 

@@ -18,8 +18,8 @@ CAMERA = Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
 PART = rts.Mesh.example()
 FACES, VERTICES = np.array([(0, 1, 2), (0, 2, 3)], np.int32), np.eye(4, 3, dtype=np.float32)
 POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
-SAMPLED = rts.sample(PART, CAMERA, SIZE, splatter=None)
-SAMPLES = SAMPLED.samples[0]
+SAMPLED = rts.sample(PART, CAMERA, SIZE)
+BARE = rts.sample(PART, CAMERA, SIZE, splatter="none")
 NDC = rts.Ndc((1.0, 1.0))
 STEPS = rts.LargeSteps(FACES, 4)
 DOUBLE = Operation(
@@ -172,10 +172,6 @@ def open_in(function, *names, **fixed):
 
 
 GROUPS = {
-    "Adaptive": open_in(
-        lambda **o: rts.render(PART, CAMERA, SIZE, supersample=rts.Adaptive(**{"samples": 2, **o})),
-        *("samples", "dilated", "contrast"),
-    ),
     "BSpline": open_in(rts.BSpline, "tolerance", shape=(4, 4)),
     "Camera": {"aspect": lambda v: rts.render(PART, Camera(CAMERA.view, CAMERA.projection, v), SIZE)},
     "Fragments": open_in(lambda **o: drawn(Card(), sampler=Raster(**o)), "triangle_ids", "barycentrics", "depth"),
@@ -204,7 +200,9 @@ GROUPS = {
     "RayHits": open_in(lambda **o: drawn(Ball(**o), {}), "hit", "distance", "params", "ids"),
     "Revolution": open_in(rts.Revolution, "ends", "tolerance", heights=np.arange(5.0)),
     "Samples": open_in(
-        lambda **o: rts.render_samples(replace(SAMPLED, samples=[SAMPLES.replace(**o)]), PART, CAMERA),
+        lambda **o: rts.render_samples(
+            replace(BARE, samples=[BARE.samples[0].replace(**o)]), PART, CAMERA, splatter="none"
+        ),
         *("ids", "params", "row", "depth"),
     ),
     "Sdf": open_in(lambda **o: rts.Sdf(lambda t, p: p[:, 0], **o), "isovalue", "inside", "reads", "attributes"),
@@ -275,7 +273,7 @@ GROUPS = {
     ),
     "sample": open_in(
         lambda **o: rts.sample(**{"parts": PART, "camera": CAMERA, "size": SIZE, "splatter": None, **o}),
-        *("camera", "sampler", "supersample", "capacity", "engine", "settles"),
+        *("camera", "sampler", "supersample", "capacity", "engine"),
     ),
     "tune": open_in(
         tuned,

@@ -45,7 +45,7 @@ def mixed_of(number):
     parts = [_part(rng, x, small) for x in opaque]
     cameras = [_camera(rng, size) for _ in range(2)]
     layers = [2, 3, 2, 3, 1, 4, "auto", 6][rng.integers(8)]
-    supersample = [1, 1, 1, 2, rts.Adaptive(2), rts.Adaptive(2), rts.Adaptive(3)][rng.integers(7)]
+    supersample = [1, 1, 1, 2, 2, 2, 3][rng.integers(7)]
     return Mixed(parts, cameras, size, layers, supersample, rng.random() < 0.3)
 
 

@@ -8,29 +8,32 @@ import collections
 import contextlib
 import functools
 import itertools
+import time
 import warnings
 
 import numpy as np
+import pytest
 from helpers import arrays, derivative, gradient, to_numpy
 from mixed_scenes import mixed_of
 
 import rts
 from rts.arrays.trees import leaves, map_leaves
-from rts.splatting import Visible
+from rts.compiling import threads
+from rts.splatting import edges, edges_stacks
 
-FLAGS = ("whole", "views", "prepared", "enough", "specified", "forward", "numpy", "jax", "jit")
+FLAGS = ("threads", "views", "prepared", "enough", "specified", "forward", "numpy", "jax", "jit")
 """How a way differs from `rts.render` of torch arrays, and a gradient in reverse mode.
 
-- whole: no hidden sample is left out.
+- threads: on four threads, however little work there is.
 - views: `rts.render_views` of both cameras, in place of one call each.
 - prepared: by `rts.prepare`.
 - enough: with the least capacity that drops nothing.
-- specified: by the splatter in array code, on the samples of the compiled one.
+- specified: by the splatter in array code.
 - forward: a derivative in forward mode.
 - numpy, jax, jit: arrays of NumPy, of jax, and of jax in a compiled program.
 """
 
-NEVER = ({"numpy", "jax"}, {"numpy", "jit"}, {"jax", "jit"}, {"numpy", "forward"}, {"specified", "whole"})
+NEVER = ({"numpy", "jax"}, {"numpy", "jit"}, {"jax", "jit"}, {"numpy", "forward"})
 TOO_LONG = ({"specified", "jax"}, {"specified", "jit"})
 """Pairs that make no sense, and those that XLA compiles for minutes."""
 
@@ -93,11 +96,13 @@ def result_of(scene, way, view=0):
     compiled = __import__("jax").jit if "jit" in way else lambda f: f
     weights = np.random.default_rng(0).normal(size=(2, *scene.size, 4))[view : view + len(cameras)]
     options = {"layers": _layers(scene, way), "supersample": scene.supersample}
-    with _float64(engine), warnings.catch_warnings():
+    with _float64(engine), _patched(way), warnings.catch_warnings():
         for kind in IGNORED:
             warnings.simplefilter("ignore", kind)
         if "enough" in way:
-            options["capacity"] = least_capacity(scene, cameras, _splatter(way), options)
+            options["capacity"] = least_capacity(scene, cameras, options)
+        if "jit" in way:
+            options["capacity"] = room_for_breaks(scene, cameras, options)
         weights, still = arrays(engine, (weights, _values(scene)), np.float64)
         prepared = rts.prepare(scene.parts if scene.poses else _parts(scene, still)) if "prepared" in way else None
 
@@ -113,12 +118,12 @@ def result_of(scene, way, view=0):
         return to_numpy(compiled(images)(still)), _flat(slopes)
 
 
-def least_capacity(scene, cameras, splatter, options):
+def least_capacity(scene, cameras, options):
     """The least capacity with which no sample is dropped in any view."""
     parts = _parts(scene, _values(scene))
 
     def drops(capacity):
-        sampled = (rts.sample(parts, c, scene.size, splatter=splatter, capacity=capacity, **options) for c in cameras)
+        sampled = (rts.sample(parts, camera, scene.size, capacity=capacity, **options) for camera in cameras)
         return any(int(s.overflow) for s in sampled)
 
     low, high = 0, 1
@@ -128,6 +133,16 @@ def least_capacity(scene, cameras, splatter, options):
         middle = (low + high) // 2
         low, high = (middle, high) if drops(middle) else (low, middle)
     return high
+
+
+def room_for_breaks(scene, cameras, options):
+    """A capacity with which programs have room for the breaks of all views; None if they have it anyway."""
+    sampled = [rts.sample(_parts(scene, _values(scene)), camera, scene.size, **options) for camera in cameras]
+    most, row = max(len(s.outlines.gap) for s in sampled), sampled[0].row
+    given = options.get("capacity")
+    if most <= 8 * sum(row.shape[1:]):
+        return given
+    return max(4 * most, given or row.size)
 
 
 def _values(scene):
@@ -152,22 +167,24 @@ def _parts(scene, values, prepared=None):
 
 
 def _images(parts, cameras, size, way, options):
-    if "specified" in way and "views" not in way:  # On the very samples of the compiled splatter.
-        sampled = [rts.sample(parts, c, size, settles=True, **options) for c in cameras]
-        parts = parts if isinstance(parts, list) else list(parts.parts)
-        pairs = zip(sampled, cameras, strict=True)
-        images = [rts.render_samples(own, parts, camera, splatter=Visible()) for own, camera in pairs]
-    elif "views" in way:
-        return rts.render_views(parts, cameras, size, splatter=_splatter(way), **options)
-    else:
-        images = [rts.render(parts, camera, size, splatter=_splatter(way), **options) for camera in cameras]
+    if "views" in way:
+        return rts.render_views(parts, cameras, size, **options)
+    images = [rts.render(parts, camera, size, **options) for camera in cameras]
     return rts.namespace(images[0]).stack(images)
 
 
-def _splatter(way):
-    if "whole" in way:
-        return type("Every", (rts.plugin("splatters", "visible"),), {"needed": rts.Splatter.needed})()
-    return Visible() if "specified" in way else "visible"
+@contextlib.contextmanager
+def _patched(way):
+    """The library as a way wants it: with several threads for the least work, with array code in place of loops."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "threads" in way:
+            patch.setenv("RTS_NUM_THREADS", "4")
+            patch.setattr(threads, "LITTLE_WORK", 0)
+        if "specified" in way:
+            patch.setattr(edges, "EDGES", edges._specification)
+            patch.setattr(edges, "CELLS", edges_stacks._specification)
+            patch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
+        yield
 
 
 def _flat(tree):
@@ -211,13 +228,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("numbers", help="such as 0:500")
     parser.add_argument("--jax", type=int, default=5, help="jax at every so many numbers")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="stop after so many")
     given = parser.parse_args()
     first, last = map(int, given.numbers.split(":"))
+    began, number = time.monotonic(), first
     tried, found, worst = collections.Counter(), collections.defaultdict(set), collections.defaultdict(float)
     for number in range(first, last):
         scene = mixed_of(number)
         kind = "translucent" if scene.translucent else "opaque"
-        kind += ", Adaptive" if isinstance(scene.supersample, rts.Adaptive) else ""
         for way in ways_of(number, given.jax):
             tried[kind, name_of(way)] += 1
             for what, off in _differences_or_error(number, way):
@@ -225,7 +243,9 @@ def main():
                 found[key].add(number)
                 worst[key] = max(worst[key], off)
                 print(f"{number} {kind}, {name_of(way)}: {what} off by {off:.2g}", flush=True)
-    print(f"\n{last - first} scenes; scenes that differ, of so many tried")
+        if time.monotonic() - began > given.seconds:
+            break
+    print(f"\n{number + 1 - first} scenes; scenes that differ, of so many tried")
     for key in sorted(found):
         print(
             f"{' | '.join(key)}: {len(found[key])} of {tried[key[:2]]}, by up to {worst[key]:.2g}; {sorted(found[key])}"

@@ -163,7 +163,7 @@ CASES = {
     "rays": lambda: Case((rts.Part(Torus(), {"radii": np.array([0.9, 0.35])}, "normals"),), {"sampler": "rays"}),
     **{
         name: lambda name=name: Case((ball(),), {"splatter": name, "layers": 1 if name == "single" else 2})
-        for name in ("none", "single", "multi", "visible")
+        for name in ("none", "single", "multi", "edges")
     },
     "translucent": lambda: Case((ball(glass), ball("unlit", (0.4, 0.2, -1.5))), {"layers": 4}),
     **{
@@ -351,7 +351,7 @@ def test_arrays_on_two_devices_are_refused_in_one_line(place):
         {**tree, "view": CPU.put(arrays_of(case)["view"])},
         {**tree, "theta": [{**tree["theta"][0], "colors": CPU.put(case.parts[0].theta["colors"])}]},
     ):
-        with pytest.raises(rts.EngineError) as error:
+        with pytest.raises(rts.errors.EngineError) as error:
             image_of(case, mixed)
         assert "\n" not in str(error.value) and "on the devices" in str(error.value) and "cpu" in str(error.value)
 
@@ -360,7 +360,7 @@ def test_a_target_on_another_device_is_refused_in_one_line(place):
     if place.device == "cpu":
         pytest.skip("this is the CPU")
     target = CPU.put(rts.render(ball("lambert"), CAMERA, SIZE)) if place.engine == "torch" else None
-    with pytest.raises(rts.EngineError, match="on the devices .*cpu"):
+    with pytest.raises(rts.errors.EngineError, match="on the devices .*cpu"):
         rts.fit(rts.ImageResiduals(posed, CAMERA, SIZE, target), place.put({"pose": POSE}), steps=2, progress=False)
 
 

@@ -8,7 +8,6 @@ import trimesh
 from polygons import covered
 
 import rts
-from rts import InputError
 from rts.contracts.records import Outlines
 
 torch = pytest.importorskip("torch")
@@ -246,11 +245,6 @@ def test_prepared_parts_and_samples_are_drawn_alike():
 def test_two_layers_ask_for_no_second_sample():
     sampled = rts.sample(card(flat(SQUARE + 12)), in_pixels(), SIZE, splatter="edges", layers=2)
     assert sampled.row.shape[0] == 1
-
-
-def test_adaptive_samples_are_refused():
-    with pytest.raises(InputError, match="splatter .* finds outlines without further samples"):
-        edges(card(flat(SQUARE + 12)), supersample=rts.Adaptive(4))
 
 
 def test_no_colour_leaves_the_range_of_those_that_are_seen():

@@ -305,28 +305,3 @@ def test_layers_that_are_found_are_as_many_as_light_goes():
     np.testing.assert_allclose(image[12, 12], over(*[(np.eye(3)[i % 3], 0.3) for i in range(5)]), atol=1e-5)
     with pytest.warns(rts.errors.LayersWarning, match="of the light passes through the last of 2 layers"):
         drawn(parts, layers=2)
-
-
-def of_field(distance):
-    """A ball of glass without triangles, seen from a distance."""
-
-    def outside(theta, points):
-        return (points**2).sum(-1) ** 0.5 - theta["radius"]
-
-    def glass(theta, gbuffer, camera):
-        position = gbuffer["position"]
-        return np.concatenate([np.ones_like(position), 0.5 * np.ones_like(position[:, :1])], axis=1)
-
-    part = rts.Part(rts.Sdf(outside), {"radius": np.float32(0.8)}, glass)
-    return rts.render(part, rts.Camera.look_at((0, 0, distance), (0, 0, 0)), SIZE, splatter="edges")
-
-
-def test_of_glass_that_has_no_triangles_the_front_is_drawn_with_a_warning():
-    with pytest.warns(rts.errors.LayersWarning, match="use splatter='visible'"):
-        image = of_field(6)
-    assert image[12, 12, 3] == 0.5
-
-
-@pytest.mark.filterwarnings("ignore::rts.errors.LayersWarning")
-def test_a_field_that_ends_nowhere_in_the_image_is_drawn():
-    np.testing.assert_array_equal(of_field(1.0)[..., 3], 0.5)

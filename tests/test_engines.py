@@ -223,13 +223,13 @@ def test_torch_and_jax_in_one_scene_are_refused_by_name():
     scene = arrays("torch-cpu", SCENE)
     for key in ("vertices", "colors", "transform"):
         mixed = {**scene, key: arrays("jax", SCENE[key])}
-        with pytest.raises(rts.EngineError, match="jax and torch.*convert one side"):
+        with pytest.raises(rts.errors.EngineError, match="jax and torch.*convert one side"):
             image_of(mixed)
     with pytest.raises(TypeError, match="jax and torch"):
         rts.render(part_of(scene), camera_at(arrays("jax", SCENE["eye"])), SIZE)
     sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
     jax_scene = arrays("jax", SCENE)
-    with pytest.raises(rts.EngineError, match="jax and torch"):
+    with pytest.raises(rts.errors.EngineError, match="jax and torch"):
         rts.render_samples(sampled, part_of(jax_scene), camera_at(jax_scene["eye"]))
 
 
@@ -237,13 +237,15 @@ def test_arrays_of_no_engine_are_refused_by_type():
     class Strange:
         shape = (4, 4)
 
-    with pytest.raises(rts.EngineError, match="transform of part 0 .*Strange belongs to no engine; expected NumPy"):
+    with pytest.raises(
+        rts.errors.EngineError, match="transform of part 0 .*Strange belongs to no engine; expected NumPy"
+    ):
         rts.render(part_of({**SCENE, "transform": Strange()}), camera_at(SCENE["eye"]), SIZE)
 
 
 def test_numpy_has_no_derivatives_and_says_what_to_pass():
     engine = rts.plugin("engines", "numpy")()
-    with pytest.raises(rts.EngineError, match="torch or jax"):
+    with pytest.raises(rts.errors.EngineError, match="torch or jax"):
         engine.value_and_grad(lambda x: x)
 
 

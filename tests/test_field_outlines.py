@@ -5,11 +5,9 @@ import math
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, quick, to_numpy
-from rts.sampling.exits import outline_cells
 
 import rts
 from rts import Camera, Part
-from rts.plugin_api.records import Request
 from rts_surfaces.implicit.casting import deepest
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
@@ -138,15 +136,6 @@ def test_outlines_shift_with_the_surface(name, way):
     assert abs(grown) < 0.02 * area
 
 
-@pytest.mark.parametrize(("way", "name"), [("sdf", "box, turned"), ("lattice", "torus across")])
-def test_fine_samples_at_outlines_have_pairs_too(way, name):
-    torch = pytest.importorskip("torch")
-    f, q, eye, expected = SHAPES[name]
-    image, shift = coverage(f, eye, way, supersample=rts.Adaptive(4)), torch.tensor([SHIFT, SHIFT, SHIFT])
-    found = torch.func.jacfwd(lambda q: image(q, shift).sum() * PIXEL**2)(torch.tensor(q)).numpy()
-    np.testing.assert_allclose(found, expected(q), rtol=0.01, atol=0.01 * max(expected(q)))
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("way", ["sdf", "lattice"])
 def test_a_compiled_program_has_the_derivative_of_an_eager_one(way):
@@ -217,84 +206,28 @@ def test_rays_through_the_middle_of_a_wall_have_no_pair():
 # -------------------------------------------------------------------------------------------------------- samplers
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("capacity", [None, 6000])
-def test_pairs_lie_on_the_rays_of_cells_at_outlines(way, capacity):
-    f, q, eye, _ = SHAPES["torus across"]
+def paired(name, way):
+    """Outlines of a shape, and for each break that has a pair the positions (B, 2, 3) of both, in pixels."""
+    f, q, eye, _ = SHAPES[name]
     surface, options = WAYS[way](lambda theta, p: f(theta["q"], p))
     part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")
-    sampler = rts.plugin("samplers", options.get("sampler", "raster"))()
-    found = sampler.sample(part, camera(eye), SIZE, 2, Request(capacity, exits=True))
-    exits, row = np.asarray(found.exit), np.asarray(found.row)
-    assert exits.shape == (2, *SIZE)
-    there = exits[0] >= 0
-    np.testing.assert_array_equal(exits[1][there], exits[0][there] + 1)
-    assert (exits[1][~there] == -1).all() and not np.isin(exits[exits >= 0], row).any()
-    ends = np.zeros(SIZE, bool)
-    ends.reshape(-1)[outline_cells(row >= 0, np.asarray(found.depth))] = True
-    assert there.sum() > 0.9 * ends.sum() and not (there & ~ends).any()
-    points = np.asarray(surface.evaluate(part.theta, found)["position"])
-    for side in exits:
-        place = np.asarray(camera(eye).project(points[side[there]], SIZE))
-        y, x = np.nonzero(there)
-        np.testing.assert_allclose(place[:, :2], np.stack([x, y], axis=1) + 0.5, atol=2e-3)
-        assert (place[:, 2] > np.asarray(found.depth)[0][there] - 1e-4).all()
+    found = rts.sample(part, camera(eye), SIZE, **options)
+    points = np.asarray(surface.evaluate(part.theta, found.samples[0])["position"])
+    wide = camera(eye).for_size(SIZE).with_apron(SIZE, found.apron)
+    places = np.asarray(wide.project(points, found.row.shape[1:]))
+    return found.outlines, places[np.maximum(found.outlines.pair, 0)], places
 
 
-def pairs(name, size, **options):
-    """Cells (H, W) that have a pair, and the positions and motions (P, 2, 6) and lattice points (P, 2, 6) of pairs."""
-    f, q, eye, _ = SHAPES[name]
-    surface = Isosurface(BOUNDS, f=lambda theta, p: f(theta["q"], p), shape=SHAPE, **options)
-    part = Part(surface, {"q": np.array(q, np.float32)}, "silhouette")
-    found = rts.plugin("samplers", "raster")().sample(part, camera(eye), size, 2, Request(exits=True))
-    there, exits = found.exit[0] >= 0, np.asarray(found.exit)
-    places = exits[:, there].T
-    return there, np.asarray(found.params)[places, 9:15], np.asarray(surface.field.numbers(found))[places]
-
-
-@pytest.mark.parametrize("table", quick([True, False]))
-@pytest.mark.parametrize("name", quick(["box, turned", "ball", "torus across"]))
-def test_a_band_has_pairs_of_the_lattice(name, table):
-    """Nearly all where pixels are narrower than cells. Where they are wider, rays that leave the band have none.
-
-    Where the ray of a neighbour leaves the band, a pair stands on one ray, and tells nearly the same motion.
-    """
-    for width, least, most in ((160, 0.95, 1), (20, 0.05, 0.7)):
-        there, params, points = pairs(name, (width, width))
-        own, own_params, own_points = pairs(name, (width, width), band=NarrowBand(), table=table)
-        assert least * there.sum() <= own.sum() <= most * there.sum() and there[own].all()
-        params, same = params[own[there]], (own_points == points[own[there]]).all(axis=(1, 2))
-        np.testing.assert_allclose(own_params[same], params[same], atol=2e-3)
-        off = np.abs(own_params[:, :, 3:].mean(axis=1) - params[:, :, 3:].mean(axis=1)).max(axis=1)
-        assert off.max() < 0.2 and np.quantile(off, 0.9) < 0.02
-
-
-def test_listed_cells_have_the_pairs_of_the_whole_grid():
-    part, size = Isosurface.example().replace(shader="silhouette"), (24, 32)
-    view, sampler = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=40, aspect=4 / 3), rts.plugin("samplers", "raster")()
-    whole = sampler.sample(part, view, size, 2, Request(exits=True))
-    cells = np.arange(24 * 32, dtype=np.int32)[::-1].reshape(-1, 8)
-    listed = sampler.sample(part, view, size, 2, Request(cells=cells, exits=True))
-    of_whole, of_list = (np.asarray(x.params)[np.asarray(x.exit)] for x in (whole, listed))
-    of_whole[np.asarray(whole.exit) < 0] = of_list[np.asarray(listed.exit) < 0] = 0
-    np.testing.assert_array_equal(of_list.reshape(2, -1, 16)[:, ::-1], of_whole.reshape(2, -1, 16))
-    assert np.asarray(whole.exit).max() > 0
-
-
-def test_outlines_are_where_fronts_end():
-    covered, depth = np.zeros((2, 5, 6), bool), np.zeros((2, 5, 6), np.float32)
-    covered[0, 1:4, 1:5] = True
-    depth[0, 1:4, 1:5] = 1
-    found = np.zeros((5, 6), bool)
-    found.reshape(-1)[outline_cells(covered, depth)] = True
-    expected = covered[0].copy()
-    expected[2, 2:4] = False
-    np.testing.assert_array_equal(found, expected)
-    covered[0] = covered[1, :, :3] = True
-    depth[0, :, :3], depth[1, :, :3], depth[0, :, 3:] = 1, 2.1, 2
-    found = np.zeros((5, 6), bool)
-    found.reshape(-1)[outline_cells(covered, depth)] = True
-    assert found[:, 2:4].all() and found.sum() == 10
+@pytest.mark.parametrize("way", WAYS)
+def test_pairs_lie_on_the_rays_of_the_last_samples_behind_them(way):
+    outlines, pairs, places = paired("torus across", way)
+    there, index = outlines.pair[:, 0] >= 0, np.arange(len(outlines.near))
+    # Rays leave a band where pixels are wider than cells.
+    assert there.mean() > (0.1 if way == "band" else 0.9) and (outlines.pair[~there] == -1).all()
+    last = places[outlines.rows[index, np.minimum(outlines.near, 1)]]
+    for side in (0, 1):
+        np.testing.assert_allclose(pairs[there, side, :2], last[there, :2], atol=2e-3)
+        assert (pairs[there, side, 2] > last[there, 2] - 1e-4).all()
 
 
 def test_views_together_have_the_gradients_of_views_alone():

@@ -38,7 +38,8 @@ def test_a_right_gradient_agrees_with_the_difference(target):
     names = [s.name for s in check.slopes]
     assert names == ["color[0]", "color[1]", "color[2]", "shift[0]", "shift[1]", "shift[2]"]
     for s in check.slopes:
-        assert abs(s.autodiff - s.difference) <= 0.05 * abs(s.difference) + 3 * s.error
+        # A sum of squares ripples as outlines pass pixels; a difference over a pixel averages it, the slope does not.
+        assert abs(s.autodiff - s.difference) <= 0.1 * abs(s.difference) + 3 * s.error
     assert check.slopes[5].difference == pytest.approx(0, abs=1e-6)  # Orthographic: depth is not seen.
     assert [(r.kind, r.parameters) for r in check.reasons] == [("undetermined", ["shift[2]"])]
 
@@ -202,7 +203,7 @@ def test_images_that_jax_cannot_trace_and_arrays_of_two_engines():
     parameters = parameters_of("jax")
     for image, kind, said in (
         (lambda q: rts.render(*card(q), SIZE) * float(q["shift"][0]), rts.InputError, "jax cannot trace the function"),
-        (lambda q: rts.render(*card(q), SIZE) * torch.ones(1), rts.EngineError, "torch and jax arrays met"),
+        (lambda q: rts.render(*card(q), SIZE) * torch.ones(1), rts.errors.EngineError, "torch and jax arrays met"),
     ):
         with pytest.raises(kind, match=said) as error:
             rts.gradient_image(image, parameters, ALONG)
@@ -229,6 +230,7 @@ def test_a_derivative_of_the_wrong_sign_differs_however_small_beside_others():
 
 TURNED = 7.0 * np.array([(np.cos(a), np.sin(a), 0) for a in 0.3 + np.pi / 2 * np.arange(4)])
 """A square of side 7 √2, of area 98; a world unit is a pixel."""
+CALIBRATED = rts.splatting.Multi(epsilon=1e-3, calibration=None)
 LARGER = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=20)
 
 
@@ -238,7 +240,15 @@ def square(shift):
 
 
 def checked(target, loss, **options):
-    given = {"entries": 3, "samples": 2, "hessian": True, "budget_s": 600, "splatter": "visible", "layers": 2} | options
+    given = {
+        "entries": 3,
+        "samples": 2,
+        "hessian": True,
+        "budget_s": 600,
+        "splatter": CALIBRATED,
+        "layers": 2,
+        **options,
+    }
     return rts.check_gradient(square, arrays(target, np.array([0.1, 0.2, 0.0])), (20, 20), loss=loss, **given)
 
 

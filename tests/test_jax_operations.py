@@ -1,12 +1,15 @@
 """Projection and interpolation of packed samples in jax: the same as in plain jax, in every transform."""
 
+import contextlib
 import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from fast_splatter.rts_fast_splatter import FastSingle
 from helpers import icosphere
+from samples import cells
 
 import rts
 from rts.operations.combine import COMBINE, combine, interpolate
@@ -16,14 +19,30 @@ pytestmark = pytest.mark.engines
 
 jax = pytest.importorskip("jax")
 export = pytest.importorskip("jax.export")
-test_fused_jax = pytest.importorskip("test_fused_jax")
 jax_operations = pytest.importorskip("rts_backends.jax_engine.operations")
 host = pytest.importorskip("rts_backends.jax_engine.host")
 jnp = jax.numpy
-MODES, close, x64 = test_fused_jax.MODES, test_fused_jax.close, test_fused_jax.x64
+
+MODES = {"eager": lambda f: f, "jit": jax.jit}
 
 COLUMN, ROWS, COUNT = 3, 5, 7
 IDS = np.random.default_rng(2).integers(0, ROWS, (COUNT, 6)).astype(np.int32)
+
+
+def close(found, expected, tolerance=1e-4):
+    """Equal to a share of the largest."""
+    expected = np.asarray(expected)
+    assert np.isfinite(expected).all() and np.abs(expected).max() > 1e-3
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max())
+
+
+@contextlib.contextmanager
+def x64():
+    jax.config.update("jax_enable_x64", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", False)
 
 
 def projected(rows, points):
@@ -279,12 +298,12 @@ def test_weights_that_do_not_count_have_no_gradient():
         close(pull(value)[0], jnp.pad(expected, ((0, 0), (0, 2))), 1e-5)
 
 
-SPLATTER = test_fused_jax.KINDS["visible"]()
+SPLATTER = FastSingle()
 VIEW = jnp.asarray([[1, 0, 0, 0.02], [0, 1, 0, -0.01], [0, 0, 0, 1], [0, 0, 1, 0]], jnp.float32)
 
 
 def test_a_projection_and_a_splat_in_programs_are_those_outside():
-    positions, rgba, row = test_fused_jax.scene32(2, (6, 8))
+    positions, rgba, row = map(jnp.asarray, cells(2, (6, 8), dtype=np.float32))
     weights = numbers(6, 8, 4)
 
     def image(view, points, rgba):
@@ -302,7 +321,7 @@ def test_a_projection_and_a_splat_in_programs_are_those_outside():
 
 
 def test_gradients_in_the_place_of_operands_leave_what_is_read_later():
-    positions, rgba, row = test_fused_jax.scene32(2, (6, 8))
+    positions, rgba, row = map(jnp.asarray, cells(2, (6, 8), dtype=np.float32))
     weights = numbers(6, 8, 4)
 
     def both(positions, rgba, later):

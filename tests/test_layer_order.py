@@ -240,9 +240,9 @@ def spoiled(array, at):
         (lambda s: s.replace(row=np.where(s.row < 0, 0, s.row)), "another number to a row"),
         (
             lambda s: s.replace(row=s.row[:2]),
-            r"gave row of shape \(2, 32, 36\) and dtype int32; expected \(3, 32, 36\)",
+            r"gave row of shape \(2, 28, 32\) and dtype int32; expected \(3, 28, 32\)",
         ),
-        (lambda s: s.replace(depth=s.depth[0]), r"gave depth of shape \(32, 36\)"),
+        (lambda s: s.replace(depth=s.depth[0]), r"gave depth of shape \(28, 32\)"),
         (
             lambda s: s.replace(depth=spoiled(s.depth, (0, 12, 14))),
             "gave 1 depths that are not finite; set their rows to −1",

@@ -198,9 +198,7 @@ def test_on_curved_surfaces_it_is_what_uv_changes_by_from_pixel_to_pixel(make):
 def test_more_samples_have_smaller_footprints():
     vertices, faces = quad(-1.5, 1.5, -1.2, 1.2)
     part = mesh_part((vertices, faces), theta={"uv": CORNERS}, shader=footprint_of_u)
-    coarse, fine, adaptive = (
-        show(part, FRONT, splatter="none", supersample=s)[..., 0] for s in (1, 4, rts.Adaptive(4))
-    )
+    coarse, fine = (show(part, FRONT, splatter="none", supersample=s)[..., 0] for s in (1, 4))
     inside = coarse > 0
     step = 1 / 3 * 4 / 20
     np.testing.assert_allclose(coarse[inside], step, rtol=1e-4)
@@ -209,9 +207,6 @@ def test_more_samples_have_smaller_footprints():
         for shift in (-1, 1):
             deep &= np.roll(inside, shift, axis)
     np.testing.assert_allclose(fine[deep], step / 4, rtol=1e-4)
-    near_outline = np.isclose(adaptive, step / 4, rtol=1e-3)
-    assert (near_outline | np.isclose(adaptive, step, rtol=1e-3))[deep].all()
-    assert near_outline[deep].any() and not near_outline[10, 12]
 
 
 # -------------------------------------------------------------------------------------------------- the images

@@ -24,7 +24,7 @@ PART = Mesh.example()
 Bezier = rts.plugin("surfaces", "bezier")
 Sdf = rts.plugin("surfaces", "sdf")
 PATCH, VASE, PAWN = (rts.plugin("surfaces", name).example() for name in ("bezier", "bspline", "revolution"))
-SAMPLED = rts.sample(PART, CAMERA, SIZE, splatter=None)
+SAMPLED = rts.sample(PART, CAMERA, SIZE)
 K = np.array([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]])
 
 
@@ -176,8 +176,8 @@ CALLS = {
     "splat.positions": lambda v: splatter().splat(v, np.ones((1, 4), np.float32), np.zeros((1, 2, 2), np.int32)),
     "splat.rgba": lambda v: splatter().splat(np.ones((1, 3), np.float32), v, np.zeros((1, 2, 2), np.int32)),
     "splat.row": lambda v: splatter().splat(np.ones((1, 3), np.float32), np.ones((1, 4), np.float32), v),
-    "splatter.sigma": lambda v: rts.plugin("splatters", "visible")(sigma=v),
-    "splatter.calibration": lambda v: rts.plugin("splatters", "visible")(calibration=v),
+    "splatter.sigma": lambda v: rts.plugin("splatters", "multi")(sigma=v),
+    "splatter.calibration": lambda v: rts.plugin("splatters", "multi")(calibration=v),
     "exact_calibration.sigma": rts.splatting.exact_calibration,
     "gradient.f": lambda v: gradient(v, np.zeros((1, 3))),
     "combine.rows": lambda v: combine(v, np.zeros((1, 1), np.int32), np.ones((1, 1), np.float32)),
@@ -276,7 +276,7 @@ def scene(pose):
 
 
 def splatter():
-    return rts.plugin("splatters", "visible")()
+    return rts.plugin("splatters", "multi")()
 
 
 OPTIONAL = """

@@ -5,19 +5,16 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, relative_error, to_numpy
-from rts.operations.inset import INSET, PAINTED, painted_inset, with_inset
-from rts_backends.fused.image import IMAGE
 
 import rts
 from rts.operations import linear, projection
 from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
-from rts.operations.take import SHIFTED, TAKE, take
+from rts.operations.take import TAKE, take
 from rts.plugin_api.operations import Operation
 from rts.scene.rigid import RIGID
 from rts.testing import OperationConformance
-from rts.testing.splatters import scattered
 
 pytestmark = pytest.mark.engines
 
@@ -85,60 +82,6 @@ def test_combine_refuses_what_does_not_fit_in_one_line():
     for target in ALL:
         with pytest.raises(rts.InputError, match="refer to row 9 of 4 rows; sample this surface anew"):
             to_numpy(combine(*arrays(target, (rows, ids + 9, weights))))
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_an_inset_is_the_mean_of_cells_where_there_is_one(target):
-    image, fine = RNG.normal(size=(3, 4, 2)), RNG.normal(size=(4, 6, 2))
-    pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
-
-    def expected(image, fine):
-        means = fine.reshape(2, 2, 3, 2, 2).mean(axis=(1, 3)).reshape(6, 2)
-        return np.where((pixel >= 0)[..., None], means[np.maximum(pixel, 0)], image)
-
-    places = arrays(target, pixel)
-    put = lambda x: with_inset(x[0], x[1], places, 2)  # noqa: E731
-    given = list(arrays(target, (image, fine)))
-    np.testing.assert_allclose(to_numpy(put(given)), expected(image, fine), atol=1e-6)
-    if target == "numpy":
-        return
-    moves, factors = [RNG.normal(size=x.shape) for x in (image, fine)], RNG.normal(size=image.shape)
-    along = derivative(target, put, given, list(arrays(target, moves)))[1]
-    np.testing.assert_allclose(along, expected(*moves), atol=1e-6)
-    pulled = gradient(target, lambda x: (put(x) * arrays(target, factors)).sum(), given)
-    np.testing.assert_allclose(
-        sum((a * b).sum() for a, b in zip(pulled, moves, strict=True)), (factors * along).sum(), rtol=1e-4
-    )
-    assert (np.abs(pulled[1]).max(axis=2) > 0).sum() == 4 * 4
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_a_painted_inset_is_the_inset_of_an_image_of_one_color(target):
-    color, fine = RNG.normal(size=2), RNG.normal(size=(4, 6, 2))
-    pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
-    rng = np.random.default_rng(0)
-    row, settled = rng.integers(-3, 3, size=(5, 6), dtype=np.int32), rng.integers(-2, 1, size=(5, 6), dtype=np.int8)
-    shown = ((row >= 0) | (settled >= 0))[1:-1, 1:-1]
-    assert 0 < shown[pixel < 0].sum() < (pixel < 0).sum()
-
-    def expected(color, fine):
-        means = fine.reshape(2, 2, 3, 2, 2).mean(axis=(1, 3)).reshape(6, 2)
-        return np.where((pixel >= 0)[..., None], means[np.maximum(pixel, 0)], shown[..., None] * color)
-
-    beside = arrays(target, (pixel, row, settled))
-    paint = lambda x: painted_inset(x[0], x[1], *beside, 2)  # noqa: E731
-    given = list(arrays(target, (color, fine)))
-    np.testing.assert_allclose(to_numpy(paint(given)), expected(color, fine), atol=1e-6)
-    if target == "numpy":
-        return
-    moves, factors = [RNG.normal(size=x.shape) for x in (color, fine)], RNG.normal(size=(3, 4, 2))
-    along = derivative(target, paint, given, list(arrays(target, moves)))[1]
-    np.testing.assert_allclose(along, expected(*moves), atol=1e-6)
-    pulled = gradient(target, lambda x: (paint(x) * arrays(target, factors)).sum(), given)
-    np.testing.assert_allclose(pulled[0], factors[shown & (pixel < 0)].sum(axis=0), rtol=1e-4)
-    np.testing.assert_allclose(
-        sum((a * b).sum() for a, b in zip(pulled, moves, strict=True)), (factors * along).sum(), rtol=1e-4
-    )
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -352,12 +295,6 @@ def test_take_adds_gradients_of_rows_that_are_taken_twice(target):
 # ------------------------------------------------------------------------------------------- all of them, by the kit
 
 
-def splatted():
-    """Operands of the image of two layers with holes, and settings, whose specification jax compiles fast."""
-    splatter, splats = rts.plugin("splatters", "single")(), scattered()
-    return splatter._operands(splats), {"settings": splatter._settings_of(splats)}
-
-
 def cases():
     """Each operation with operands and parameters; those of surfaces are in tests of these."""
     rng = np.random.default_rng(3)
@@ -365,23 +302,15 @@ def cases():
     rows, ahead = rng.normal(size=(7, 3)), rng.normal(size=(3, 4, 4)) * 0.3 + np.diag([0, 0, 0, 6])[[0, 1, 3, 2]]
     points, places = rng.normal(size=(20, 3)), np.array([[0, 0, 1], [9, 9, 9], [20, 10, 0.5]])
     view = np.array([1] * 8 + [3] * 12, np.int32)
-    image, fine = rng.normal(size=(3, 4, 2)), rng.normal(size=(4, 6, 2))
-    pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
-    row, settled = rng.integers(-3, 3, size=(5, 6), dtype=np.int32), rng.integers(-2, 1, size=(5, 6), dtype=np.int8)
-    given, options = splatted()
     return {
         "combine": (COMBINE, [rows, rng.normal(size=(20, 6)), ids], {"column": 2, "count": 4, "affine": False}),
         "interpolate": (COMBINE, [rows, rng.random((20, 2)), ids], {"column": 1, "count": 3, "affine": True}),
         "take": (TAKE, [rows, index], {}),
-        "take_shifted": (SHIFTED, [rows, index, points], {}),
         "rigid": (RIGID, [rng.normal(size=6), rng.normal(size=3)], {}),
         "affine": (linear.AFFINE, [rng.normal(size=(5, 4)), points], {}),
         "affine_of_views": (linear.VIEWS, [rng.normal(size=(3, 2, 4)), points, view], {}),
         "projection": (projection.PROJECTION, [ahead[0], points], {}),
         "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
-        "inset": (INSET, [image, fine, pixel], {"side": 2}),
-        "painted_inset": (PAINTED, [rng.normal(size=2), fine, pixel, row, settled], {"side": 2}),
-        "image": (IMAGE, given, options),
         "a stranger's": (CLAMP, operands(), {"power": 2}),
     }
 

@@ -159,19 +159,6 @@ def test_without_a_covered_cell_there_is_a_ray_of_the_first_pixel():
 PARTS = {"bezier": Bezier.example, "bspline": BSpline.example, "revolution": Revolution.example}
 
 
-@pytest.mark.parametrize("shader", ["silhouette", "lambert"])
-@pytest.mark.parametrize("name", PARTS)
-def test_images_are_the_same_without_hidden_samples(name, shader):
-    part, size = PARTS[name]().replace(shader=shader), (90, 110)
-    images, counts = [], []
-    for chosen in (None, "visible"):
-        sampled = rts.sample(part, CAMERA, size, splatter=chosen, layers=3)
-        images.append(rts.render_samples(sampled, part, CAMERA))
-        counts.append((sampled.row >= 0).sum())
-    np.testing.assert_allclose(images[1], images[0], rtol=0, atol=1e-6)
-    assert counts[1] < counts[0]
-
-
 def test_newells_teapot_has_few_triangles_and_samples_at_the_centres_of_pixels(data):
     (part,) = rts.load(data / "bezier" / "teapot_patches.txt", surface="bezier")
     camera, size = Camera.look_at((5, -11, 6), (0.2, 0, 1.4), (0, 0, 1), fov_y=30), (256, 256)

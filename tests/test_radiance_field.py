@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, gradient, icosphere, mesh_part, relative_error, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, gradient, icosphere, mesh_part, relative_error, to_numpy
 
 import rts
 from rts import Camera, InputError, Ndc
@@ -336,35 +336,6 @@ def test_engines_agree_on_images_and_gradients():
         gradients.append(gradient(target, loss, part.theta["weights"]))
     for found in gradients[1:]:
         compared(found, gradients[0], 1e-3)
-
-
-@pytest.mark.parametrize("name", ["weights", "values"])
-def test_samples_where_outlines_are_have_the_colours_and_gradients_of_many_everywhere(name):
-    """A network on a mesh, and a lattice in NDC."""
-    part = surface(TORCH[0]) if name == "weights" else Projected.example()
-    part = part.replace(theta=arrays(TORCH[0], part.theta))
-    camera = CAMERA if name == "weights" else Camera.look_at((0.1, 0.2, 2.5), (0, 0, 0), fov_y=40)
-    sampled = rts.sample(part, camera, SIZE, supersample=rts.Adaptive(2), splatter=None)
-    active = to_numpy(sampled.fine.pixel) >= 0
-    images = {s: to_numpy(rts.render(part, camera, SIZE, supersample=s)) for s in (1, 2, rts.Adaptive(2))}
-    found = images[rts.Adaptive(2)]
-    assert 0.1 < active.mean() < 0.9 and np.abs(images[1] - images[2])[active].max() > 0.05
-    np.testing.assert_allclose(found[active], images[2][active], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(found[~active], images[1][~active], rtol=0, atol=1e-5)
-
-    factor = arrays(TORCH[0], np.random.default_rng(5).standard_normal((*SIZE, 4)) * active[..., None])
-
-    def slope(samples):
-        def loss(x):
-            moved = part.replace(theta={**part.theta, name: x})
-            return (rts.render(moved, camera, SIZE, supersample=samples) * factor).sum()
-
-        return gradient(TORCH[0], loss, part.theta[name])
-
-    if name == "weights":
-        compared(slope(rts.Adaptive(2)), slope(2), 1e-4)
-    else:
-        assert relative_error(slope(rts.Adaptive(2)), slope(2)) < 1e-3
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

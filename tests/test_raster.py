@@ -414,31 +414,3 @@ def test_a_corner_far_outside_does_not_bend_a_thin_triangle(x):
     expected = np.full((5, 7), -1)
     expected[0, 0 if x < 0 else 6] = 0
     np.testing.assert_array_equal(found.triangle_ids[0], expected)
-
-
-@pytest.mark.parametrize("name", ["raster", "reference", "embree"])
-def test_of_no_cells_there_are_no_fragments(name):
-    if name == "embree":
-        pytest.importorskip("embreex")
-    vertices, faces = icosphere(1)
-    sampler = rts.plugin("samplers", name)()
-    camera = Camera(VIEW, LENS)
-    prepared = sampler.prepare(Proxy(vertices.astype(np.float32), np.asarray(faces, np.int32)))
-    found = sampler.rasterize_cells(prepared, camera, SIZE, 2, "none", np.zeros((1, 0), np.int32))
-    assert found.triangle_ids.shape == found.depth.shape == (2, 1, 0)
-
-
-@pytest.mark.parametrize(
-    "cells, wrong",
-    [
-        ([3, 4, SIZE[0] * SIZE[1]], f"cell {SIZE[0] * SIZE[1]}, .* beyond the grid's {SIZE[0]} × {SIZE[1]}"),
-        ([3, -1, 2**31 - 1], f"cell {2**31 - 1}, .* beyond"),
-        ([7, 9, -1, -1, 7], "cell 7, which is there twice"),
-    ],
-)
-def test_cells_that_are_no_cells_or_there_twice_are_refused(cells, wrong):
-    vertices, faces = icosphere(1)
-    sampler = rts.plugin("samplers", "raster")()
-    prepared = sampler.prepare(Proxy(vertices.astype(np.float32), np.asarray(faces, np.int32)))
-    with pytest.raises(rts.InputError, match=wrong):
-        sampler.rasterize_cells(prepared, Camera(VIEW, LENS), SIZE, 2, "none", np.array([cells], np.int32))

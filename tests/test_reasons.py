@@ -407,6 +407,7 @@ def test_shares_tell_what_explains_most():
     found = check(outlines, mended=False)
     assert {r.kind for r in found.reasons} == {"outlines"} and "% of the disagreement" in found.reasons[0].text
 
+
 def test_a_budget_that_is_spent_is_told():
     begun = time.perf_counter()
     found = check(numpy_transform, mended=False, budget_s=1e-3)

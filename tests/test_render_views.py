@@ -23,8 +23,6 @@ OPTIONS = (
     {},
     {"layers": "auto"},
     {"supersample": 2},
-    {"supersample": rts.Adaptive(2)},
-    {"supersample": rts.Adaptive(2, contrast=0.2)},
     {"background": (0.2, 0.4, 1.0)},
     {"splatter": "multi", "sampler": "reference"},
 )
@@ -183,7 +181,7 @@ def test_compiled_silhouettes_are_those_of_a_loop(capacity):
 
 def test_what_does_not_fit_is_left_out_of_its_own_view():
     jax = pytest.importorskip("jax")
-    part = mesh_part(icosphere(1), shader="silhouette")
+    part = mesh_part(icosphere(1), shader="normals")
     cameras = [CAMERAS[0], *(Camera.look_at(np.array(eye) * 2, (0, 0, 0), fov_y=45) for eye in EYES[1:])]
 
     def images(vertices):

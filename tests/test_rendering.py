@@ -443,7 +443,7 @@ def test_bad_values_in_tensors_are_input_errors_too(target):
 def test_every_error_is_an_error_of_the_library_and_of_its_python_kind():
     assert issubclass(rts.InputError, (rts.RtsError, ValueError))
     assert issubclass(rts.InputError, ValueError) and issubclass(rts.InputError, rts.RtsError)
-    assert issubclass(rts.EngineError, TypeError) and issubclass(rts.EngineError, rts.RtsError)
+    assert issubclass(rts.errors.EngineError, TypeError) and issubclass(rts.errors.EngineError, rts.RtsError)
     assert issubclass(rts.PluginError, ImportError) and issubclass(rts.PluginError, rts.RtsError)
 
 

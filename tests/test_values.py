@@ -430,7 +430,7 @@ def test_an_engine_by_name_computes_a_numpy_scene(engine):
 def test_an_engine_of_another_name_than_that_of_the_arrays_is_refused():
     torch = pytest.importorskip("torch")
     pytest.importorskip("jax")
-    with pytest.raises(rts.EngineError, match="engine is 'jax', but the scene has torch arrays"):
+    with pytest.raises(rts.errors.EngineError, match="engine is 'jax', but the scene has torch arrays"):
         show(made(vertices=torch.tensor(VERTICES)), engine="jax")
     with pytest.raises(InputError, match="no engine named 'tensorflow'"):
         show(engine="tensorflow")

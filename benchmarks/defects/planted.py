@@ -41,8 +41,8 @@ LOOPS = [
     Defect(
         "merging takes the deeper part first",
         "rts/sampling/merging_loops.py",
-        "own_depth[b, y, x] < depth[a, y, x]",
-        "own_depth[b, y, x] > depth[a, y, x]",
+        "own_depth[b] < depth[a]",
+        "own_depth[b] > depth[a]",
         "merging_invariants rendering",
     ),
     Defect(

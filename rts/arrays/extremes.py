@@ -6,12 +6,15 @@ import numpy as np
 
 from rts.compiling.threads import parallel, read_only
 
+FEW = 1 << 14
+"""Numbers of which NumPy finds extremes before a compiled loop has begun."""
+
 
 def largest(x: np.ndarray) -> float:
     """The largest absolute value in an array of floats; 0 if it is empty, NaN if any value is NaN."""
     from rts.arrays import extremes_loops
 
-    if x.dtype != np.float32:
+    if x.dtype != np.float32 or x.size < FEW:
         return float(max(x.max(initial=0), -x.min(initial=0)))
     bits = read_only(x).reshape(-1).view(np.int32)
     maxima = np.zeros(max(1, -(-bits.size // extremes_loops.CHUNK)), np.int32)
@@ -21,7 +24,7 @@ def largest(x: np.ndarray) -> float:
 
 def extent(x: np.ndarray) -> tuple[int, int]:
     """The least and the largest number in a non-empty array of integers."""
-    if x.dtype != np.int32:
+    if x.dtype != np.int32 or x.size < FEW:
         return int(x.min()), int(x.max())
     return _ends(x, np.empty(0, np.bool_))
 
@@ -30,7 +33,7 @@ def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
     """A bool mask, true where integers `x` are not negative; and the least and the largest number in `x` and −1."""
     if not x.size:
         return np.zeros(x.shape, np.bool_), -1, -1
-    if x.dtype == np.int32:
+    if x.dtype == np.int32 and x.size >= FEW:
         mask = np.empty(x.shape, np.bool_)
         least, most = _ends(x, mask)
     else:

@@ -21,7 +21,7 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.shader import FunctionShader, Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import RaySurface, Surface, TriangleSurface
-from rts.errors import AspectWarning, InputError, PluginError, warn
+from rts.errors import AspectWarning, InputError, PluginError, warn, warn_deprecated
 from rts.plugin_base import check_members, promised
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -202,6 +202,9 @@ def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sample
 
 def check_splatter(chosen: Any) -> Splatter:
     """A usable splatter from a name, a class or an object."""
+    if isinstance(chosen, str) and chosen == "visible":
+        warn_deprecated("splatter 'visible'", "'edges', which it now is", until="0.4")
+        chosen = "edges"
     splatter = checked_plugin(registry.instance("rts.splatters", chosen), "the splatter", Splatter)
     if not is_count(splatter.reach):
         raise InputError(f"reach of {splatter!r} is {splatter.reach!r}; expected cells, an integer of at least 1")

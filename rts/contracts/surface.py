@@ -40,7 +40,26 @@ class Rate(NamedTuple):
     theta: Callable[[Mapping[str, Tree]], Mapping[str, Tree]] | None = None
 
 
-class Surface(Plugin):
+class Evaluator(Plugin):
+    """The step from samples to points of a surface; the paper's S(θ, U)."""
+
+    @abc.abstractmethod
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """Points of the surface and their attributes, in local space; differentiable in θ.
+
+        Write it over the array namespace of θ (`rts.namespace`), and every engine can run it.
+
+        Args:
+            theta: the entries of θ that it reads.
+            samples: the points to evaluate, without derivative. Rows that no cell refers to are all zero, and must
+                give finite values.
+
+        Returns:
+            "position" (N, 3) and further attributes, each (N, C), in θ's dtype.
+        """
+
+
+class Surface(Evaluator):
     """The topology of a surface, such as the triangles of a mesh; immutable. Its numbers, such as vertices, come as θ.
 
     Subclass `TriangleSurface`, `RaySurface`, or both. Several threads may call its methods at once.
@@ -55,21 +74,6 @@ class Surface(Plugin):
     sample_widths: tuple[int, int] = (-1, -1)
     centered: bool = True
     param_step: float = 2**-8
-
-    @abc.abstractmethod
-    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
-        """Points of the surface and their attributes, in local space; differentiable in θ.
-
-        Write it over the array namespace of θ (`rts.namespace`), and every engine can run it.
-
-        Args:
-            theta: the entries that `Surface.reads` names.
-            samples: the points to evaluate, without derivative. Rows that no cell refers to are all zero, and must
-                give finite values.
-
-        Returns:
-            "position" (N, 3) and further attributes, each (N, C), in θ's dtype.
-        """
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line if an entry of θ is missing or of a wrong shape; values may be traced.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
+from rts.arrays.engines import namespace
 from rts.arrays.trees import Array
 from rts.compiling.threads import parallel, read_only
 from rts.errors import InputError
@@ -21,15 +20,6 @@ def take(rows: Array, index: Array) -> Array:
         InputError: on the host, an index names no row.
     """
     return TAKE(rows, index)
-
-
-def take_shifted(rows: Array, index: Array, shift: Array) -> Array:
-    """Rows (M, C) of an array (V, C), by their indices (M,), plus a shift (M, C) that has no derivative.
-
-    Raises:
-        InputError: on the host, an index names no row.
-    """
-    return SHIFTED(rows, index, shift)
 
 
 def _specification(rows: Array, index: Array) -> Array:
@@ -49,20 +39,11 @@ def _shape(rows: tuple[int, ...], index: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
-    rows, index = operands
-    _put(rows, index, np.empty((0, rows.shape[1]), rows.dtype), out)
-
-
-def _put(rows: np.ndarray, index: np.ndarray, shift: np.ndarray, out: np.ndarray) -> None:
-    """Fill `out` (M, C) with the indexed rows plus a shift (M, C), or (0, C) for none.
-
-    Raises:
-        InputError: an index names no row.
-    """
     from rts.operations import take_loops
 
+    rows, index = operands
     index, bad = read_only(index, np.int32 if index.dtype.itemsize < 8 else np.int64), np.zeros(1, np.bool_)
-    parallel(take_loops.put, len(index), read_only(rows), index, read_only(shift), out, bad, work=2 * out.size)
+    parallel(take_loops.put, len(index), read_only(rows), index, out, bad, work=2 * out.size)
     if bad[0]:
         _check(index, len(rows))
 
@@ -79,32 +60,4 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
         take_loops.add(np.ascontiguousarray(g), operands[1], results[0])
 
 
-_PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
-TAKE = Operation("rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, **_PACKED)
-
-
-def _specified_shift(rows: Array, index: Array, shift: Array) -> Array:
-    xp, still = namespace(rows, index), engine_of(shift).stop_gradient(shift)
-    return _specification(rows, index) + xp.astype(still, rows.dtype)
-
-
-def _shifted_shape(rows: tuple[int, ...], index: tuple[int, ...], shift: tuple[int, ...]) -> tuple[int, ...]:
-    return shift
-
-
-def _shifted(operands: Arrays, out: np.ndarray) -> None:
-    rows, index, shift = operands
-    _put(rows, index, shift, out)
-
-
-SHIFTED = Operation(
-    "rts.take_shifted",
-    _specified_shift,
-    (2, 1, 2),
-    _shifted_shape,
-    _shifted,
-    _push,
-    _pull,
-    packed=(1, 2),
-    packed_result=True,
-)
+TAKE = Operation("rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, packed=(1,), packed_result=True)

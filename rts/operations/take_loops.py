@@ -6,10 +6,10 @@ from rts.compiling.loops import loop
 
 
 @loop
-def put(start, stop, rows, index, shift, out, bad):
-    """Fill rows [start, stop) of `out` (M, C) with the rows of (V, C) that `index` (M,) names, plus `shift` (M, C).
+def put(start, stop, rows, index, out, bad):
+    """Fill rows [start, stop) of `out` (M, C) with the rows of (V, C) that `index` (M,) names.
 
-    An empty `shift` is none. `bad` (1,) is set if an index names no row; that row of `out` is left unwritten.
+    `bad` (1,) is set if an index names no row; that row of `out` is left unwritten.
     """
     count, channels = rows.shape
     for m in range(start, stop):
@@ -18,7 +18,7 @@ def put(start, stop, rows, index, shift, out, bad):
             bad[0] = True
             continue
         for c in range(channels):
-            out[m, c] = rows[i, c] + shift[m, c] if len(shift) > 0 else rows[i, c]
+            out[m, c] = rows[i, c]
 
 
 @loop

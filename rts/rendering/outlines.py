@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
+from rts.arrays.engines import engine_of, exemplar, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart
@@ -21,6 +21,7 @@ from rts.registry import name_of
 from rts.rendering.sampled_views import in_one_table
 from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.gaps import Breaks, Fronts, Oracle, find_breaks
+from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.segments import joined
 from rts.sampling.sheets import Sheets
@@ -54,7 +55,7 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         known.append((part.transform, read, _proxy_inputs(part) if entry is None else None))
     inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or all(map(has_sheets, scene.parts, scene.chosen())) or any(map(_batched, leaves(inputs))):
+    if traced or all(map(has_sheets, scene.parts, scene.samplers)) or any(map(_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:
@@ -115,7 +116,7 @@ def with_entries(scene: Scene, grid: Grid) -> Scene:
     if any(is_traced(x) or _batched(x) for x in leaves(inputs)):
         return scene
     entries = []
-    for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
+    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
         if entry is None and isinstance(sampler, TriangleSampler) and _is_dear(part):
             camera = _on_host(grid.camera.within(part.transform).for_size(grid.size))
             entry = _entry(part, sampler, map_leaves(host_value, _proxy_inputs(part)), camera, grid.size)
@@ -371,13 +372,13 @@ class Points:
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
         """Take for each part its sampler, camera, entry and, where triangles tell all, sheets."""
         self._scene, self._grid, self._parts = scene, grid, parts
-        self._width = np.asarray(_on_host(grid.camera).spread(grid.size))
+        self._width = pixel_widths(_on_host(grid.camera).for_size(grid.size), grid.size)
 
     @classmethod
     def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> Points:
         """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
         parts = []
-        for part, sampler, entry, own in zip(scene.parts, scene.chosen(), scene.entries, inputs, strict=True):
+        for part, sampler, entry, own in zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True):
             camera, sheets = grid.camera.within(part.transform), None
             if isinstance(sampler, TriangleSampler):
                 host = _on_host(camera.for_size(grid.size))
@@ -517,15 +518,19 @@ class Points:
 
     def _layers(self, points: np.ndarray, count: int) -> Fronts:
         """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
-        part, depth = np.full((count, len(points)), -1, np.int32), np.full((count, len(points)), np.inf)
-        for index, opaque in enumerate(self._scene.opaque):
-            samples = self.sample(index, points, layers=1 if opaque else count)
-            row, z = host_value(samples.row)[:, 0], host_value(samples.depth)[:, 0]
+        scene, none = self._scene, (count, len(points))
+        given = [part.theta for part in scene.parts], self._grid.camera
+        more = engine_of(*given).room(len(points), exemplar(*given)) - len(points)
+        asked = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
+        part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
+        for index, opaque in enumerate(scene.opaque):
+            samples = self.sample(index, asked, layers=1 if opaque else count)
+            row, z = (host_value(x)[:, 0, : len(points)] for x in (samples.row, samples.depth))
             part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])
             order = np.argsort(depth, axis=0, kind="stable")[:count]
             part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
-        return _lit(Fronts(part, np.full(part.shape, -1, np.int32), depth), np.array(self._scene.opaque))
+        return _lit(Fronts(part, np.full(none, -1, np.int32), depth), np.array(scene.opaque))
 
 
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:

@@ -89,7 +89,7 @@ class Sampling:
     def parts(self) -> list[tuple[Any, Any, Any]]:
         """Each part, its sampler, and the structure that the sampler has prepared."""
         first = self.scenes[0]
-        return list(zip(first.parts, first.chosen(), first.entries, strict=True))
+        return list(zip(first.parts, first.samplers, first.entries, strict=True))
 
     def of_part(self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None) -> tuple[Samples, Array]:
         """The samples of a part in all views, by one call to the host; at most `settings.capacity` in each view.

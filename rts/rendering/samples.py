@@ -90,7 +90,7 @@ def sampled_scene(
 def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:
     """The samples of all parts, `count` layers of a grid of cells."""
     samples = []
-    for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
+    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
         camera = grid.camera.within(part.transform)
         own = sampler.sample(part, camera, grid.size, count, replace(request, entry=entry))
         samples.append(check_samples(own, grid.size, sampler))

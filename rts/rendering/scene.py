@@ -24,7 +24,7 @@ class Scene(NamedTuple):
     Attributes:
         parts: checked parts.
         camera: the camera of the whole image.
-        samplers: the sampler of each part, as the user chose it.
+        samplers: the sampler of each part.
         entries: the structure that each sampler has built for its part, or None.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
     """
@@ -65,18 +65,14 @@ class Scene(NamedTuple):
         if prepared:
             fields = parts.samplers, parts.entries
         else:
-            fields = [check_sampler(sampler)] * len(checked), [None] * len(checked)
+            chosen = check_sampler(sampler)
+            fields = [suited_sampler(chosen, part, camera) for part in checked], [None] * len(checked)
         return cls(checked, camera, *fields, context_of_scene(checked, camera, engine=engine))
 
     def at(self, size: tuple[int, int]) -> Scene:
         """The scene with its camera made for images of a size; an AspectWarning if the camera is for another ratio."""
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
-
-    def chosen(self) -> list[Sampler]:
-        """The sampler that samples each part."""
-        pairs = zip(self.samplers, self.parts, strict=True)
-        return [suited_sampler(sampler, part, self.camera) for sampler, part in pairs]
 
     def context_with(self, *others: Tree) -> Context:
         """The context of the scene and further arrays, such as a background; the scene's own if none differentiates."""

@@ -54,8 +54,7 @@ class RenderSettings:
         """
         size = check_size(size, layers, capacity, supersample)
         layers = layers if is_auto(layers) else int(layers)
-        splatter = None if splatter is None else check_splatter(splatter)
-        return size, cls(splatter, layers, int(supersample), capacity)
+        return size, cls(check_splatter(splatter), layers, int(supersample), capacity)
 
     def of(self, scene: Scene) -> RenderSettings:
         """The settings with the number of layers that the splatter reads of a scene; "auto" where it is to be found."""

@@ -187,9 +187,20 @@ def find_breaks(layers: Fronts, oracle: Oracle) -> tuple[Breaks, Stacks]:
         change.parts(near),
         joined,
         np.full((len(number), 4), -1, np.int32),
-        np.zeros((len(number), 2)),
+        lines_of_crossing(slope),
     )
     return breaks, change.stacks(near, points, beside)
+
+
+def lines_of_crossing(slope: np.ndarray) -> np.ndarray:
+    """Unit directions (B, 2) in the image of the lines where surfaces cross, from both slopes; 0 where they are equal.
+
+    Args:
+        slope: (B, 2, 2), see `Breaks.slope`.
+    """
+    apart = slope[:, 1] - slope[:, 0]
+    length = np.hypot(*apart.T)
+    return np.column_stack([apart[:, 1], -apart[:, 0]]) / np.where(length > 0, length, 1.0)[:, None]
 
 
 def _ends(gap: np.ndarray, layers: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
@@ -267,6 +278,11 @@ class _Change(NamedTuple):
         a, b = (Fronts(*(np.expand_dims(x, axis) for x in side)) for side, axis in zip(sides, (1, 0), strict=True))
         apart = np.where(_level(a, b, oracle) & (a.part >= 0), np.abs(a.depth - b.depth), np.inf)
         one = (apart == apart.min(0)) & (apart == apart.min(1)[:, None]) & np.isfinite(apart)
+        # Within the same parts the layer whose depth changes most ends, as others may be steep.
+        count, alike = len(one), (found.before.part == found.behind.part).all(0)
+        most = np.abs(found.before.depth - found.behind.depth).argmax(0)
+        in_order = np.eye(count, dtype=bool)[..., None] & (np.arange(count)[:, None] != most)[:, None] & (a.part >= 0)
+        one = np.where(alike, in_order, one)
         behind, before = (np.where(one.any(axis), one.argmax(axis), -1) for axis in (1, 0))
         first = (~one[index, index] & ((found.before.part >= 0) | (found.behind.part >= 0))).argmax(0)
         lone = [(side.part >= 0) & (other < 0) for side, other in zip(sides, (behind, before), strict=True)]
@@ -294,7 +310,7 @@ class _Change(NamedTuple):
         level = np.abs(b.depth - a.depth) <= 10 * FINE * oracle.widths(np.maximum(a.depth, b.depth))
         meets = np.flatnonzero((a.part >= 0) & (b.part >= 0) & (a.part != b.part) & level)
         if len(meets):
-            slopes = _sampled_slopes(found.at(meets), a.at(meets), b.at(meets), gaps, oracle)
+            slopes = _sampled_slopes(found.at(meets), self.first[meets], gaps, oracle)
             turn = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
             there = turn > 1e-4 * oracle.widths(a.depth[meets])  # False for NaN.
             near[meets[there]], slope[meets[there]] = 2, slopes[there]
@@ -329,13 +345,14 @@ def _numbers(part: np.ndarray) -> np.ndarray:
     return np.stack([(part[:k] == own).sum(0) for k, own in enumerate(part)])
 
 
-def _sampled_slopes(found: _Intervals, a: Fronts, b: Fronts, gaps: _Lines, oracle: Oracle) -> np.ndarray:
-    """Slopes of depth (M, 2, 2) on both sides of intervals, of the surfaces seen at their ends; NaN where unknown."""
+def _sampled_slopes(found: _Intervals, layer: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:
+    """Slopes of depth (M, 2, 2) of a layer (M,) on both sides of intervals; NaN where they are unknown."""
     slopes = np.full((len(found.gap), 2, 2), np.nan)
-    for side, (front, place, way) in enumerate(((a, found.low, -1), (b, found.high, 1))):
+    for side, (seen, place, way) in enumerate(((found.before, found.low, -1), (found.behind, found.high, 1))):
+        front, number = seen.of_layer(layer), _numbers(seen.part)[layer, np.arange(len(layer))]
         at, step = gaps.points(found.gap, place), gaps.step[found.gap]
         inward, across = way * BESIDE * step, BESIDE * step[:, ::-1]
-        told = [_depth_of(front, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
+        told = [_depth_of(front, number, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
         same = [np.isfinite(t) for t in told]
         along = (told[0] - front.depth) / (way * BESIDE)
         both = (told[1] - told[2]) / (2 * BESIDE)
@@ -345,8 +362,7 @@ def _sampled_slopes(found: _Intervals, a: Fronts, b: Fronts, gaps: _Lines, oracl
     return slopes
 
 
-def _depth_of(front: Fronts, layers: Fronts) -> np.ndarray:
-    """The depth (M,) of the layer of the same part as a front that is the nearest to it; NaN where there is none."""
-    apart = np.where(layers.part == front.part, np.abs(layers.depth - front.depth), np.inf)
-    at = apart.argmin(0)
-    return np.where(np.isfinite(apart.min(0)), layers.of_layer(at).depth, np.nan)
+def _depth_of(front: Fronts, number: np.ndarray, layers: Fronts) -> np.ndarray:
+    """The depth (M,) of the layer of a front's part with as many of the same part before it; NaN if there is none."""
+    same = (layers.part == front.part) & (_numbers(layers.part) == number)
+    return np.where(same.any(0), layers.of_layer(same.argmax(0)).depth, np.nan)

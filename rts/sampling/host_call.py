@@ -113,7 +113,7 @@ class HostCall:
             beside: specs of the further results, by name.
             tables: specs of `Samples.tables`.
             arrays: further operands of `find`, after cameras and inputs. A surface that is not centred takes the first
-                as the list of cells (L, C), if there is one.
+                as the points (1, M, 2), if there is one.
 
         Returns:
             Samples, and the further results by name, in arrays of the part's engine.

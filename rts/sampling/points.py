@@ -56,3 +56,10 @@ def kept_sign(camera: Camera, cull: str) -> float:
     p = camera.projection
     winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
     return float(winding) * {"back": -1.0, "front": 1.0, "none": 0.0}[cull]
+
+
+def pixel_widths(camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """`Camera.spread` of host matrices, float64, for images of `size`."""
+    p, view = camera.projection, camera.view
+    area = 4 / (size[0] * size[1] * abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
+    return np.sqrt(area) * abs(np.linalg.det(view[:3, :3])) ** (-1 / 3) * np.array([p[3, 3], -p[3, 2]])

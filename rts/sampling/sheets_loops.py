@@ -203,12 +203,36 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
 
 @loop
 def on_planes(first, last, triangles, points, rows, vertices, faces, weights, depths, slopes):
-    """Triangles' planes at points (M, 2): the first two barycentrics, depths, and their slopes along x and y."""
+    """Triangles' planes at points (M, 2): the first two barycentrics, depths, and their slopes along x and y.
+
+    Of a triangle that is seen edge-on, these are of its nearest edge, and slopes are NaN.
+    """
     corners = np.empty((3, 4))
     for m in range(first, last):
         sign = corners_of(triangles[m], rows, vertices, faces, corners)
         _, weights[m, 0], weights[m, 1] = _weights(corners, sign, points[m, 0], points[m, 1])
         depths[m], slopes[m, 0], slopes[m, 1] = _depth(corners, sign, points[m, 0], points[m, 1])
+        if sign == 0:
+            depths[m], weights[m, 0], weights[m, 1] = _on_edges(corners, points[m, 0], points[m, 1])
+
+
+@compiled
+def _on_edges(corners, x, y):
+    """Depth and first two barycentrics of the point of a triangle's edges that is seen nearest to a position."""
+    least, z, shares, best = np.inf, 0.0, np.zeros(3), np.zeros(3)
+    for k in range(3):
+        a, b = corners[(k + 1) % 3], corners[(k + 2) % 3]
+        ax, ay, dx, dy = a[0] / a[2], a[1] / a[2], b[0] / b[2] - a[0] / a[2], b[1] / b[2] - a[1] / a[2]
+        length = dx * dx + dy * dy
+        t = min(max(((x - ax) * dx + (y - ay) * dy) / length, 0.0), 1.0) if length > 0 else 0.0
+        off = (ax + t * dx - x) ** 2 + (ay + t * dy - y) ** 2
+        if off < least:
+            total = (1 - t) / a[2] + t / b[2]
+            shares[k], shares[(k + 1) % 3], shares[(k + 2) % 3] = 0.0, (1 - t) / a[2] / total, t / b[2] / total
+            least, best[:] = off, shares
+    for k in range(3):
+        z += best[k] * corners[k, 3]
+    return z, best[0], best[1]
 
 
 @loop

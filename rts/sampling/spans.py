@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import INNER, Breaks, Fronts
+from rts.sampling.gaps import INNER, Breaks, Fronts, lines_of_crossing
 from rts.sampling.sheets import Gaps, Sheets
 
 
@@ -43,9 +43,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along = np.column_stack([gap[:, 2], 1 - gap[:, 2]])[:, None, :]
     points = gap[:, None, 1::-1] + 0.5 + numbers[:, :, None] * along
-    slope = slopes_at(whole[:, 1], whole[:, 2:4], whole[:, 4:6], points[:, 0], sheets)
-    near = flat_apart(whole[:, 1], slope, fronts.depth, gap, width)
-    slope[near < 2] = 0
+    near, slope = crossings(whole[:, 1], whole[:, 2:4], whole[:, 4:6], points[:, 0], sheets, width)
     triangles = whole[:, [4, 5, 6, 7]]
     triangles[np.tile(whole[:, 2:4] < 0, 2)] = -1
     ends, parts = whole[:, 8:] == 1, whole[:, 2:4]
@@ -90,20 +88,38 @@ def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarr
     return begins, names.take(order, 0), spans.take(order, 0), parts.take(order)
 
 
-def slopes_at(
-    near: np.ndarray, parts: np.ndarray, triangles: np.ndarray, points: np.ndarray, sheets: Sequence[Sheets]
-) -> np.ndarray:
-    """(B, 2, 2) slopes of depth of the surfaces that cross at breaks; 0 elsewhere.
+def crossings(
+    near: np.ndarray,
+    parts: np.ndarray,
+    triangles: np.ndarray,
+    points: np.ndarray,
+    sheets: Sequence[Sheets],
+    width: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Breaks.near`, and slopes of depth (B, 2, 2) of the surfaces that cross at breaks; 0 elsewhere.
 
-    `near` (B,) is 2 where surfaces cross; `parts` and `triangles` (B, 2) are before and behind; `points` (B, 2).
+    Surfaces that hardly differ in slope are not said to cross.
+
+    Args:
+        near: (B,) int32, 2 where surfaces are found to cross.
+        parts: (B, 2), before and behind.
+        triangles: (B, 2), alike.
+        points: (B, 2), where breaks are.
+        sheets: the triangles of each part.
+        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
-    slopes = np.zeros((len(near), 2, 2))
+    slopes, depth = np.zeros((len(near), 2, 2)), np.zeros(len(near))
     for part, own in enumerate(sheets):
         for side in (0, 1):
             at = np.flatnonzero((near == 2) & (parts[:, side] == part))
             if len(at):
-                _, slopes[at, side] = own.at(triangles[at, side], points[at])
-    return slopes
+                found, slopes[at, side] = own.at(triangles[at, side], points[at])
+                depth[at] = found.depth[0, 0]
+    apart = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
+    flat = ~(apart > 1e-4 * (width[0] + width[1] * depth))
+    near = np.where((near == 2) & flat, 0, near).astype(np.int32)
+    slopes[near < 2] = 0
+    return near, slopes
 
 
 def tangents(
@@ -116,10 +132,9 @@ def tangents(
 ) -> np.ndarray:
     """`Breaks.tangent`: along the edge of the triangle that ends there, or the line where two planes cross.
 
-    Arguments as of `slopes_at`.
+    Arguments as of `crossings`, with slopes.
     """
-    apart = slope[:, 1] - slope[:, 0]
-    found = np.column_stack([apart[:, 1], -apart[:, 0]])
+    found = lines_of_crossing(slope)
     side = np.where(near == 1, 1, 0)
     index = np.arange(len(near))
     part, triangle = parts[index, side], triangles[index, side]
@@ -128,20 +143,3 @@ def tangents(
         found[at] = sheet.along(triangle[at], points[at])
     length = np.hypot(*found.T)
     return found / np.where(length > 0, length, 1.0)[:, None]
-
-
-def flat_apart(
-    near: np.ndarray, slope: np.ndarray, depth: np.ndarray, gap: np.ndarray, width: np.ndarray
-) -> np.ndarray:
-    """`Breaks.near`, where surfaces that hardly differ in slope are not said to cross.
-
-    Args:
-        near: (B,) int32.
-        slope: (B, 2, 2).
-        depth: (H, W), of the fronts at centres.
-        gap: (B, 3).
-        width: the width of a cell at a depth: `width[0] + width[1] * depth`.
-    """
-    cell = width[0] + width[1] * depth[gap[:, 0], gap[:, 1]]
-    flat = ~(np.abs(slope[:, 1] - slope[:, 0]).sum(-1) > 1e-4 * cell)
-    return np.where((near == 2) & flat, 0, near).astype(np.int32)

@@ -13,7 +13,7 @@ import numpy as np
 from rts.compiling.threads import parallel
 from rts.sampling.gaps import INNER, Breaks, Fronts, Stacks
 from rts.sampling.sheets import Gaps, Sheets
-from rts.sampling.spans import flat_apart, slopes_at, spans_on, tangents
+from rts.sampling.spans import crossings, spans_on, tangents
 
 
 def breaks_of_stacks(
@@ -37,9 +37,7 @@ def breaks_of_stacks(
     joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
     along, first = np.column_stack([gap[:, 2], 1 - gap[:, 2]]), gap[:, 1::-1] + 0.5
     at, points = first + place[:, None] * along, first[:, None] + places[..., None] * along[:, None]
-    slope = slopes_at(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets)
-    near = flat_apart(near, slope, layers.depth[0], gap, width)
-    slope[near < 2] = 0
+    near, slope = crossings(near, samples[:, :2, 0], samples[:, :2, 1], at, sheets, width)
     tangent = tangents(near, slope, samples[:, :2, 0], samples[:, :2, 1], at, sheets)
     last, stack = samples[:, :2], samples[:, 2:]
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)

@@ -193,13 +193,13 @@ class TriangleSampler(Sampler):
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *given: np.ndarray) -> tuple[Samples, dict[str, Any]]:
-            own = np.asarray(given[0], np.float64)[None] if given else None
+            own = np.asarray(given[0], np.float64) if given else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, entry, own)
             samples = search.moved() if moves else search.in_place(request.uniform, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
-        samples, more = call.samples(find, beside, tables, [] if points is None else [points])
+        samples, more = call.samples(find, beside, tables, [] if points is None else [points[None, ...]])
         return samples.replace(**more, followed=() if points is None else ("points",))
 
     def working_on(

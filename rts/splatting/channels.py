@@ -53,8 +53,7 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
     alpha, row = value_of(splats.rgba[:, -1]), value_of(splats.row)
     if alpha is None or row is None or row.ndim > 3 or not len(alpha):
         return  # Values are not known, or those of several scenes, under `torch.vmap`.
-    fronts_alone = splats.outlines is not None and row.shape[0] == 1
-    if fronts_alone or not promised(splatter, "translucent"):
+    if not promised(splatter, "translucent"):
         if alpha.min() < 1 - LOST:
             warn(
                 f"samples are translucent, and {splatter!r} leaves out some of the light that passes through them; "

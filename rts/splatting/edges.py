@@ -82,7 +82,7 @@ class Edges(SummingSplatter):
         background: Array | None = None,
         loss: Any = None,
     ) -> tuple[Array, Array, Array] | None:
-        """See `rts.SummingSplatter`; None without outlines, where light passes through, and off the host."""
+        """See `SummingSplatter`; None without outlines, where light passes through, and off the host."""
         outlines, engine = splats.outlines, engine_of(splats.positions)
         own = (
             splats.positions,

@@ -39,11 +39,12 @@ weighted colours and the weight, and depths (K, H, W)."""
 class Plain(Splatter):
     """No splatting: layers are composited front to back, without derivative at occlusion boundaries."""
 
+    layers = 1
     translucent = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        positions, rgba, row = splats.positions, splats.rgba, splats.row
+        positions, rgba, row = splats.positions, splats.rgba, splats.row[:1, ...] if splats.opaque else splats.row
         if rgba.shape[0] == 0:
             return nothing(rgba, row)
         check_rows(row, rgba.shape[0])
@@ -54,10 +55,6 @@ class Plain(Splatter):
             layer = xp.where((row[k] >= 0)[..., None], unpack(rgba, row[k]), 0.0)
             image = over(layer, image)
         return image
-
-    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.Splatter`: the fronts, since an opaque front hides all layers behind it."""
-        return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
 
 @dataclass(frozen=True)

@@ -219,7 +219,7 @@ class EngineConformance(Conformance):
     # -------------------------------------------------------------------------------------- derivatives
 
     def test_without_derivatives_it_says_so(self, engine: Any) -> None:
-        """An engine that does not differentiate raises an `rts.EngineError`."""
+        """An engine that does not differentiate raises an `rts.errors.EngineError`."""
         chosen = _instance(engine)
         if chosen.differentiates:
             pytest.skip("it differentiates")
@@ -235,7 +235,9 @@ class EngineConformance(Conformance):
             except EngineError:
                 continue
             except Exception as error:
-                raise AssertionError(f"{name} raises {type(error).__name__}; expected an rts.EngineError") from error
+                raise AssertionError(
+                    f"{name} raises {type(error).__name__}; expected an rts.errors.EngineError"
+                ) from error
             claim(False, f"{name} raises nothing, though the engine says that it does not differentiate")
 
     def test_gradients_are_those_of_closed_forms(self, engine: Any) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rts import Engine, EngineError, GBuffer, InputError, RtsError, Surface, engine_of, namespace
+from rts import Engine, GBuffer, InputError, RtsError, Surface, engine_of, namespace
+from rts.errors import EngineError
 from rts.plugin_api.arrays import Array, Tree, exemplar, leaves, shape_of, unit
 from rts.plugin_api.checks import check_numbers, quoted
 from rts.plugin_api.operations import gradient

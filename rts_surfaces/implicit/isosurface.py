@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rts import GBuffer, InputError, Part, Rate, RaySurface, TriangleSurface, engine_of, namespace
+from rts import GBuffer, InputError, Part, RaySurface, TriangleSurface, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, from_numbers, map_leaves, unit
 from rts.plugin_api.checks import check_positive, fingerprint, quoted
 from rts.plugin_api.operations import gradient
-from rts.plugin_api.records import ArraySpec, Proxy, RayHits, Rays, Samples
+from rts.plugin_api.records import ArraySpec, Proxy, Rate, RayHits, Rays, Samples
 from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import marching_cubes
 from rts_surfaces.implicit.casting import box, cast, deepest, per_level

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from rts import EngineError, InputError, engine_of
+from rts import InputError, engine_of
+from rts.errors import EngineError
 from rts.plugin_api.arrays import shape_of
 from rts.plugin_api.checks import check_numbers, quoted
 

@@ -30,7 +30,7 @@ def pictures(parts: list[rts.Part], folder: Path) -> None:
     camera = rts.Camera.look_at((2, 1, 4), (0, 0, 0), fov_y=40)
     white = rts.render(parts, camera, SIZE, sampler="raster", background=(1.0, 1.0, 1.0))
     rts.save_image(folder / "white.png", white)
-    over = rts.render(parts, camera, SIZE, splatter="multi", supersample=rts.Adaptive(4), background=white)
+    over = rts.render(parts, camera, SIZE, splatter="multi", supersample=4, background=white)
     rts.save_image(folder / "over.png", over)
     views = rts.render_views(parts, [camera, camera], SIZE, layers="auto", supersample=2)
     print(views.shape, [choice.sampler for choice in rts.explain(parts, camera, SIZE)])

@@ -32,9 +32,6 @@ class Loft(rts.TriangleSurface):
         faces = np.stack([a, b, c, b, d, c], axis=-1).reshape(-1, 3)
         return Proxy(vertices=np.asarray(inputs, np.float32), faces=faces)
 
-    def pieces(self, proxy):
-        return np.ones(1, np.int16)  # All triangles are wound alike.
-
     def evaluate(self, theta, samples):
         self.check(theta)
         curves = theta["curves"]
