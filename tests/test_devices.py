@@ -178,7 +178,6 @@ CASES = {
     },
     "two parts": lambda: Case((ball(), ball("unlit", (0.7, 0.3, 0.4)))),
     "supersampled": lambda: Case((ball(),), {"supersample": 2}),
-    "adaptive": lambda: Case((ball(), ball("unlit", (0.7, 0.3, 0.4))), {"supersample": rts.Adaptive(3)}),
     "auto layers": lambda: Case((ball(), ball("unlit", (0.7, 0.3, 0.4))), {"layers": "auto"}),
     "capacity": lambda: Case((ball(),), {"capacity": 2000}),
     "background": lambda: Case((ball(),), {"background": (0.1, 0.4, 0.8)}),

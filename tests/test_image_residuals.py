@@ -282,7 +282,6 @@ def test_nothing_in_view_has_zero_derivatives(target):
     [
         ({"splatter": "multi"}, "torch-cpu"),
         ({"splatter": "none"}, "torch-cpu"),
-        pytest.param({"supersample": 33}, "torch-cpu", marks=pytest.mark.thorough),
     ],
 )
 def test_what_no_sweep_knows_is_done_by_the_jacobian(options, target, monkeypatch):

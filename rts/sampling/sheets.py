@@ -93,7 +93,7 @@ class Sheets(NamedTuple):
         from rts.sampling import sheets_loops
 
         mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
-        arguments = *fronts, own, *mesh, self.keep != 0, met, joined
+        arguments = *map(read_only, fronts), own, *mesh, self.keep != 0, met, joined
         parallel(sheets_loops.seams, height, *arguments, work=20 * joined[0].size)
 
     def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
