@@ -10,13 +10,6 @@ from rts.plugin_api.records import Fragments, Proxy
 CANDIDATES_AT_ONCE = 1 << 20
 """About how many pairs of a triangle and a pixel are tested at once, which bounds memory."""
 
-SLACK = 0.5
-"""How far in front of the nearest depth around a cell the surface may come, as a share of the range of these depths: at
-a ridge between two centres, half of it."""
-
-ROUNDING = 1e-4
-"""How far it may come in any case, as a share of the depth."""
-
 
 class Reference(TriangleSampler):
     """Sampler that tests each triangle against each pixel near it: slow and obvious.

@@ -7,6 +7,7 @@ from helpers import box, icosphere, quad, quick, rotation, soup
 import rts
 from rts import Camera
 from rts.plugin_api.records import Proxy
+from rts.sampling.points import at_points
 from rts.scene.camera import orthographic, perspective
 
 pytestmark = pytest.mark.sampling
@@ -24,10 +25,10 @@ def rasterize(name, vertices, faces, camera, size=SIZE, layers=1, cull="none"):
     return sampler.rasterize(sampler.prepare(Proxy(vertices, faces)), camera, size, layers, cull)
 
 
-def cast(vertices, faces, camera, size, layers, cull, near=NEAR, far=FAR):
-    """Fragments by intersecting every pixel's ray with every triangle (Möller and Trumbore 1997)."""
+def cast(vertices, faces, camera, size, layers, cull, near=NEAR, far=FAR, points=None):
+    """Fragments by intersecting every pixel's ray, or every point's, with every triangle (Möller and Trumbore 1997)."""
     a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
-    rays = camera.rays(size)
+    rays, size = camera.rays(size, points), size if points is None else (1, len(points))
     origins, directions = (x.reshape(-1, 1, 3) for x in rays[:2])
     p = np.cross(directions, c - a)
     determinant = (p * (b - a)).sum(-1)
@@ -110,6 +111,30 @@ def test_fragments_are_the_nearest_hits_of_each_ray(sampler, kind, camera):
     for layers, cull in ((1, "none"), (2, "back"), (4, "none")):
         found = rasterize(sampler, vertices, faces, camera, SIZE, layers, cull)
         ids, barycentrics, depth = cast(vertices, faces, camera, SIZE, layers, cull, near, far)
+        np.testing.assert_array_equal(found.triangle_ids, ids)
+        np.testing.assert_allclose(found.barycentrics, barycentrics, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found.depth, depth, rtol=1e-6)
+        total += (ids >= 0).sum()
+    assert total > 5
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("kind", quick(KINDS, 3))
+@pytest.mark.parametrize("name", ["raster", "reference", "embree"])
+def test_fragments_at_points_are_the_nearest_hits_of_their_rays(name, kind, camera):
+    try:
+        sampler = rts.plugin("samplers", name)()
+    except rts.PluginError as error:
+        pytest.skip(str(error))
+    near, far = (3.5, 4.0) if camera is CAMERAS["between close planes"] else (NEAR, FAR)
+    vertices, faces = triangles(kind)
+    host = Camera(np.asarray(camera.view, np.float64), np.asarray(camera.projection, np.float64))
+    points = np.random.default_rng(0).uniform((0, 0), SIZE[::-1], (700, 2))
+    proxy, total = Proxy(vertices, faces), 0
+    for layers, cull in ((1, "none"), (2, "back"), (4, "none")):
+        view = host, SIZE, layers, cull
+        found = sampler.rasterize_points(sampler.prepare(proxy), *view, points) or at_points(proxy, *view, points)
+        ids, barycentrics, depth = cast(vertices, faces, camera, SIZE, layers, cull, near, far, points)
         np.testing.assert_array_equal(found.triangle_ids, ids)
         np.testing.assert_allclose(found.barycentrics, barycentrics, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(found.depth, depth, rtol=1e-6)

@@ -176,9 +176,9 @@ class Request:
 
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are samples.
-        points: (M, 2) float64, x and y in cells from the grid's upper left corner: the only points to sample, in place
-            of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None for
-            centres.
+        points: (M, 2) float64, M > 0, x and y in cells from the grid's upper left corner: the only points to sample, in
+            place of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None
+            for centres.
         pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
             move.
         triangles: whether to record `Cells.triangle`.

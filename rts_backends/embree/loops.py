@@ -215,7 +215,7 @@ def cast(
         margins: (T,), see `Covers`.
         width: the image's width.
         height: the image's height.
-        points: (M, 2) x and y of the positions to cast rays through, NaN for none; empty for all H · W pixels' centres.
+        points: (M, 2) x and y of the positions to cast rays through; empty for all H · W pixels' centres.
         triangle_ids: (K, M or H · W) to fill.
         barycentrics: (K, M or H · W, 2) to fill.
         depths_out: (K, M or H · W) to fill.
@@ -253,7 +253,7 @@ def cast(
         for p in range(pixels):
             state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, xs[p], ys[p]
             x, y = xs[p] * 2 / width - 1, 1 - ys[p] * 2 / height
-            if not np.isnan(x) and _aim(ray_space, object_sphere, planes, x, y, ray, state):
+            if _aim(ray_space, object_sphere, planes, x, y, ray, state):
                 ray_bits[9], ray_bits[10], ray_bits[11] = -1, 0, 0
                 ray_bits[17], ray_bits[18], ray_bits[19] = -1, -1, -1
                 _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
@@ -301,7 +301,7 @@ def cast(
 
 @compiled
 def _pixels(tile, across, width, height, points, at, xs, ys):
-    """Fill in the positions of a tile of pixels, or of a piece of `points`: index of output, x (NaN for none), y.
+    """Fill in the positions of a tile of pixels, or of a piece of `points`: index of output, x, y.
 
     Returns the number of positions, at most TILE².
     """

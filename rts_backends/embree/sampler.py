@@ -78,7 +78,7 @@ class Embree(TriangleSampler):
 def _cast(
     prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, points: np.ndarray, shape: tuple[int, ...]
 ) -> Fragments:
-    """Fragments of `shape` (K, ·, ·) at `points` (M, 2), none where NaN; at all pixels' centres if there are none."""
+    """Fragments of `shape` (K, ·, ·) at `points` (M, 2); at all pixels' centres if there are none."""
     scene: Any = prepared.scene
     (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(points) // TILE**2) if len(points) else -(-height // TILE) * -(-width // TILE)
