@@ -189,12 +189,10 @@ class SamplerConformance(Conformance):
         y, x = np.append(y, y[:1]), np.append(x, x[:1])  # One of them twice.
         for index, part in enumerate(map(scenes.checked, parts)):
             for move, layers in (((0.0, 0.0), 3), ((0.3, -0.21), 2)):
-                points, moved = np.column_stack([x, y]) + 0.5 + move, scenes.CAMERA.for_size(scenes.SIZE)
-                shift = np.eye(4)
-                shift[:2, 3] = -2 * move[0] / width, 2 * move[1] / height
-                centred = moved.replace(projection=shift @ moved.projection).within(part.transform)
-                own = moved.within(part.transform), scenes.SIZE, layers
-                found = chosen.sample(part, *own, Request(points=points, triangles=True))
+                own = scenes.CAMERA.for_size(scenes.SIZE).within(part.transform)
+                centred = scenes.shifted(scenes.shifted(own, -move[0], 0), move[1], 1)
+                request = Request(points=np.column_stack([x, y]) + 0.5 + move, triangles=True)
+                found = chosen.sample(part, own, scenes.SIZE, layers, request)
                 if "points" not in found.followed:
                     pytest.skip("the sampler samples whole grids")
                 whole = chosen.sample(part, centred, scenes.SIZE, layers, Request(triangles=True))
