@@ -55,7 +55,7 @@ def kept_sign(camera: Camera, cull: str) -> float:
     """Sign of the determinant on screen of triangles to keep; 0 for both. A mirrored view or image reverses it."""
     p = camera.projection
     winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return float(winding) * {"back": -1.0, "front": 1.0, "none": 0.0}[cull]
+    return -float(winding) if cull == "back" else 0.0
 
 
 def pixel_widths(camera: Camera, size: tuple[int, int]) -> np.ndarray:

@@ -96,7 +96,6 @@ def _cast(
         prepared.sphere,
         _planes(camera.projection),
         facing(camera, cull),
-        {"back": 1.0, "front": -1.0, "none": 0.0}[cull],
         prepared.proxy.vertices,
         prepared.proxy.faces,
         prepared.covers.owners,
