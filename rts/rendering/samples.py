@@ -9,8 +9,8 @@ from functools import partial
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
+from rts.outlines.of_scene import with_entries, with_outlines
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
-from rts.rendering.outlines import with_entries, with_outlines
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.layer_count import with_all_layers

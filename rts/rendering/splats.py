@@ -14,11 +14,12 @@ from rts.contracts.checks import CheckedPart, check_splats
 from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats
 from rts.errors import InputError
 from rts.operations.projection import projective_map_of_views
-from rts.rendering.sampled_views import Views, in_one_table
 from rts.rendering.scene import Grid
 from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
+from rts.sampling.tables import in_one_table
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
+from rts.views.sampled_views import Views
 
 
 def to_splats(
@@ -151,7 +152,8 @@ def _shown(
         local = evaluate(part, samples, inputs)
         own = seen.within(transform)
         add_footprint(part, samples, local, own, grid.size, inputs)
-        used = samples if beside is None else _all_in_use(samples, inputs, beside, first)
+        padded = beside is not None and engine.padded(samples.row)
+        used = _all_in_use(samples, inputs, beside, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
         positions.append(context.constants(own.project(_on_rays(samples, local["position"]), grid.size)))
         check_splats(index, part, world, positions[-1], rgba, row, first)
@@ -204,7 +206,7 @@ def _shown_in_views(
     inputs, engine = _of_inputs(context), context.engine
     whole = in_one_table([own.samples[index] for own in sampled])
     used, outlines = whole, sampled[0].outlines
-    if outlines is not None:
+    if outlines is not None and engine.padded(whole.row):
         before = sum(own.ids.shape[-2] for own in sampled[0].samples[:index])
         # Engines that pad rows have all views in one picture.
         used = _all_in_use(whole, inputs, outlines.rows if len(sampled) == 1 else None, before)

@@ -24,7 +24,7 @@ def at_points(
     Returns:
         Fragments (K, 1, M).
     """
-    from rts.sampling import sheets_loops
+    from rts.sampling import points_loops
 
     line = np.floor(points[:, 1])
     line = np.where((line >= 0) & (line < size[0]), line, size[0]).astype(np.int64)
@@ -35,7 +35,7 @@ def at_points(
     arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size)
     faces = np.ascontiguousarray(proxy.faces, np.int32)
     vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-    sheets_loops.hits(*arguments, near_and_far(camera), kept_sign(camera, cull), vertices, faces, ids, weights, depth)
+    points_loops.hits(*arguments, near_and_far(camera), kept_sign(camera, cull), vertices, faces, ids, weights, depth)
     depth = np.where(ids >= 0, depth, 0).astype(np.float32)
     return Fragments(ids[:, None], weights[:, None], depth[:, None])
 
