@@ -34,10 +34,10 @@ from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import render
 from rts.rendering.samples import sampled_scene
-from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
 from rts.sampling.prepared import Prepared
+from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.views.render_views import render_views

@@ -15,7 +15,7 @@ from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns
 from rts.outlines.points import Points, at_centres, entry_of, found_in_views, host_value, on_host, proxy_inputs
-from rts.rendering.scene import Grid, Scene, has_sheets
+from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
 

@@ -23,9 +23,9 @@ from rts.outlines.spans import breaks_of_triangles
 from rts.outlines.stacks import breaks_of_stacks
 from rts.plugin_base import overrides
 from rts.registry import name_of
-from rts.rendering.scene import Grid, Scene, has_sheets
 from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
+from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera

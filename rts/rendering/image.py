@@ -17,10 +17,10 @@ from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.samples import sampled_scene
-from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
 from rts.sampling.prepared import Prepared
+from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image

@@ -20,13 +20,13 @@ from rts.contracts.checks import CheckedPart, check_memory
 from rts.contracts.records import ArraySpec, Cells, Fragments, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
-from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
 from rts.sampling.sample_checks import check_fragments
+from rts.sampling.scene import Grid, Scene
 from rts.sampling.tables import in_one_table
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
