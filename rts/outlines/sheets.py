@@ -21,11 +21,13 @@ class Gaps(NamedTuple):
         gap: (M, 3) int32, y and x of the first centre; 1 for a gap along a row, 0 along a column.
         rows: (H, W) int32, how many of them come before each centre of a row.
         columns: (W, H) int32, and of a column.
+        around: (H, W) int8, the cells of gaps and those beside; see `spans_loops.around`.
     """
 
     gap: np.ndarray
     rows: np.ndarray
     columns: np.ndarray
+    around: np.ndarray
 
     @classmethod
     def of(cls, marks: np.ndarray) -> Gaps:
@@ -35,7 +37,9 @@ class Gaps(NamedTuple):
         (height, width), gap = marks.shape[1:], np.empty((np.count_nonzero(marks), 3), np.int32)
         rows, columns = np.empty((height, width), np.int32), np.empty((width, height), np.int32)
         spans_loops.number(marks, gap, rows, columns)
-        return cls(gap, rows, columns)
+        cells = np.zeros((height, width), np.int8)
+        spans_loops.around(gap, cells)
+        return cls(gap, rows, columns, cells)
 
 
 class Sheets(NamedTuple):
@@ -100,9 +104,8 @@ class Sheets(NamedTuple):
         """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
         from rts.outlines import spans_loops
 
-        cells, close = np.zeros(gaps.rows.shape, np.int8), np.empty(len(self.seen), np.int8)
-        spans_loops.around(gaps.gap, cells)
-        parallel(spans_loops.close, len(close), self.seen, cells, close, work=3 * len(close))
+        close = np.empty(len(self.seen), np.int8)
+        parallel(spans_loops.close, len(close), self.seen, gaps.around, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
         own = self.faces, self.seen, self.sides, self.keep, close
         parallel(spans_loops.most_spans, count, *own, gaps.rows, gaps.columns, most, work=10 * count)
@@ -111,7 +114,7 @@ class Sheets(NamedTuple):
         begins = np.cumsum(most) - most
         names, spans = np.full((most.sum(), 2), -1, np.int32), np.empty((most.sum(), 6))
         mesh = self.rows, self.vertices, self.faces, self.clip, self.keep, self.seen
-        arguments = triangles, begins, *mesh, *gaps, names, spans
+        arguments = triangles, begins, *mesh, *gaps[:3], names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=200 * len(names))
         return names, spans
 
