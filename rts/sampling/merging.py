@@ -66,8 +66,8 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) 
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
-        of_parts = (arrays[n : n + count] for n in (0, count, 2 * count))
-        return merging_loops.interleave(*of_parts, firsts, layers)
+        own_rows, own_depths, triangles = (arrays[n : n + count] for n in (0, count, 2 * count))
+        return merging_loops.interleave(own_rows, own_depths, triangles, firsts, layers)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
     specs = specs if len(tables) == 2 * count else (*specs, ArraySpec(shape, np.int32))
