@@ -117,7 +117,7 @@ def test_every_sample_named_is_one_of_its_part_in_its_cell(given):
         [layer] = np.flatnonzero(own.row[:, y, x] == found.row[k, y, x] - numbers[found.part[k, y, x]])
         np.testing.assert_array_equal(ids[found.row[k, y, x]], own.ids[own.row[layer, y, x]])
         assert found.depth[k, y, x] == own.depth[layer, y, x]
-    np.testing.assert_array_equal(found.part, by_hand(samples, layers)[0])
+    np.testing.assert_array_equal(found.row, by_hand(samples, layers)[0])
 
 
 @PROPERTIES

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rts.compiling.loops import loop
+from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel, read_only
 
 
@@ -53,23 +53,28 @@ def _insert(start, stop, own_row, own_depth, own_triangle, first, row, depth, tr
         depth: (K, H, W).
         triangle: (K, H, W) int32; no layers if triangles are not told.
     """
-    layers, told = len(row), len(own_triangle) > 0
     for y in range(start, stop):
         for x in range(row.shape[2]):
             k = 0
             for own in range(len(own_row)):
-                if own_row[own, y, x] < 0:
-                    continue
-                z = own_depth[own, y, x]
-                while k < layers and row[k, y, x] >= 0 and not z < depth[k, y, x]:
-                    k += 1
-                if k == layers:
-                    break
-                for n in range(layers - 1, k, -1):
-                    row[n, y, x], depth[n, y, x] = row[n - 1, y, x], depth[n - 1, y, x]
-                    if told:
-                        triangle[n, y, x] = triangle[n - 1, y, x]
-                row[k, y, x], depth[k, y, x] = first + own_row[own, y, x], z
-                if told:
-                    triangle[k, y, x] = own_triangle[own, y, x]
-                k += 1
+                if own_row[own, y, x] >= 0:
+                    told = own_triangle[own, y, x] if len(own_triangle) > 0 else -1
+                    k = 1 + _put(first + own_row[own, y, x], own_depth[own, y, x], told, y, x, k, row, depth, triangle)
+
+
+@compiled
+def _put(own, z, told, y, x, k, row, depth, triangle):
+    """Put a sample into a cell, behind all that are not deeper, from layer k on; returns its layer, or the last."""
+    layers = len(row)
+    while k < layers and row[k, y, x] >= 0 and not z < depth[k, y, x]:
+        k += 1
+    if k == layers:
+        return k - 1
+    for n in range(layers - 1, k, -1):
+        row[n, y, x], depth[n, y, x] = row[n - 1, y, x], depth[n - 1, y, x]
+        if len(triangle) > 0:
+            triangle[n, y, x] = triangle[n - 1, y, x]
+    row[k, y, x], depth[k, y, x] = own, z
+    if len(triangle) > 0:
+        triangle[k, y, x] = told
+    return k
