@@ -83,7 +83,6 @@ class Operation:
             gradients.
         packed_result: whether the result has a row for each sample, too.
         used: (operands) → number of rows of the packed operands in use; None to rely on the engine.
-        even: the indices of packed operands whose rows are often all equal, which a compiling engine may exploit.
         keeps: whether `forward` returns an object that helps the derivatives at the same operands. `push` and `pull`
             then take a keyword `kept`: that object, or None if it is lost.
         sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). Otherwise it is called
@@ -101,7 +100,6 @@ class Operation:
     packed: tuple[int, ...] = ()
     packed_result: bool = False
     used: Callable[[Arrays], int] | None = None
-    even: tuple[int, ...] = ()
     keeps: bool = False
     sweeps: bool = False
 
@@ -164,7 +162,7 @@ class Operation:
             function = getattr(self, name)
             if not callable(function) and not (name == "used" and function is None):
                 raise InputError(f"{name} of the operation {self.name} is {quoted(function)}; expected a function")
-        for name in ("ranks", "packed", "even"):
+        for name in ("ranks", "packed"):
             object.__setattr__(self, name, self._integers(name))
         for name in ("packed_result", "keeps", "sweeps"):
             if type(getattr(self, name)) is not bool:
@@ -189,7 +187,7 @@ class Operation:
                 f"the operation {self.name} has {count} operands, by its ranks, of which the first "
                 f"{quoted(self.differentiable)} are to have derivatives; expected from 1 to {count}"
             )
-        for i in (*self.packed, *self.even):
+        for i in self.packed:
             if i >= count or self.ranks[i] < 1:
                 raise InputError(
                     f"the operation {self.name} has no operand {i} of packed rows; its ranks are {self.ranks}"
