@@ -456,13 +456,11 @@ def _float64(engine: Engine) -> Array:
 _names: list[str] = []
 
 
-def load_engines() -> None:
-    """Load the engines whose framework has been imported, so that these frameworks accept the library's records."""
-    _imported()
+def load_engines() -> list[Engine]:
+    """The engines whose framework has been imported, loaded now if need be; broken ones are left out.
 
-
-def _imported() -> list[Engine]:
-    """The engines whose framework has been imported, loaded now if need be; broken ones are left out."""
+    Once they are loaded, these frameworks accept the library's records.
+    """
     if not _names:
         _names.extend(registry.plugins("rts.engines"))
     engines = []
@@ -488,7 +486,7 @@ def uncompiled(f: _F) -> _F:
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
         outside = f
-        for engine in _imported():
+        for engine in load_engines():
             outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 

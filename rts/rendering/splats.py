@@ -105,21 +105,20 @@ def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
 
 
 def _places_of(pictures: Sequence[Views], context: Context) -> Array:
-    """(B, 3) for each view its offsets along x and y in its picture, in cells, and 1, the factor on depth."""
-    corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
-    return context.constants(np.insert(corners, 2, 1, axis=1))
+    """(B, 2) for each view its offsets along x and y in its picture, in cells."""
+    return context.constants(np.concatenate([own.picture.corners() for own in pictures]).astype(np.float32))
 
 
 def _splats(
     sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, border: int = 0
 ) -> Splats:
     """The splats of samples with these positions and colours."""
-    cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
+    cells = replace(sampled.cells, depth=None)
     outlines = context_of(positions, rgba).constants(sampled.outlines)
     if not context.engine.owns(rgba):
-        cells, part = context_of(positions, rgba).constants((cells, part))
+        cells = context_of(positions, rgba).constants(cells)
     opaque = all(p.shader.opaque for p in parts)
-    return Splats(positions, rgba, cells, part, border, sampled.one_part, opaque, outlines)
+    return Splats(positions, rgba, cells, border, opaque, outlines)
 
 
 def _shown(

@@ -138,7 +138,7 @@ class _Differentiable:
 
         noted = operation.keeps
         ranks = *operation.ranks, *[0] * self._told
-        self._value = HostPrimitive(name, ranks, given, valued, self._host_value, self._plain, noted)
+        self._value = HostPrimitive(name, ranks, given, valued, self._host_value, self._plain, noted=noted)
         ranks = *ranks, *[0] * noted
         swept, backward = (*ranks, *(r + 1 for r in ranks[:varied])), (*ranks, self.rank + 1)
         self._push = HostPrimitive(

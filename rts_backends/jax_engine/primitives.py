@@ -47,6 +47,7 @@ class HostPrimitive:
         shapes: Callable,
         host: Callable,
         specified: Callable,
+        *,
         noted: bool = False,
         some: bool = False,
         in_place: tuple[int, ...] = (),
