@@ -218,6 +218,6 @@ def crooked_block(folder):
     return path
 
 
-def splats_of(positions, rgba, row, part=None, **more):
+def splats_of(positions, rgba, row, **more):
     """Splats of arrays of samples and of cells."""
-    return Splats(positions, rgba, Cells(row), part, **more)
+    return Splats(positions, rgba, Cells(row), **more)

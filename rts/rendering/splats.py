@@ -55,12 +55,12 @@ def splats_of(
     sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, border: int = 0
 ) -> Splats:
     """The splats of samples with these positions and colours."""
-    cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
+    cells = replace(sampled.cells, depth=None)
     outlines = context_of(positions, rgba).constants(sampled.outlines)
     if not context.engine.owns(rgba):
-        cells, part = context_of(positions, rgba).constants((cells, part))
+        cells = context_of(positions, rgba).constants(cells)
     opaque = all(p.shader.opaque for p in parts)
-    return Splats(positions, rgba, cells, part, border, sampled.one_part, opaque, outlines)
+    return Splats(positions, rgba, cells, border, opaque, outlines)
 
 
 def _shown(

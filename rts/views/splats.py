@@ -146,6 +146,5 @@ def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
 
 
 def _places_of(pictures: Sequence[Views], context: Context) -> Array:
-    """(B, 3) for each view its offsets along x and y in its picture, in cells, and 1, the factor on depth."""
-    corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
-    return context.constants(np.insert(corners, 2, 1, axis=1))
+    """(B, 2) for each view its offsets along x and y in its picture, in cells."""
+    return context.constants(np.concatenate([own.picture.corners() for own in pictures]).astype(np.float32))
