@@ -220,7 +220,7 @@ def _splat(splatter: Any, splats: Splats) -> np.ndarray:
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:
     """The image by a direct call with arrays, as a function of a list of positions and colours."""
-    return lambda x: check_splatter(splatter).splat(*x, row)
+    return lambda x: check_splatter(splatter).splat(x[0], x[1], row)
 
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
