@@ -7,12 +7,14 @@ import logging
 import re
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rts import errors
 from rts.errors import FileWarning, InputError
 
+Fail = Callable[[str], InputError]
+"""What is wrong with a file → the error."""
 COUNT = re.compile(r"\+?[0-9]+")
 """A count in a header. Python's own rules take digits of any script."""
 _PLAIN = b"\t" + bytes(range(32, 127))
@@ -34,6 +36,17 @@ def contents(path: Path) -> bytes:
     except (OSError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or "it does not fit into memory"
         raise InputError(f"{path} cannot be read ({reason}); check the file and who may read it") from error
+
+
+def text_of(path: Path, kind: str, data: bytes) -> str:
+    """A file's text; an InputError if the bytes are no UTF-8."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path} is not a valid {kind} file, neither as binary nor as text; the file may be cut short or of "
+            "another format: export it again"
+        ) from error
 
 
 def lines_of(data: bytes) -> list[str]:

@@ -1,14 +1,13 @@
-"""Checks of accessors of GLB and glTF files: their data are present, in layouts and types that the format allows."""
+"""Accessors of GLB and glTF files, the tables of numbers, and what primitives may take of them."""
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.files.damaged_files import warn
+from rts.files.damaged_files import Fail, warn
+from rts.files.gltf_tree import Gltf, count_of
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -32,55 +31,68 @@ QUANTIZED = COMPONENTS | {
     "TEXCOORD_0": ("f4", *_INTEGERS),
 }
 """Component types that KHR_mesh_quantization adds."""
-MOST = 2**24
-"""Rows of an accessor without data, all zero, which a damaged file could otherwise have any number of."""
 BOUNDS_TOLERANCE = 1e-3
 """Tolerance of `min` and `max`, as a share of the range that they bound; some writers round them."""
 
 
-def count_of(value: Any) -> int:
-    """The value if it is a whole number of at least zero; else a ValueError."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"{value!r} is no count")
-    return value
+class Accessor(NamedTuple):
+    """A table of numbers, whose rows are known to be there.
 
-
-def _layout(accessor: dict[str, Any], descriptions: list[dict[str, Any]]) -> tuple[int, int, int]:
-    """Counts of bytes of an accessor that has a view: to its first row, from one row to the next, and in one row.
-
-    `descriptions` are the file's bufferViews, as JSON.
+    Attributes:
+        index: its number, for errors.
+        json: its JSON.
+        component: the NumPy type of a number.
+        width: numbers in a row.
+        count: how many rows there are.
+        content: the bytes of its bufferView; None for rows of zeros, which have no data.
+        start: the byte of the first row there.
+        stride: bytes from one row to the next.
     """
-    row = np.dtype(TYPES[accessor["componentType"]]).itemsize * WIDTHS[accessor["type"]]
-    stride = descriptions[accessor["bufferView"]].get("byteStride", row)
-    return count_of(accessor.get("byteOffset", 0)), count_of(stride), row
+
+    index: int
+    json: dict[str, Any]
+    component: np.dtype
+    width: int
+    count: int
+    content: bytes | None = None
+    start: int = 0
+    stride: int = 0
+
+    @property
+    def row(self) -> int:
+        """Bytes of a row."""
+        return self.component.itemsize * self.width
+
+    def rows(self) -> np.ndarray:
+        """(N, C) of its own type."""
+        if self.content is None:
+            return np.zeros((self.count, self.width), self.component)
+        content = np.frombuffer(self.content, np.uint8)[self.start :]
+        rows = np.lib.stride_tricks.as_strided(content, (self.count, self.row), (self.stride, 1))
+        return np.ascontiguousarray(rows).view(self.component)
+
+    def numbers(self, fractions: bool = False) -> np.ndarray:
+        """(N, C) float32; integers as the fractions they stand for, if they are `normalized` or `fractions` says so."""
+        rows = self.rows()
+        if rows.dtype.kind == "f" or not (fractions or self.json.get("normalized")):
+            return rows.astype(np.float32)
+        return np.maximum(rows / np.float32(np.iinfo(rows.dtype).max), -1)
 
 
-def check_accessor(
-    index: int, accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: list[bytes], fail: Any
-) -> None:
-    """Refuse an accessor whose rows are not in its view, or overlap, or begin where numbers of its type cannot.
-
-    An accessor without a view stands for zeros; it may promise up to `MOST` rows.
-
-    Args:
-        index: the accessor's number, for errors.
-        accessor: its JSON.
-        descriptions: the JSON of the bufferViews.
-        views: the bytes of each bufferView.
-        fail: text → error.
-    """
-    count = count_of(accessor["count"])
-    if count_of(accessor["componentType"]) not in TYPES:
-        raise fail(f"accessor {index} has componentType {accessor['componentType']}; expected one of {list(TYPES)}")
-    if accessor["type"] not in WIDTHS:
-        raise fail(f"accessor {index} has type {accessor['type']!r}; expected one of {', '.join(WIDTHS)}")
-    if "bufferView" not in accessor:
-        if count > MOST:
-            raise fail(f"accessor {index} promises {count} rows, and has no data")
-        return
-    content = views[count_of(accessor["bufferView"])]
-    start, stride, row = _layout(accessor, descriptions)
-    size = np.dtype(TYPES[accessor["componentType"]]).itemsize
+def read_accessor(gltf: Gltf, index: int) -> Accessor:
+    """An accessor; refused if its rows are not in its view, or overlap, or begin where its numbers cannot."""
+    json, fail = gltf.tree["accessors"][index], gltf.fail
+    count = count_of(json["count"])
+    if count_of(json["componentType"]) not in TYPES:
+        raise fail(f"accessor {index} has componentType {json['componentType']}; expected one of {list(TYPES)}")
+    if json["type"] not in WIDTHS:
+        raise fail(f"accessor {index} has type {json['type']!r}; expected one of {', '.join(WIDTHS)}")
+    accessor = Accessor(index, json, np.dtype("<" + TYPES[json["componentType"]]), WIDTHS[json["type"]], count)
+    if "bufferView" not in json:
+        return accessor
+    view, row, size = count_of(json["bufferView"]), accessor.row, accessor.component.itemsize
+    content, start = gltf.views[view], count_of(json.get("byteOffset", 0))
+    stride = count_of(gltf.tree["bufferViews"][view].get("byteStride", row))
     if stride < row or stride % size or start % size:
         raise fail(
             f"accessor {index} begins at byte {start} and has rows of {row} bytes, {stride} bytes apart; expected "
@@ -89,134 +101,115 @@ def check_accessor(
     end = start + max(count - 1, 0) * stride + row
     if count and end > len(content):
         raise fail(f"accessor {index} promises {count} rows, which end at byte {end} of {len(content)}")
+    return accessor._replace(content=content, start=start, stride=stride)
 
 
-def rows_of(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: list[bytes]) -> np.ndarray:
-    """The rows (N, C) of an accessor that has data, in its own type."""
-    start, stride, row = _layout(accessor, descriptions)
-    content = np.frombuffer(views[accessor["bufferView"]], np.uint8)[start:]
-    rows = np.lib.stride_tricks.as_strided(content, (accessor["count"], row), (stride, 1))
-    return np.ascontiguousarray(rows).view("<" + TYPES[accessor["componentType"]])
+def read_attributes(
+    gltf: Gltf, name: str, primitive: dict[str, Any], accessors: list[Accessor]
+) -> tuple[dict[str, Accessor], np.ndarray]:
+    """The accessors of a primitive that are read (`ATTRIBUTES`), and its corners (N,) int64.
 
-
-def check_attributes(
-    path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
-) -> dict[str, int]:
-    """Refuse attributes and indices that do not fit.
-
-    Returns:
-        For the attributes that are read (`ATTRIBUTES`, "indices" among them) and have data, the index of the accessor.
+    Refuses what does not fit together, or is not allowed; warns of wrong bounds. `name` is for errors.
     """
-    attributes = primitive["attributes"]
+    fail, attributes = gltf.fail, primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
-    accessors = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}
-    sparse = [kind for kind, accessor in accessors.items() if "sparse" in accessor]
-    if sparse:
-        raise fail(f"{sparse[0]} of {name} is sparse, which is not read")
-    quantized = QUANTIZATION in (*tree.get("extensionsUsed", []), *tree.get("extensionsRequired", []))
-    for kind, accessor in accessors.items():
-        if accessor["type"] not in ATTRIBUTES.get(kind, WIDTHS):
-            raise fail(f"{kind} of {name} is of {accessor['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
-        _check_components(f"{kind} of {name}, accessor {used[kind]},", kind, accessor, quantized, fail)
-    count = accessors["POSITION"]["count"]
-    different = [kind for kind in attributes if accessors[kind]["count"] != count]
-    if different:
-        raise fail(f"{different[0]} of {name} has {accessors[different[0]]['count']} rows, and POSITION {count}")
-    if "bufferView" not in accessors["POSITION"] and not importlib.util.find_spec("DracoPy"):
+    used = {kind: accessors[count_of(index)] for kind, index in used.items()}
+    for kind, accessor in used.items():
+        if "sparse" in accessor.json:
+            raise fail(f"{kind} of {name} is sparse, which is not read")
+        if accessor.json["type"] not in ATTRIBUTES.get(kind, WIDTHS):
+            raise fail(f"{kind} of {name} is of {accessor.json['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
+        _check_components(
+            f"{kind} of {name}, accessor {accessor.index},", kind, accessor, gltf.uses(QUANTIZATION), fail
+        )
+    count = used["POSITION"].count
+    for kind in attributes:
+        if used[kind].count != count:
+            raise fail(f"{kind} of {name} has {used[kind].count} rows, and POSITION {count}")
+    if used["POSITION"].content is None:
         extensions = ", ".join(primitive.get("extensions", {})) or "none is named"
         raise fail(f"{name} has no data of its own, and the extension that has them is not read: {extensions}")
-    read = {kind: used[kind] for kind, a in accessors.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
-    _check_overlap(name, {kind: index for kind, index in read.items() if kind != "indices"}, tree, fail)
-    _check_bounds(path, name, read, tree, views)
-    if "bufferView" in accessors["POSITION"]:
-        _check_corners(name, primitive, count, used.get("indices"), tree, views, fail)
-    return read
+    read = {kind: accessor for kind, accessor in used.items() if kind in ATTRIBUTES}
+    _check_overlap(name, {k: a for k, a in read.items() if k != "indices" and a.content is not None and count}, fail)
+    for kind in ("POSITION", "indices"):
+        if kind in read and read[kind].content is not None and read[kind].count:
+            _check_bounds(gltf, f"{kind} of {name}", read[kind])
+    return read, _corners(name, primitive.get("mode", 4), count, read.pop("indices", None), fail)
 
 
-def _check_components(name: str, kind: str, accessor: dict[str, Any], quantized: bool, fail: Any) -> None:
+def _check_components(name: str, kind: str, accessor: Accessor, quantized: bool, fail: Fail) -> None:
     """Refuse a type of numbers that the format does not allow for an attribute.
 
     Args:
         name: of the attribute and its primitive, for errors.
         kind: of the attribute, such as "POSITION", or "indices"; kinds not in `COMPONENTS` may have any type.
-        accessor: its JSON.
+        accessor: the attribute's.
         quantized: True if the file uses KHR_mesh_quantization, which allows more.
         fail: text → error.
     """
-    component = TYPES[accessor["componentType"]]
-    if accessor.get("normalized", False) not in (True, False):
-        raise fail(f"{name} has normalized = {accessor['normalized']!r}; expected true or false")
-    known = component + (" fraction" if accessor.get("normalized") and component not in ("u4", "f4") else "")
+    component, normalized = TYPES[accessor.json["componentType"]], accessor.json.get("normalized", False)
+    if normalized not in (True, False):
+        raise fail(f"{name} has normalized = {normalized!r}; expected true or false")
+    known = component + (" fraction" if normalized and component not in ("u4", "f4") else "")
     if known not in (QUANTIZED if quantized else COMPONENTS).get(kind, (known,)):
         raise fail(
-            f"{name} is of numbers {accessor['componentType']} ({np.dtype(component).name}"
-            f"{', normalized' if accessor.get('normalized') else ''}), which glTF does not allow there"
+            f"{name} is of numbers {accessor.json['componentType']} ({accessor.component.name}"
+            f"{', normalized' if normalized else ''}), which glTF does not allow there"
             f"{'' if quantized or known not in QUANTIZED[kind] else f' without the extension {QUANTIZATION}'}"
         )
 
 
-def _check_overlap(name: str, read: dict[str, int], tree: dict[str, Any], fail: Any) -> None:
+def _check_overlap(name: str, read: dict[str, Accessor], fail: Fail) -> None:
     """Refuse attributes of one primitive that share bytes of a view, where their rows are equally far apart."""
-    places = []
-    for kind, index in read.items():
-        accessor = tree["accessors"][index]
-        start, stride, row = _layout(accessor, tree["bufferViews"])
-        places.append((accessor["bufferView"], stride, start, row, accessor["count"], f"{kind} (accessor {index})"))
-    places.sort(key=lambda place: place[:3])
-    for (view, stride, a, row, count, first), (other, step, b, width, _, second) in zip(
+    places = sorted((a.json["bufferView"], a.stride, a.start, kind) for kind, a in read.items())
+    for (view, stride, start, kind), (other_view, other_stride, other_start, other_kind) in zip(
         places, places[1:], strict=False
     ):
-        if view != other or stride != step or b >= a + (count - 1) * stride + row:
+        first, second, apart = read[kind], read[other_kind], other_start - start
+        if view != other_view or stride != other_stride or apart >= (first.count - 1) * stride + first.row:
             continue
-        if not row <= (b - a) % stride <= stride - width:
-            raise fail(f"{first} and {second} of {name} share bytes, with rows {stride} bytes apart")
-
-
-def _check_bounds(path: Path, name: str, read: dict[str, int], tree: dict[str, Any], views: list[bytes]) -> None:
-    """Warn of positions or indices not between the bounds that their accessor gives, or that do not reach these."""
-    for kind in ("POSITION", "indices"):
-        accessor = tree["accessors"][read[kind]] if kind in read else {}
-        if "min" not in accessor or "max" not in accessor or not accessor["count"]:
-            continue
-        rows = rows_of(accessor, tree["bufferViews"], views).astype(np.float64)
-        bounds = np.stack([rows.min(axis=0), rows.max(axis=0)])
-        try:
-            declared = np.array([accessor["min"], accessor["max"]], np.float64)
-            slack = BOUNDS_TOLERANCE * np.ptp(bounds, axis=0) + 1e-5 * np.abs(bounds).max()
-            wrong = declared.shape != bounds.shape or not (np.abs(bounds - declared) <= slack).all()
-        except (TypeError, ValueError):
-            wrong = True
-        if wrong:
-            warn(
-                f"{path}: {kind} of {name} go from {bounds[0].tolist()} to {bounds[1].tolist()}, but min and max of "
-                f"accessor {read[kind]} are {accessor['min']} and {accessor['max']}; the file may be damaged"
+        if not first.row <= apart % stride <= stride - second.row:
+            raise fail(
+                f"{kind} (accessor {first.index}) and {other_kind} (accessor {second.index}) of {name} share bytes, "
+                f"with rows {stride} bytes apart"
             )
 
 
-def _check_corners(
-    name: str,
-    primitive: dict[str, Any],
-    count: int,
-    indices: int | None,
-    tree: dict[str, Any],
-    views: list[bytes],
-    fail: Any,
-) -> None:
-    """Refuse corners that make no triangles, or refer to vertices that are not there.
+def _check_bounds(gltf: Gltf, name: str, accessor: Accessor) -> None:
+    """Warn of rows not between the bounds that their accessor gives, or that do not reach these."""
+    if not {"min", "max"} <= set(accessor.json):
+        return
+    low, high = accessor.json["min"], accessor.json["max"]
+    rows = accessor.rows().astype(np.float64)
+    bounds = np.stack([rows.min(axis=0), rows.max(axis=0)])
+    try:
+        declared = np.array([low, high], np.float64)
+        slack = BOUNDS_TOLERANCE * np.ptp(bounds, axis=0) + 1e-5 * np.abs(bounds).max()
+        wrong = declared.shape != bounds.shape or not (np.abs(bounds - declared) <= slack).all()
+    except (TypeError, ValueError):
+        wrong = True
+    if wrong:
+        warn(
+            f"{gltf.path}: {name} go from {bounds[0].tolist()} to {bounds[1].tolist()}, but min and max of "
+            f"accessor {accessor.index} are {low} and {high}; the file may be damaged"
+        )
 
-    `indices` is the accessor of a primitive's table of corners; None where its `count` vertices are the corners.
+
+def _corners(name: str, mode: int, count: int, indices: Accessor | None, fail: Fail) -> np.ndarray:
+    """The vertices (N,) int64 of a primitive's corners, refused if they make no triangles, or are not there.
+
+    Without `indices`, the `count` vertices are the corners.
     """
-    corners, owner = count, f"POSITION of {name}"
+    corners, owner = np.arange(count), f"POSITION of {name}"
     if indices is not None:
-        accessor = tree["accessors"][indices]
-        corners, owner = accessor["count"], f"accessor {indices}, the indices of {name},"
-        if "bufferView" not in accessor:
+        owner = f"accessor {indices.index}, the indices of {name},"
+        if indices.content is None:
             raise fail(f"{owner} has no data")
-        _, stride, row = _layout(accessor, tree["bufferViews"])
-        if stride != row:
-            raise fail(f"{owner} has rows {stride} bytes apart; expected them one after the other")
-        largest = rows_of(accessor, tree["bufferViews"], views).max(initial=0)
-        if largest >= count:
-            raise fail(f"{owner} refers to vertex {largest} of {count}, which count from 0")
-    if corners == 0 or (primitive.get("mode", 4) == 4 and corners % 3):
-        raise fail(f"{owner} has {corners} corners of triangles; expected a multiple of 3")
+        if indices.stride != indices.row:
+            raise fail(f"{owner} has rows {indices.stride} bytes apart; expected them one after the other")
+        corners = indices.rows().ravel().astype(np.int64)
+        if corners.max(initial=0) >= count:
+            raise fail(f"{owner} refers to vertex {corners.max()} of {count}, which count from 0")
+    if len(corners) == 0 or (mode == 4 and len(corners) % 3):
+        raise fail(f"{owner} has {len(corners)} corners of triangles; expected a multiple of 3")
+    return corners

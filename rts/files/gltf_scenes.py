@@ -1,48 +1,47 @@
-"""Checks of nodes and scenes of GLB and glTF files: nodes form a forest, and transforms of meshes are sound."""
+"""Nodes and scenes of GLB and glTF files: where meshes are. Nodes form a forest, and transforms of meshes are sound."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rts.files.damaged_files import warn
-from rts.files.gltf_accessors import count_of
+from rts.files.damaged_files import Fail, warn
+from rts.files.gltf_tree import TOLD, Gltf, count_of
 from rts.files.model_pieces import fault_of
 
 _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
-def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
-    """Refuse nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots.
+def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
+    """The meshes of the scene that is shown: index, and transform (4, 4) scene-from-local, one for each node.
 
-    Skins, instances and morph targets, which are not read, are warned of.
+    Refuses nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots; warns of
+    skins, instances and morph targets, which are not read.
     """
-    nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
-    parents = _check_forest(nodes, fail)
-    shown = {index for index, node in enumerate(nodes) if "mesh" in node}
-    ahead = list(shown)
-    while ahead:
-        above = {parents[index] for index in ahead if index in parents} - shown
-        shown |= above
-        ahead = list(above)
+    path, fail, tree = gltf.path, gltf.fail, gltf.tree
+    nodes, meshes, scenes = tree.get("nodes", []), tree.get("meshes", []), tree.get("scenes", [])
+    parents = _parents(nodes, fail)
+    moves = [_move(f"node {index}", node, fail) for index, node in enumerate(nodes)]
+    shown = set()
     for index, node in enumerate(nodes):
-        matrix = _matrix(f"node {index}", node, fail)
-        fault = fault_of(matrix) if index in shown else ""
-        if fault:
-            raise fail(f"the transform of node {index} {fault}")
         if "mesh" in node and count_of(node["mesh"]) >= len(meshes):
             raise fail(f"node {index} is of mesh {node['mesh']}, and there are {len(meshes)}")
+        above = index if "mesh" in node else None
+        while above is not None and above not in shown:
+            shown.add(above)
+            above = parents.get(above)
+    for index in sorted(shown):
+        if fault := fault_of(moves[index]):
+            raise fail(f"the transform of node {index} {fault}")
     bent = [index for index, node in enumerate(nodes) if "skin" in node]
     if bent:
         warn(f"{path}: node {bent[0]} is bent by a skin, which is not read; it is loaded as it is without")
-    repeated = [index for index, node in enumerate(nodes) if "EXT_mesh_gpu_instancing" in node.get("extensions", {})]
+    repeated = [index for index, node in enumerate(nodes) if TOLD in node.get("extensions", {})]
     if repeated:
         warn(f"{path}: node {repeated[0]} stands for several instances, which are not read; it is loaded once")
     if any(np.any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)):
         warn(f"{path} has morph targets, which are not read; meshes are loaded as they are without")
-    scenes = tree.get("scenes", [])
     if "scene" in tree and count_of(tree["scene"]) >= len(scenes):
         raise fail(f"its scene is number {tree['scene']}, and there are {len(scenes)}")
     for index, scene in enumerate(scenes):
@@ -52,9 +51,18 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
             raise fail(
                 f"scene {index} has node {wrong[0]}, which is there twice, is the child of another, or is missing"
             )
+    instances = []
+    ahead = [(root, np.eye(4)) for root in scenes[tree.get("scene", 0)].get("nodes", [])] if scenes else []
+    while ahead:
+        index, outer = ahead.pop()
+        place = outer @ moves[index]
+        ahead += [(child, place) for child in nodes[index].get("children", [])]
+        if "mesh" in nodes[index]:
+            instances.append((nodes[index]["mesh"], place))
+    return instances
 
 
-def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
+def _parents(nodes: list[dict[str, Any]], fail: Fail) -> dict[int, int]:
     """Child → parent, indices of nodes; refused if nodes form no forest, since a walk among them might never end."""
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
@@ -75,8 +83,8 @@ def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
     return parents
 
 
-def _matrix(name: str, node: dict[str, Any], fail: Any) -> np.ndarray:
-    """The transform (4, 4) of a node without its rotation, which changes no volume. Its numbers are checked."""
+def _move(name: str, node: dict[str, Any], fail: Fail) -> np.ndarray:
+    """The transform (4, 4) of a node in its parent. Its numbers are checked."""
     entries = {key: node[key] for key in _WIDTHS if key in node}
     for key, values in entries.items():
         numbers = isinstance(values, list) and all(isinstance(x, (int, float)) and x is not True for x in values)
@@ -86,12 +94,18 @@ def _matrix(name: str, node: dict[str, Any], fail: Any) -> np.ndarray:
         raise fail(
             f"{name} has both matrix and {', '.join(key for key in entries if key != 'matrix')}; expected one of them"
         )
-    matrix = np.eye(4)
     if "matrix" in entries:
-        matrix = np.array(entries["matrix"], np.float64).reshape(4, 4).T
-    matrix[:3, 3] += entries.get("translation", 0)
-    matrix[:3, :3] *= entries.get("scale", 1)
-    length = np.linalg.norm(np.array(entries.get("rotation", [0, 0, 0, 1]), np.float64))
-    if not abs(length - 1) <= 0.01:
+        return np.array(entries["matrix"], np.float64).reshape(4, 4).T
+    quaternion = np.array(entries.get("rotation", [0, 0, 0, 1]), np.float64)
+    if not abs(np.linalg.norm(quaternion) - 1) <= 0.01:
         raise fail(f"rotation of {name} is {entries['rotation']}; expected a quaternion of length 1")
+    x, y, z, w = quaternion * np.sqrt(2 / (quaternion @ quaternion))
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - y * y - z * z, x * y - z * w, x * z + y * w],
+        [x * y + z * w, 1 - x * x - z * z, y * z - x * w],
+        [x * z - y * w, y * z + x * w, 1 - x * x - y * y],
+    ]
+    matrix[:3, :3] *= np.array(entries.get("scale", [1, 1, 1]), np.float64)
+    matrix[:3, 3] = entries.get("translation", 0)
     return matrix

@@ -19,7 +19,7 @@ from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.contracts.checks import MEMORY, is_real
 from rts.errors import EngineError, FileWarning, InputError, PluginError, warn
-from rts.files.damaged_files import gathered
+from rts.files.damaged_files import Fail, gathered
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 
@@ -210,33 +210,24 @@ def read_texture(path: Path, referrer: Path) -> np.ndarray:
 
 def read_image(path: Path) -> np.ndarray:
     """The result of `pixels` for an image file; an InputError if it cannot be read."""
+    return decoded(path, str(path), lambda what: InputError(f"{what}; export it again, as PNG for example"))
+
+
+def decoded(source: Path | bytes, name: str, fail: Fail) -> np.ndarray:
+    """The result of `pixels` for a file or its bytes; an error, `fail` of a text with `name`, if it cannot be read."""
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
             return pixels(image)
-    except InputError as error:
-        raise InputError(f"{path} {error}") from None
     except Exception as error:  # Pillow's decoders raise many kinds, SyntaxError and struct.error among them.
-        said = " ".join(str(error).split())
-        raise InputError(f"{path} cannot be read as an image ({said}); export it again, as PNG for example") from error
-
-
-def is_image(content: bytes) -> bool:
-    """True where bytes begin like an image that Pillow reads."""
-    from PIL import Image
-
-    try:
-        Image.open(io.BytesIO(content)).close()
-    except Exception:  # Of many kinds, as in `read_image`.
-        return False
-    return True
+        raise fail(f"{name} cannot be read as an image ({' '.join(str(error).split())})") from error
 
 
 def pixels(image: Any) -> np.ndarray:
     """(h, w, 3) float32 in [0, 1] of a Pillow image as encoded, (h, w, 4) where some alpha is below one."""
     if image.mode == "F":
-        raise InputError("holds floating-point numbers, whose range is not known; export it again, as PNG for example")
+        raise ValueError("it holds floating-point numbers, whose range is not known")
     if image.mode.startswith("I"):  # 16 bits of grey, which Pillow would clip to 8.
         grey = np.asarray(image, np.float32) / 65535
         return np.repeat(np.clip(grey, 0, 1)[..., None], 3, axis=2)

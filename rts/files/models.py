@@ -1,11 +1,12 @@
 """Models from files as parts: pieces of a file welded, their colours made linear, their shaders chosen.
 
-OBJ has a reader of its own (`rts.files.obj_reader`), since its separate tables of positions, uv and normals are exactly
-what a `Mesh` takes; every other format goes through trimesh.
+Each format has a reader of its own, which refuses what is damaged, and gives the file's tables as they are; formats
+without one go through trimesh.
 """
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,15 @@ import numpy as np
 from rts import registry
 from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
-from rts.files.damaged_files import gathered
+from rts.files.damaged_files import contents, gathered
+from rts.files.gltf_reader import read_gltf
 from rts.files.model_pieces import Piece, check_piece
 from rts.files.obj_reader import read_obj
-from rts.files.paths import as_path
+from rts.files.off_reader import read_off
+from rts.files.paths import as_path, beside
+from rts.files.ply_reader import read_ply
 from rts.files.srgb import decode_srgb
+from rts.files.stl_reader import read_stl
 from rts.files.trimesh_reader import read_with_trimesh
 from rts.scene.parts import Part
 from rts.shading.shaders import Lambert, Textured
@@ -233,12 +238,28 @@ def read_pieces(path: Path) -> list[Piece]:
     Raises:
         InputError: the file cannot be read, or holds no sound mesh.
     """
-    extension = path.suffix.lower().removeprefix(".")
     check_exists(path)
-    if extension == "obj":
-        pieces = read_obj(path)
-    else:
-        pieces = read_with_trimesh(path, extension)
-    for piece in pieces:
+    extension = path.suffix.lower().removeprefix(".")
+    data = b"" if extension == "obj" else contents(path)
+    file = functools.partial(beside, path)
+    match extension:
+        case "obj":
+            pieces = read_obj(path)
+        case "ply":
+            pieces = [read_ply(path, data, file)]
+        case "off":
+            pieces = [read_off(path, data)]
+        case "stl" | "stl_ascii":
+            pieces = read_stl(path, data)
+        case "glb" | "gltf":
+            pieces = read_gltf(path, data, file)
+        case _:
+            pieces = read_with_trimesh(path, data, file)
+    meshes = [piece for piece in pieces if len(piece.faces)]
+    if not meshes:
+        points = sum(len(piece.vertices) for piece in pieces)
+        what = f"{points} points but no faces" if points else "no geometry"
+        raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
+    for piece in meshes:
         check_piece(path, piece)
-    return pieces
+    return meshes

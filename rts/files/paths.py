@@ -15,10 +15,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
 from typing import Any
+from urllib.parse import unquote
 
 import platformdirs
 
 from rts.errors import InputError
+from rts.files.damaged_files import contents
 
 
 def as_path(path: Any) -> Path:
@@ -111,6 +113,20 @@ def inside(folder: Path, name: str, referrer: Path, start: Path | None = None) -
     if not target.is_relative_to(folder.resolve()):
         raise refused
     return target
+
+
+def beside(path: Path, name: str) -> bytes:
+    """The bytes of a file that a model names, perhaps with its spaces and other characters as in a URI.
+
+    Raises:
+        InputError: see `inside`; or there is no such file, or it cannot be read.
+    """
+    target = inside(path.parent, name.strip(), path)
+    if not target.is_file():
+        target = inside(path.parent, unquote(name.strip()), path)
+    if not target.is_file():
+        raise InputError(f"{path} refers to {name!r}, but there is no file {target}; put it there")
+    return contents(target)
 
 
 def cache_folder() -> Path:

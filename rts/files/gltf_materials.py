@@ -1,0 +1,84 @@
+"""Materials of GLB and glTF files."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.files.damaged_files import warn
+from rts.files.gltf_tree import Gltf
+
+SPECULAR = "KHR_materials_pbrSpecularGlossiness"
+"""An older kind of material; of what it is made of, the diffuse colour is read."""
+
+
+class Material(NamedTuple):
+    """The part of a material that shaders use.
+
+    Attributes:
+        color: (4,) the factor of the base colour, linear, in steps of 1/255; or None.
+        texture: (h, w, 3 or 4) of the base colour, as `rts.files.images.pixels` gives it; or None.
+        alpha_mode: "OPAQUE", "MASK" or "BLEND".
+        cutoff: the least alpha that is shown, of "MASK".
+    """
+
+    color: np.ndarray | None = None
+    texture: np.ndarray | None = None
+    alpha_mode: str = "OPAQUE"
+    cutoff: float = 0.5
+
+    def shown(
+        self, rows: np.ndarray | None, mapped: bool
+    ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+        """Vertex colours (A, 3 or 4), the texture and the factor, with the alpha that the mode gives them.
+
+        It is none where the mode is OPAQUE. Where the mode is MASK, the product of alpha is 1 from the cutoff on, and 0
+        below. A texture hides the colours, unless it is not `mapped`. Arrays of three components have no alpha, and
+        stay as they are, as None does.
+        """
+        values = [rows, self.texture, self.color]
+        if self.alpha_mode == "BLEND":
+            return rows, self.texture, self.color
+        plain = [None if x is None else x[..., :3] for x in values]
+        if self.alpha_mode == "MASK":
+            at = 1 if mapped and self.texture is not None else 0
+            shown, alpha = values[at], 1.0 if self.color is None else float(self.color[3])
+            if shown is not None and shown.shape[-1] == 4:
+                opaque = shown[..., 3:] * alpha >= self.cutoff
+                plain[at] = np.concatenate([shown[..., :3], opaque], axis=-1, dtype=shown.dtype)
+            elif self.color is not None:
+                plain[2] = np.append(self.color[:3], float(alpha >= self.cutoff))
+        return plain[0], plain[1], plain[2]
+
+
+def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
+    """A material; refused if a colour or texture is invalid. Warns of what is not read of a texture."""
+    name = f"material {index}"
+    look = dict(material.get("pbrMetallicRoughness", {}))
+    older = material.get("extensions", {}).get(SPECULAR, {})
+    for ours, theirs in (("baseColorFactor", "diffuseFactor"), ("baseColorTexture", "diffuseTexture")):
+        if theirs in older:
+            look[ours] = older[theirs]
+    factor = np.array(look.get("baseColorFactor", [1.0] * 4), np.float64)
+    if factor.shape != (4,):
+        raise gltf.fail(f"the baseColorFactor of {name} is {factor.tolist()}; expected four numbers")
+    color = unit_colors(gltf, f"baseColorFactor of {name}", factor[None])[0] if "baseColorFactor" in look else None
+    texture = None
+    if "baseColorTexture" in look:
+        reference = look["baseColorTexture"]
+        if "KHR_texture_transform" in reference.get("extensions", {}) or reference.get("texCoord", 0) != 0:
+            warn(f"{gltf.path}: the texture of {name} has a transform or coordinates of its own, which are not read")
+        texture = gltf.picture(reference["index"], f"the texture of {name}")
+    return Material(color, texture, material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5)))
+
+
+def unit_colors(gltf: Gltf, name: str, colors: np.ndarray) -> np.ndarray:
+    """Colours (N, C) clipped to [0, 1], in steps of 1/255; refused if NaN or beyond ±255, with a warning if clipped."""
+    wrong = ~(np.abs(colors) <= 255).all(axis=1)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        raise gltf.fail(f"row {at} of {name} is {colors[at].tolist()}; expected colours from 0 to 1")
+    if ((colors < 0) | (colors > 1)).any():
+        warn(f"{gltf.path}: {name} has colours that are not from 0 to 1, which are clipped")
+    return np.round(255 * np.clip(colors, 0, 1)).astype(np.float64) / 255

@@ -1,0 +1,83 @@
+"""Reading GLB and glTF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rts.files.damaged_files import warn
+from rts.files.gltf_accessors import Accessor, read_accessor, read_attributes
+from rts.files.gltf_materials import Material, read_material, unit_colors
+from rts.files.gltf_scenes import read_instances
+from rts.files.gltf_tree import Gltf, count_of
+from rts.files.model_pieces import Piece
+
+MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
+
+
+def read_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> list[Piece]:
+    """A piece for each primitive of each node of the scene that is shown; points and lines are pieces without faces.
+
+    Args:
+        path: the path of the file.
+        data: its bytes.
+        file: name → bytes of a file that it refers to.
+
+    Raises:
+        InputError: it is shorter than it promises; a part is missing, unsound or needs what is not read; accessors
+            reach beyond the data; or colours are not finite or far off.
+    """
+    gltf = Gltf(path, data, file)
+    accessors = gltf.each("accessors", lambda index, _: read_accessor(gltf, index))
+    materials = gltf.each("materials", lambda index, material: read_material(gltf, index, material))
+
+    def read_mesh(index: int, mesh: dict[str, Any]) -> list[Piece]:
+        return [_piece(gltf, f"mesh {index}", p, accessors, materials) for p in mesh["primitives"]]
+
+    meshes = gltf.each("meshes", read_mesh)
+    instances = gltf.part("its scene", read_instances, gltf)
+    gltf.part("its tree", gltf.check_names)
+    return [
+        piece._replace(transform=None if np.array_equal(place, np.eye(4)) else place)
+        for mesh, place in instances
+        for piece in meshes[mesh]
+    ]
+
+
+def _piece(
+    gltf: Gltf, name: str, primitive: dict[str, Any], accessors: list[Accessor], materials: list[Material]
+) -> Piece:
+    """A primitive, in local space; refused if of an unfit mode, material or attribute. `name` is for errors."""
+    mode = count_of(primitive.get("mode", 4))
+    if mode > 5:
+        raise gltf.fail(
+            f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)"
+        )
+    if mode in MODES:
+        warn(f"{gltf.path}: {name} is of {MODES[mode]}, which are left out")
+    if "material" in primitive and count_of(primitive["material"]) >= len(materials):
+        raise gltf.fail(f"{name} has material {primitive['material']}, which is not there")
+    material = materials[primitive["material"]] if "material" in primitive else Material()
+    read, corners = read_attributes(gltf, name, primitive, accessors)
+    faces = corners[:0] if mode in MODES else corners
+    if mode == 5:
+        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        faces[1::2] = faces[1::2, ::-1]  # Every other triangle of a strip is turned over.
+    faces = faces.reshape(-1, 3)
+    attributes = {}
+    if "NORMAL" in read:
+        attributes["normals"] = read["NORMAL"].numbers(), faces
+    if "TEXCOORD_0" in read:
+        u, v = read["TEXCOORD_0"].numbers().T
+        attributes["uv"] = np.stack([u, 1 - v], axis=1), faces
+    colors = None
+    if "COLOR_0" in read:
+        colors = unit_colors(gltf, f"COLOR_0 of {name}", read["COLOR_0"].numbers(fractions=True))
+    colors, texture, color = material.shown(colors, "uv" in attributes)
+    if colors is not None:
+        attributes["colors"] = colors, faces
+    vertices = read["POSITION"].numbers().astype(np.float64)
+    return Piece(vertices, faces, attributes, texture, color, linear=True)
