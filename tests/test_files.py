@@ -976,7 +976,7 @@ def test_an_array_of_frames_is_an_animation_and_its_speed_is_the_nearest_that_th
 
 def test_mp4_needs_a_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(PluginError, match="pip install imageio-ffmpeg"):
+    with pytest.raises(PluginError, match=r"pip install 'rasterize-then-splat\[video\]'"):
         rts.save_animation(tmp_path / "a.mp4", [np.zeros((2, 2))])
 
 
@@ -989,7 +989,7 @@ def test_mp4(tmp_path):
 
 
 def test_importing_the_library_imports_no_reader_and_no_framework():
-    heavy = ["trimesh", "PIL", "imageio", "scipy", "torch", "jax", "numba"]
+    heavy = ["trimesh", "PIL", "imageio_ffmpeg", "scipy", "torch", "jax", "numba"]
     code = f"import sys, rts; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
 

@@ -15,7 +15,6 @@ from rts_surfaces.implicit.narrow_band import NarrowBand
 
 pytestmark = pytest.mark.sampling
 
-pytest.importorskip("mcubes")
 Isosurface = rts.plugin("surfaces", "isosurface")
 CAMERA, SIZE = Camera.look_at((0.4, 1.3, 2.9), (0, 0, 0), fov_y=40), (48, 48)
 RADII = {"radii": np.array([0.6, 0.25], np.float32)}

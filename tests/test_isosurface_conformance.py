@@ -9,7 +9,6 @@ from rts_surfaces.implicit.fields import swept_sphere
 
 pytestmark = pytest.mark.plugins
 
-pytest.importorskip("mcubes")
 Isosurface = rts.plugin("surfaces", "isosurface")
 BOUNDS = ((-1.51, -0.7, -1.5), (1.5, 0.72, 1.53))
 

@@ -7,13 +7,11 @@ import pytest
 from lattices import BALL, TORUS, on_lattice
 
 import rts
+from rts_surfaces.implicit import marching_cubes
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
 pytestmark = pytest.mark.sampling
-
-mcubes = pytest.importorskip("mcubes")
-from rts_surfaces.implicit import marching_cubes  # noqa: E402
 
 UNIT = ((0, 0, 0), (1, 1, 1))
 
@@ -40,7 +38,7 @@ def random_values(seed):
     return np.rint(values) if seed % 2 else values
 
 
-def test_the_cases_are_those_of_the_library():
+def test_the_cases_cut_the_edges_that_change_sign():
     counts, edges = marching_cubes.cases()
     assert counts[0] == counts[255] == 0 and counts.sum() == 820
     for case in range(256):

@@ -28,7 +28,6 @@ HEAVY = (
     "trimesh",
     "scipy",
     "PIL",
-    "imageio",
     "matplotlib",
     "optax",
 )

@@ -28,8 +28,6 @@ def test_a_tutorial_runs_and_writes_its_picture(script, tmp_path, monkeypatch, c
             with pytest.raises(AttributeError) as error:
                 getattr(rts, name)
             pytest.skip(str(error.value))
-    if "rts.Isosurface" in text:
-        pytest.importorskip("mcubes")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RTS_QUICK", "1")
     with warnings.catch_warnings():

@@ -72,7 +72,7 @@ def load_image(path: Any) -> np.ndarray:
 
 
 def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> None:
-    """Write an animated .gif or .png, or an .mp4 if imageio-ffmpeg is installed.
+    """Write an animated .gif or .png, or an .mp4 if imageio-ffmpeg is installed (extra `video`).
 
     Args:
         path: a name with one of these extensions; folders that do not exist are made.
@@ -134,18 +134,23 @@ def _each(frames: Any) -> Iterable[Any]:
 
 
 def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
-    import imageio.v2 as imageio
-
     try:
         # Not among what is installed for checks of types.
-        import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
+        from imageio_ffmpeg import write_frames  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
-        raise PluginError("mp4 needs the package imageio-ffmpeg: pip install imageio-ffmpeg; or write a .gif") from None
+        raise PluginError(
+            "mp4 needs imageio-ffmpeg: pip install 'rasterize-then-splat[video]'; or write a .gif"
+        ) from None
     # The usual pixel format of mp4 halves the resolution of colour: sides must be even.
-    even: list[Any] = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
-    even = [np.pad(p, ((0, p.shape[0] % 2), (0, p.shape[1] % 2), (0, 0)), mode="edge") for p in even]
-    # The format's own options are not in the function's annotations.
-    imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # pyright: ignore[reportCallIssue]
+    even = [
+        np.pad(p, ((0, p.shape[0] % 2), (0, p.shape[1] % 2), *[(0, 0)] * (p.ndim - 2)), mode="edge") for p in pictures
+    ]
+    kind = "rgb24" if even[0].ndim == 3 else "gray"
+    writer = write_frames(path, even[0].shape[1::-1], pix_fmt_in=kind, fps=fps, macro_block_size=2)
+    writer.send(None)
+    for picture in even:
+        writer.send(np.ascontiguousarray(picture))
+    writer.close()
 
 
 def _host(image: Any, name: str) -> np.ndarray:
