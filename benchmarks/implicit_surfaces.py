@@ -1,8 +1,9 @@
 """Isosurfaces: how fast, how much of the lattice they need, how stable their gradients are; and a mixed scene.
 
 *Speed*: an iteration is render, loss, gradient in the values of a 128³ lattice (a torus), and a step of gradient
-descent, with torch and K = 2 at 256²; the values change in each. *Naive*: marching cubes by PyMCubes (`pip install PyMCubes`), the vertices
-computed again from the values at the ends of their edges, so that they have derivatives, and drawn as a mesh.
+descent, with torch and K = 2 at 256²; the values change in each. *Naive*: marching cubes by PyMCubes (`pip install
+PyMCubes`), the vertices computed again from the values at the ends of their edges, so that they have derivatives, and
+drawn as a mesh.
 *Band*: at how many points a function is evaluated, and the time of evaluations and triangles, in NumPy.
 *Outlines*: derivatives of silhouettes against closed forms, and against differences of hard images.
 *Stability*: norms of gradients while a surface passes through ties of lattice values. Contenders take turns:

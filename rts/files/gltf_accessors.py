@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,31 +12,24 @@ from rts.files.gltf_tree import Gltf, count_of
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-ATTRIBUTES = {
-    **{"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "TEXCOORD_0": ("VEC2",), "COLOR_0": ("VEC3", "VEC4")},
-    "indices": ("SCALAR",),
-}
 QUANTIZATION = "KHR_mesh_quantization"
-COMPONENTS = {
-    "POSITION": ("f4",),
-    "NORMAL": ("f4",),
-    "TEXCOORD_0": ("f4", "u1 fraction", "u2 fraction"),
-    "COLOR_0": ("f4", "u1", "u2", "u1 fraction", "u2 fraction"),
-    "indices": ("u1", "u2", "u4"),
+_INTEGERS = "i1 u1 i2 u2 i1/ u1/ i2/ u2/"
+ATTRIBUTES = {
+    "POSITION": ("VEC3", "f4", _INTEGERS),
+    "NORMAL": ("VEC3", "f4", "i1/ i2/"),
+    "TEXCOORD_0": ("VEC2", "f4 u1/ u2/", _INTEGERS),
+    "COLOR_0": ("VEC3 VEC4", "f4 u1 u2 u1/ u2/", ""),
+    "indices": ("SCALAR", "u1 u2 u4", ""),
 }
-"""Types of components; integers that stand for fractions of their largest value are `normalized`."""
-_INTEGERS = tuple(kind + more for kind in ("i1", "u1", "i2", "u2") for more in ("", " fraction"))
-QUANTIZED = COMPONENTS | {
-    "POSITION": ("f4", *_INTEGERS),
-    "NORMAL": ("f4", "i1 fraction", "i2 fraction"),
-    "TEXCOORD_0": ("f4", *_INTEGERS),
-}
-"""Component types that KHR_mesh_quantization adds."""
+"""What is read: types of rows; types of numbers; and those that KHR_mesh_quantization adds.
+
+Integers with "/" are `normalized`: they stand for fractions of their largest value."""
 BOUNDS_TOLERANCE = 1e-3
 """Tolerance of `min` and `max`, as a share of the range that they bound; some writers round them."""
 
 
-class Accessor(NamedTuple):
+@dataclass(frozen=True)
+class Accessor:
     """A table of numbers, whose rows are known to be there.
 
     Attributes:
@@ -101,7 +95,7 @@ def read_accessor(gltf: Gltf, index: int) -> Accessor:
     end = start + max(count - 1, 0) * stride + row
     if count and end > len(content):
         raise fail(f"accessor {index} promises {count} rows, which end at byte {end} of {len(content)}")
-    return accessor._replace(content=content, start=start, stride=stride)
+    return replace(accessor, content=content, start=start, stride=stride)
 
 
 def read_attributes(
@@ -117,11 +111,7 @@ def read_attributes(
     for kind, accessor in used.items():
         if "sparse" in accessor.json:
             raise fail(f"{kind} of {name} is sparse, which is not read")
-        if accessor.json["type"] not in ATTRIBUTES.get(kind, WIDTHS):
-            raise fail(f"{kind} of {name} is of {accessor.json['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
-        _check_components(
-            f"{kind} of {name}, accessor {accessor.index},", kind, accessor, gltf.uses(QUANTIZATION), fail
-        )
+        _check_types(f"{kind} of {name}", kind, accessor, gltf.uses(QUANTIZATION), fail)
     count = used["POSITION"].count
     for kind in attributes:
         if used[kind].count != count:
@@ -137,25 +127,31 @@ def read_attributes(
     return read, _corners(name, primitive.get("mode", 4), count, read.pop("indices", None), fail)
 
 
-def _check_components(name: str, kind: str, accessor: Accessor, quantized: bool, fail: Fail) -> None:
-    """Refuse a type of numbers that the format does not allow for an attribute.
+def _check_types(name: str, kind: str, accessor: Accessor, quantized: bool, fail: Fail) -> None:
+    """Refuse types of rows or of numbers that the format does not allow for an attribute.
 
     Args:
         name: of the attribute and its primitive, for errors.
-        kind: of the attribute, such as "POSITION", or "indices"; kinds not in `COMPONENTS` may have any type.
+        kind: of the attribute, such as "POSITION", or "indices"; kinds not in `ATTRIBUTES` may have any type.
         accessor: the attribute's.
         quantized: True if the file uses KHR_mesh_quantization, which allows more.
         fail: text → error.
     """
-    component, normalized = TYPES[accessor.json["componentType"]], accessor.json.get("normalized", False)
+    json, normalized = accessor.json, accessor.json.get("normalized", False)
     if normalized not in (True, False):
-        raise fail(f"{name} has normalized = {normalized!r}; expected true or false")
-    known = component + (" fraction" if normalized and component not in ("u4", "f4") else "")
-    if known not in (QUANTIZED if quantized else COMPONENTS).get(kind, (known,)):
+        raise fail(f"{name}, accessor {accessor.index}, has normalized = {normalized!r}; expected true or false")
+    if kind not in ATTRIBUTES:
+        return
+    types, numbers, more = (words.split() for words in ATTRIBUTES[kind])
+    if json["type"] not in types:
+        raise fail(f"{name} is of {json['type']}; expected {' or '.join(types)}")
+    component = TYPES[json["componentType"]]
+    component += "/" if normalized and component not in ("u4", "f4") else ""
+    if component not in numbers and not (quantized and component in more):
         raise fail(
-            f"{name} is of numbers {accessor.json['componentType']} ({accessor.component.name}"
+            f"{name}, accessor {accessor.index}, is of numbers {json['componentType']} ({accessor.component.name}"
             f"{', normalized' if normalized else ''}), which glTF does not allow there"
-            f"{'' if quantized or known not in QUANTIZED[kind] else f' without the extension {QUANTIZATION}'}"
+            f"{f' without the extension {QUANTIZATION}' if component in more else ''}"
         )
 
 

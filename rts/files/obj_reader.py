@@ -28,6 +28,8 @@ LEFT_OUT = frozenset(
 )
 """Statements of the format that say nothing about polygons."""
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
+_FAR = 2**40
+"""More rows than there may be."""
 _NUMERIC = re.compile(r"[-+./eE\s]*\d[-+./eE\d\s]*")
 
 
@@ -36,9 +38,10 @@ class _Lines:
 
     Attributes:
         path: the file.
-        rows: "v", "vt", "vn" → texts of numbers.
-        numbers: "v", "vt", "vn" → line numbers of these.
-        faces: (line number, text of its corners, index of its material), with no negative index.
+        rows: "v", "vt", "vn" → numbers of each row.
+        lines: "v", "vt", "vn" → line numbers of these.
+        corners: zero-based indices of position, uv and normal of all faces' corners; −1 where one is not given.
+        faces: (line number, number of corners, index of the material) of each face.
         tags: (line number, text) of the statements "t".
         libraries: names of files of materials.
         materials: name → index, in order of first use; None, for faces before any "usemtl", is 0.
@@ -47,9 +50,10 @@ class _Lines:
 
     def __init__(self, path: Path):
         self.path = path
-        self.rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
-        self.numbers: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
-        self.faces: list[tuple[int, str, int]] = []
+        self.rows: dict[str, list[list[float]]] = {key: [] for key in LENGTHS}
+        self.lines: dict[str, list[int]] = {key: [] for key in LENGTHS}
+        self.corners: list[tuple[int, ...]] = []
+        self.faces: list[tuple[int, int, int]] = []
         self.tags: list[tuple[int, str]] = []
         self.libraries: list[str] = []
         self.materials: dict[str | None, int] = {}
@@ -60,6 +64,7 @@ class _Lines:
         material = self.materials.setdefault(None, 0)
         lines = lines_of(contents(self.path))
         plain = is_plain("".join(lines))
+        known: dict[str, tuple[int, ...]] = {}
         for number, line in _statements(lines):
             key, _, rest = without_comment(line).replace("\t", " ").strip(" \f\v").partition(" ")
             row = key in self.rows or key in FACES
@@ -67,10 +72,16 @@ class _Lines:
             if (row and "_" in rest) or (not plain and (row or key == "t") and not is_plain(rest)):
                 raise self.fail(number, f"{rest.strip()[:60]!r} are not numbers")
             if key in self.rows:
-                self.rows[key].append(rest)
-                self.numbers[key].append(number)
+                self._read_row(key, rest.split(), number)
             elif row:
-                self.faces.append((number, self._absolute(rest, number) if "-" in rest else rest, material))
+                words = rest.split()
+                if len(words) < 3:
+                    raise self.fail(number, f"a face has {len(words)} corners; expected at least 3")
+                for word in words:
+                    if word not in known or "-" in word:
+                        known[word] = self._corner(word, number)
+                    self.corners.append(known[word])
+                self.faces.append((number, len(words), material))
             elif key == "t":
                 self.tags.append((number, rest))
             elif key == "usemtl":
@@ -84,6 +95,16 @@ class _Lines:
             keys = ", ".join(f"{key[:20]!r} (line {number})" for key, number in list(self.unknown.items())[:5])
             warn(f"{self.path} has statements that are not known, and left out: {keys}")
         return self
+
+    def _read_row(self, key: str, words: list[str], number: int) -> None:
+        if len(words) not in LENGTHS[key]:
+            expected = " or ".join(map(str, sorted(LENGTHS[key])))
+            raise self.fail(number, f"{key!r} has {len(words)} numbers; expected {expected}")
+        try:
+            self.rows[key].append([float(word) for word in words])
+        except ValueError:
+            raise self.fail(number, f"{' '.join(words)[:60]!r} are not numbers") from None
+        self.lines[key].append(number)
 
     def _check_key(self, key: str, rest: str, number: int) -> None:
         """Refuse an unknown key that may be a damaged one: of letters v, t, n, f only, or no word before numbers.
@@ -99,29 +120,27 @@ class _Lines:
         """The error of a line."""
         return InputError(f"{self.path}, line {number}: {what}; the file may be cut short or damaged: export it again")
 
-    def _absolute(self, rest: str, number: int) -> str:
-        """A face whose negative indices, which count back from the latest row, are made positive."""
-        counts = [len(self.rows[k]) for k in ("v", "vt", "vn")]
-        corners = []
-        for corner in rest.split():
-            parts = corner.split("/")
-            for i, part in enumerate(parts[:3]):
-                if part.startswith("-"):
-                    index = counts[i] + 1 + self.integer(part, number)
-                    if index < 1:
-                        raise self.fail(
-                            number, f"the index {part} counts back further than the {counts[i]} rows so far"
-                        )
-                    parts[i] = str(index)
-            corners.append("/".join(parts))
-        return " ".join(corners)
+    def _corner(self, word: str, number: int) -> tuple[int, ...]:
+        """The indices of a corner such as "1/2/3"; negative ones count back from the latest row."""
+        parts = word.split("/")
+        if len(parts) > 3:
+            raise self.fail(number, f"{word[:60]!r} has {len(parts)} indices; expected at most 3 a corner")
+        indices = []
+        for part, (key, rows) in zip([*parts, "", ""], self.rows.items(), strict=False):
+            try:
+                index = int(part) if part or key == "v" else None
+            except ValueError:
+                raise self.fail(number, f"{part[:60]!r} is no index") from None
+            if index is not None and index < -len(rows):
+                raise self.fail(number, f"the index {part} counts back further than the {len(rows)} rows so far")
+            if index is not None and not 0 != index < _FAR:
+                raise self._beyond(number, part[:60], key)
+            indices.append(-1 if index is None else index - 1 if index > 0 else len(rows) + index)
+        return tuple(indices)
 
-    def integer(self, token: str, number: int) -> int:
-        """A whole number of line `number`."""
-        try:
-            return int(token)
-        except ValueError:
-            raise self.fail(number, f"{token[:60]!r} is no index") from None
+    def _beyond(self, number: int, index: Any, key: str) -> InputError:
+        count, name = len(self.rows[key]), {"v": "vertices", "vt": "texture coordinates", "vn": "normals"}[key]
+        return self.fail(number, f"a face refers to number {index} of {count} {name} (indices count from 1)")
 
     def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
         """The rows (N, C) of one kind, float64.
@@ -129,78 +148,28 @@ class _Lines:
         The result has the largest of `widths` columns that every row fills. If a row is shorter than all `widths`,
         there are as many columns as the first says, filled up with zeros.
         """
-        split = [row.split() for row in self.rows[key]]
-        if not split:
-            return np.zeros((0, widths[0]))
-        lengths = {len(row) for row in split}
-        if not lengths <= LENGTHS[key]:
-            number, row = next(
-                (n, r) for n, r in zip(self.numbers[key], split, strict=True) if len(r) not in LENGTHS[key]
-            )
-            expected = " or ".join(map(str, sorted(LENGTHS[key])))
-            raise self.fail(number, f"{key!r} has {len(row)} numbers; expected {expected}")
+        rows = self.rows[key]
+        lengths = {len(row) for row in rows} or {widths[0]}
         width = max((w for w in widths if w <= min(lengths)), default=widths[0])
         if key == "v" and {3, 4} <= lengths:
-            number = next(n for n, row in zip(self.numbers[key], split, strict=True) if len(row) == 4)
+            number = next(n for n, row in zip(self.lines[key], rows, strict=True) if len(row) == 4)
             warn(f"{self.path}, line {number}: 'v' has 4 numbers and others 3; the fourth, a weight, is not used")
         if max(widths) > width and max(lengths) >= max(widths):
             warn(f"{self.path}: some {key!r} have {max(lengths)} numbers and some {min(lengths)}; colours are left out")
-        if min(lengths) < width:
-            split = [[*row, *["0"] * (width - len(row))] for row in split]
-        try:
-            return np.array([[float(x) for x in row[:width]] for row in split])
-        except ValueError:
-            for number, row in zip(self.numbers[key], split, strict=True):
-                if not all(_is_number(x) for x in row[:width]):
-                    raise self.fail(number, f"{' '.join(row)[:60]!r} are not numbers") from None
-            raise
+        return np.array([row[:width] + [0.0] * (width - len(row)) for row in rows], np.float64).reshape(-1, width)
 
-    def polygons(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Zero-based indices of position, uv and normal (H, 3) of all corners, and the corner count of each face (F,).
+    def polygons(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Indices of position, uv and normal (H, 3) of all corners; corner count, and material, of each face (F,).
 
-        An index that is not given is −1. `counts` are the numbers of positions, uv and normals; indices beyond these
-        are refused.
+        An index that is not given is −1. Indices beyond the rows are refused.
         """
-        corners: list[tuple[int, ...]] = []
-        sizes: list[int] = []
-        known: dict[str, tuple[int, ...]] = {}
-        for number, rest, _ in self.faces:
-            tokens = rest.split()
-            if len(tokens) < 3:
-                raise self.fail(number, f"a face has {len(tokens)} corners; expected at least 3")
-            for token in tokens:
-                if token not in known:
-                    known[token] = self._corner(token, number, counts)
-                corners.append(known[token])
-            sizes.append(len(tokens))
-        return np.array(corners, np.int64), np.array(sizes)
-
-    def triangles(self, points: np.ndarray, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Zero-based indices of position, uv and normal (T, 3 corners, 3), and the material (T,).
-
-        See `rts.files.polygons.cut`; `points` are the positions (V, 3), and `counts` those of `polygons`.
-        """
-        table, sizes = self.polygons(counts)
-        cut, owner, forced = polygons.cut(points, table[:, 0], sizes)
-        if forced:
-            warn(f"{self.path}: {forced} polygons cross themselves and may be cut wrongly; export triangles to be sure")
-        return table[cut], np.array([material for _, _, material in self.faces], np.int64)[owner]
-
-    def _corner(self, token: str, number: int, counts: tuple[int, int, int]) -> tuple[int, ...]:
-        indices, parts = [], token.split("/")
-        if len(parts) > 3:
-            raise self.fail(number, f"{token[:60]!r} has {len(parts)} indices; expected at most 3 a corner")
-        for part, count, name in zip(
-            [*parts, "", ""][:3],
-            counts,
-            ("vertices", "texture coordinates", "normals"),
-            strict=True,
-        ):
-            index = self.integer(part, number) if part or name == "vertices" else 0
-            if part and not 1 <= index <= count:
-                raise self.fail(number, f"a face refers to number {part[:60]} of {count} {name} (indices count from 1)")
-            indices.append(index - 1)
-        return tuple(indices)
+        table, faces = np.array(self.corners, np.int64), np.array(self.faces, np.int64)
+        for key, indices in zip(self.rows, table.T, strict=True):
+            beyond = np.flatnonzero(indices >= len(self.rows[key]))
+            if len(beyond):
+                face = np.searchsorted(np.cumsum(faces[:, 1]), beyond[0], side="right")
+                raise self._beyond(faces[face, 0], indices[beyond[0]] + 1, key)
+        return table, faces[:, 1], faces[:, 2]
 
 
 class Polygons(NamedTuple):
@@ -236,11 +205,11 @@ def read_polygons(path: Path) -> Polygons:
         InputError: the file is damaged, or holds no faces.
     """
     lines = _Lines(path).read()
-    v, vt, vn = _rows(lines)
+    v, vt, _ = _rows(lines)
     used = {material for _, _, material in lines.faces}
     materials = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
     material = materials[0] if len(used) == len(materials) == 1 else Material()
-    corners, sizes = lines.polygons((len(v), len(vt), len(vn)))
+    corners, sizes, _ = lines.polygons()
     texture = None if material.texture is None else read_texture(material.texture, path)
     linear = (None if x is None else decode_srgb(x) for x in (_colors(v), material.color, texture))
     colors, color, texture = linear
@@ -277,7 +246,11 @@ def read_obj(path: Path) -> list[Piece]:
     v, vt, vn = _rows(lines)
     # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]
-    corners, owner = lines.triangles(vertices, (len(v), len(vt), len(vn)))
+    table, sizes, of_face = lines.polygons()
+    cut, owner, forced = polygons.cut(vertices, table[:, 0], sizes)
+    if forced:
+        warn(f"{path}: {forced} polygons cross themselves and may be cut wrongly; export triangles to be sure")
+    corners, owner = table[cut], of_face[owner]
     pieces = []
     for name, index in lines.materials.items():
         if index not in used:
@@ -333,11 +306,3 @@ def _statements(lines: list[str]) -> Iterator[tuple[int, str]]:
         start, joined = 0, ""
     if joined:
         yield start, joined
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

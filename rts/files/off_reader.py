@@ -51,7 +51,7 @@ def read_off(path: Path, data: bytes) -> Piece:
     colors = table[:, begin : min(begin + 4, width - 2 if kind[1] else width)] if kind[2] else table[:, :0]
     if kind[2] and colors.shape[1] < 3:
         raise fail(f"it promises colours, and the rows of vertices have {width} numbers")
-    columns = dict(zip(("x", "y", "z"), table.T, strict=False)) | dict(zip(COLORS, colors.T, strict=False))
+    columns = dict(zip("xyz", table.T, strict=False)) | dict(zip(COLORS, colors.T, strict=False))
     return piece_of(path, PolygonTables(columns, _polygons(path, numbered[vertex_count:], fail), {}), fail)
 
 

@@ -205,7 +205,7 @@ def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> Co
     def take(at: np.ndarray, kind: str, name: str) -> np.ndarray:
         values = padded[at]
         typed = values.astype(kind)
-        wrong = np.flatnonzero(typed != values) if kind[0] != "f" else ()
+        wrong = np.flatnonzero(typed != values) if kind[0] != "f" else np.zeros(0, np.int64)
         if len(wrong):
             number, _ = rows[int(np.searchsorted(bounds, at[wrong[0]], side="right")) - 1]
             what = f"{values[wrong[0]]:g} for {name} of {element.name}, which is no {np.dtype(kind).name}"

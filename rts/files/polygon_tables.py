@@ -13,7 +13,7 @@ from rts.files.model_pieces import Piece
 
 Lists = tuple[np.ndarray, np.ndarray]
 """Lists of different lengths: the length of each, and the entries of all, one list after the other."""
-COLORS = ("red", "green", "blue", "alpha")
+COLORS: tuple[str, ...] = ("red", "green", "blue", "alpha")
 UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 """Names that columns of texture coordinates have."""
 

@@ -47,7 +47,7 @@ b05b30320 2b329b084 b2932b 37939a2696a9 079037043a34826 75a7a350a6a202a 8264a747
 059826 240642 268 98bb8a 4904a9ab9 0b508b8ab 4b5ab4 1841b8b98 91b019 08451b 51b 5a159a98a 59014a 0a18a0 4a1 584985 059
 084 -
 """
-"""The triangles of each case, three edges each, as hexadecimal digits; those of Lorensen and Cline's table."""
+"""The triangles of each case, three edges each, as hexadecimal digits; as PyMCubes has them."""
 
 
 class Triangles(NamedTuple):
