@@ -38,7 +38,8 @@ class _Lines:
 
     Attributes:
         path: the file.
-        rows: "v", "vt", "vn" → numbers of each row.
+        values: "v", "vt", "vn" → the numbers of all rows, one row after the other.
+        lengths: "v", "vt", "vn" → how many numbers each row has.
         lines: "v", "vt", "vn" → line numbers of these.
         corners: zero-based indices of position, uv and normal of all faces' corners; −1 where one is not given.
         faces: (line number, number of corners, index of the material) of each face.
@@ -50,7 +51,8 @@ class _Lines:
 
     def __init__(self, path: Path):
         self.path = path
-        self.rows: dict[str, list[list[float]]] = {key: [] for key in LENGTHS}
+        self.values: dict[str, list[float]] = {key: [] for key in LENGTHS}
+        self.lengths: dict[str, list[int]] = {key: [] for key in LENGTHS}
         self.lines: dict[str, list[int]] = {key: [] for key in LENGTHS}
         self.corners: list[tuple[int, ...]] = []
         self.faces: list[tuple[int, int, int]] = []
@@ -67,11 +69,11 @@ class _Lines:
         known: dict[str, tuple[int, ...]] = {}
         for number, line in _statements(lines):
             key, _, rest = without_comment(line).replace("\t", " ").strip(" \f\v").partition(" ")
-            row = key in self.rows or key in FACES
+            row = key in LENGTHS or key in FACES
             # Python takes 1_0 for 10.
             if (row and "_" in rest) or (not plain and (row or key == "t") and not is_plain(rest)):
                 raise self.fail(number, f"{rest.strip()[:60]!r} are not numbers")
-            if key in self.rows:
+            if key in LENGTHS:
                 self._read_row(key, rest.split(), number)
             elif row:
                 words = rest.split()
@@ -101,9 +103,10 @@ class _Lines:
             expected = " or ".join(map(str, sorted(LENGTHS[key])))
             raise self.fail(number, f"{key!r} has {len(words)} numbers; expected {expected}")
         try:
-            self.rows[key].append([float(word) for word in words])
+            self.values[key] += map(float, words)
         except ValueError:
             raise self.fail(number, f"{' '.join(words)[:60]!r} are not numbers") from None
+        self.lengths[key].append(len(words))
         self.lines[key].append(number)
 
     def _check_key(self, key: str, rest: str, number: int) -> None:
@@ -126,7 +129,7 @@ class _Lines:
         if len(parts) > 3:
             raise self.fail(number, f"{word[:60]!r} has {len(parts)} indices; expected at most 3 a corner")
         indices = []
-        for part, (key, rows) in zip([*parts, "", ""], self.rows.items(), strict=False):
+        for part, (key, rows) in zip([*parts, "", ""], self.lengths.items(), strict=False):
             try:
                 index = int(part) if part or key == "v" else None
             except ValueError:
@@ -139,7 +142,7 @@ class _Lines:
         return tuple(indices)
 
     def _beyond(self, number: int, index: Any, key: str) -> InputError:
-        count, name = len(self.rows[key]), {"v": "vertices", "vt": "texture coordinates", "vn": "normals"}[key]
+        count, name = len(self.lengths[key]), {"v": "vertices", "vt": "texture coordinates", "vn": "normals"}[key]
         return self.fail(number, f"a face refers to number {index} of {count} {name} (indices count from 1)")
 
     def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
@@ -148,15 +151,16 @@ class _Lines:
         The result has the largest of `widths` columns that every row fills. If a row is shorter than all `widths`,
         there are as many columns as the first says, filled up with zeros.
         """
-        rows = self.rows[key]
-        lengths = {len(row) for row in rows} or {widths[0]}
+        lengths = set(self.lengths[key]) or {widths[0]}
         width = max((w for w in widths if w <= min(lengths)), default=widths[0])
         if key == "v" and {3, 4} <= lengths:
-            number = next(n for n, row in zip(self.lines[key], rows, strict=True) if len(row) == 4)
+            number = self.lines[key][self.lengths[key].index(4)]
             warn(f"{self.path}, line {number}: 'v' has 4 numbers and others 3; the fourth, a weight, is not used")
         if max(widths) > width and max(lengths) >= max(widths):
             warn(f"{self.path}: some {key!r} have {max(lengths)} numbers and some {min(lengths)}; colours are left out")
-        return np.array([row[:width] + [0.0] * (width - len(row)) for row in rows], np.float64).reshape(-1, width)
+        values, ends = np.array([*self.values[key], 0.0]), np.cumsum(self.lengths[key], dtype=np.int64)[:, None]
+        places = ends - np.array(self.lengths[key], np.int64)[:, None] + np.arange(width)
+        return values[np.where(places < ends, places, -1)]
 
     def polygons(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Indices of position, uv and normal (H, 3) of all corners; corner count, and material, of each face (F,).
@@ -164,8 +168,8 @@ class _Lines:
         An index that is not given is −1. Indices beyond the rows are refused.
         """
         table, faces = np.array(self.corners, np.int64), np.array(self.faces, np.int64)
-        for key, indices in zip(self.rows, table.T, strict=True):
-            beyond = np.flatnonzero(indices >= len(self.rows[key]))
+        for key, indices in zip(LENGTHS, table.T, strict=True):
+            beyond = np.flatnonzero(indices >= len(self.lengths[key]))
             if len(beyond):
                 face = np.searchsorted(np.cumsum(faces[:, 1]), beyond[0], side="right")
                 raise self._beyond(faces[face, 0], indices[beyond[0]] + 1, key)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -185,17 +187,22 @@ def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> tuple[np.ndarray, np.
 
     A line of other than numbers is refused.
     """
-    plain = is_plain("".join(line for _, line in rows))
-    numbers, bounds = [], [0]
+    bounds = np.cumsum([0, *(len(line.split()) for _, line in rows)])
+    text = " ".join(line for _, line in rows)
+    with warnings.catch_warnings(), contextlib.suppress(ValueError, DeprecationWarning):
+        warnings.simplefilter("error")  # Of text that is no number, where NumPy stops.
+        numbers = np.fromstring(text if is_plain(text) else "", sep=" ")
+        if len(numbers) == bounds[-1]:
+            return numbers, bounds
+    numbers = []
     for number, line in rows:
         try:
-            if "_" in line or not (plain or is_plain(line)):  # Python takes 1_0 for 10.
+            if "_" in line or not is_plain(line):  # Python takes 1_0 for 10.
                 raise ValueError
             numbers += map(float, line.split())
         except ValueError:
             raise fail(f"line {number}, {' '.join(line.split())[:60]!r}, is not of numbers") from None
-        bounds.append(len(numbers))
-    return np.array(numbers, np.float64), np.array(bounds)
+    return np.array(numbers, np.float64), bounds
 
 
 def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> Columns:
