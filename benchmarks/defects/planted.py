@@ -185,8 +185,8 @@ ARRAYS = [
     Defect(
         "an OBJ's indices from the end are off by one",
         "rts/files/obj_reader.py",
-        "index = counts[i] + 1 + self.integer(part, number)",
-        "index = counts[i] + self.integer(part, number)",
+        "else len(rows) + index)",
+        "else len(rows) + index - 1)",
         "files file_invariants",
     ),
     Defect(

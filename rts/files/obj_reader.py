@@ -135,7 +135,7 @@ class _Lines:
             except ValueError:
                 raise self.fail(number, f"{part[:60]!r} is no index") from None
             if index is not None and index < -len(rows):
-                raise self.fail(number, f"the index {part} counts back further than the {len(rows)} rows so far")
+                raise self.fail(number, f"the index {part[:60]} counts back further than the {len(rows)} rows so far")
             if index is not None and not 0 != index < _FAR:
                 raise self._beyond(number, part[:60], key)
             indices.append(-1 if index is None else index - 1 if index > 0 else len(rows) + index)
