@@ -13,7 +13,7 @@ class Defect(NamedTuple):
         path: of the file, from the repository's root.
         before: the right text.
         after: the wrong one.
-        tests: names of files in tests/ that are likely to notice, without "test_" and ".py".
+        tests: names of files of tests that are likely to notice, without "test_" and ".py".
     """
 
     name: str

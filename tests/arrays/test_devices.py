@@ -28,7 +28,7 @@ from rts.arrays.trees import leaves, map_leaves
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.devices
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SIZE = (16, 20)
 CAMERA = rts.Camera.look_at((1.0, 1.5, 3.2), (0, 0, 0), fov_y=45, aspect=SIZE[1] / SIZE[0])
 BALL, FACES = icosphere(2)

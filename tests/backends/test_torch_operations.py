@@ -244,7 +244,7 @@ KIT = ["pytest", "-q", "-o", "filterwarnings=", "-p", "no:cacheprovider", "tests
 )
 @pytest.mark.thorough
 def test_what_torch_or_numpy_calls_deprecated_is_not_used(command):
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     given = {"capture_output": True, "text": True, "cwd": root, "env": {**os.environ, "PYTHONPATH": str(root)}}
     done = subprocess.run([sys.executable, "-W", "error::DeprecationWarning", *command], **given)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -14,7 +14,7 @@ from rts.cli.new_plugin import KINDS, PLACES, TRIANGLES
 
 pytestmark = pytest.mark.plugins
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(*arguments, code=0):

@@ -23,7 +23,7 @@ from rts.operations import take_loops
 
 pytestmark = pytest.mark.core
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 FIRST_RENDER = """
 import sys

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import tampered_files as tampered
 from helpers import arrays, quick, to_numpy
+from lines import Lines
 from posed import SIZE, binary_model, save, text_model
 from test_colmap import CAMERAS, POINTS, images
-from test_many_terms import Lines
 from test_views import blender, llff
 
 import rts

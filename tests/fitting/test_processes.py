@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.fitting
 pytest.importorskip("torch")
 
-SCRIPT = Path(__file__).with_name("distributed_fit.py")
+SCRIPT = Path(__file__).parents[1] / "distributed_fit.py"
 
 
 def run(count, *args, restarts=0):

@@ -197,7 +197,7 @@ def test_details_say_which_extra_is_missing(install, tmp_path):
 
 
 def test_surfaces_and_functions_of_the_library_are_attributes_of_it():
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     entries = tomllib.loads((root / "pyproject.toml").read_text())["project"]["entry-points"]
     expected = {
         path.partition(":")[2]: (group, name)

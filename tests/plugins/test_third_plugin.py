@@ -14,7 +14,7 @@ from rts import registry
 from rts.cli.main import app
 from rts.testing import SamplerConformance, ShaderConformance, SurfaceConformance
 
-sys.path.insert(0, str(Path(__file__).parent / "third_plugin"))  # Nothing installs it.
+sys.path.insert(0, str(Path(__file__).parents[1] / "third_plugin"))  # Nothing installs it.
 
 from rts_third_plugin.caster import Caster
 from rts_third_plugin.loft import Loft

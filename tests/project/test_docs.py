@@ -22,7 +22,7 @@ from rts.cli.main import app
 
 pytestmark = pytest.mark.docs
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md"))), "CONTRIBUTING.md"]
 COMING_FROM = [page for page in PAGES if page.startswith("docs/coming-from/")]
 ELSEWHERE = {

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import icosphere
-from test_raster import CAMERAS
 
 import rts
 from rts import InputError, Part, PluginError
@@ -19,6 +18,7 @@ from rts.testing.compatibility import APRON
 pytestmark = pytest.mark.core
 
 SIZE = (96, 120)
+CAMERA = rts.Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
 Mesh = rts.plugin("surfaces", "mesh")
 
 HIDE = """
@@ -187,7 +187,7 @@ def test_the_table_of_plugins_says_what_is_missing_and_lists_the_others(package,
 def render(sampler):
     return rts.render(
         Part(Mesh([(0, 1, 2)]), {"vertices": icosphere(0)[0]}),
-        CAMERAS["perspective"],
+        CAMERA,
         (9, 12),
         sampler=sampler,
         layers=2,
@@ -248,7 +248,7 @@ def test_after_a_lost_context_the_next_call_works_again():
     sampler = opengl_sampler()
     expected = render(sampler)
     part = Part(Mesh(icosphere(2)[1]), {"vertices": icosphere(2)[0]})
-    kept = rts.render(part, CAMERAS["perspective"], SIZE, sampler=sampler)
+    kept = rts.render(part, CAMERA, SIZE, sampler=sampler)
     handle = rts.prepare(part, sampler)
     sampler._worker.context = Lost(sampler._worker.context)
     with pytest.raises(PluginError) as error:
@@ -256,8 +256,8 @@ def test_after_a_lost_context_the_next_call_works_again():
     assert "GL_CONTEXT_LOST" in str(error.value) and "libgl1-mesa-dri" in str(error.value)
     np.testing.assert_array_equal(render(sampler), expected)
     # What was on the device before is moved there again, kept entries and handles alike.
-    np.testing.assert_array_equal(rts.render(part, CAMERAS["perspective"], SIZE, sampler=sampler), kept)
-    np.testing.assert_array_equal(rts.render(handle, CAMERAS["perspective"], SIZE), kept)
+    np.testing.assert_array_equal(rts.render(part, CAMERA, SIZE, sampler=sampler), kept)
+    np.testing.assert_array_equal(rts.render(handle, CAMERA, SIZE), kept)
 
 
 def test_a_closed_worker_starts_again():
@@ -289,7 +289,7 @@ def test_an_image_beyond_the_device_is_refused_and_the_next_render_works(tall):
     part = Part(Mesh([(0, 1, 2)]), {"vertices": icosphere(0)[0]})
     for _ in range(2):
         with pytest.raises(InputError) as error:
-            rts.render(part, CAMERAS["perspective"], size, sampler=sampler)
+            rts.render(part, CAMERA, size, sampler=sampler)
         message = str(error.value)
         assert (
             f"{size[0] + 2 * APRON} × {size[1] + 2 * APRON} pixels" in message
@@ -400,7 +400,7 @@ def test_a_broken_framework_that_something_has_imported_is_no_matter_for_numpy()
 def test_a_folder_named_rts_does_not_hide_an_editable_install(tmp_path):
     pytest.importorskip("setuptools", minversion="77")
     clone, site, beside = (tmp_path / name for name in ("clone", "site", "beside"))
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     for name in ("rts", "rts_backends", "rts_compare", "rts_surfaces"):
         (clone / name).mkdir(parents=True)
         (clone / name / "__init__.py").write_text('__version__ = "1.2.3"\n')

@@ -12,7 +12,7 @@ from benchmarks.pages.kept import kept, number
 
 pytestmark = pytest.mark.docs
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = DOCS / "results"
 MARKS = marks()
 ADVICE = "Run `python -m benchmarks.pages`."

@@ -15,7 +15,7 @@ from rts import registry
 
 pytestmark = pytest.mark.docs
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = "\n".join(page.read_text() for page in sorted((ROOT / "docs/reference").glob("*.md")))
 ENTRIES = set(re.findall(r"^::: (\S+)$", REFERENCE, re.MULTILINE))
 HEADINGS = set(re.findall(r"^ +heading: (\S+)$", REFERENCE, re.MULTILINE))

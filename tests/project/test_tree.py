@@ -17,7 +17,7 @@ from benchmarks.defects import planted, run
 
 pytestmark = pytest.mark.core
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("rts", "rts_backends", "rts_compare", "rts_surfaces")
 FILES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
@@ -59,11 +59,15 @@ def test_no_file_imports_in_a_circle():
         pytest.fail(" → ".join(error.args[1]))
 
 
-def test_rooms_import_from_those_above_them():
-    """In the order of the table of rooms in docs/architecture.md, which names all."""
+def rooms():
+    """The rooms of `rts`, each with its place in the table of docs/architecture.md, which names all."""
     table = (ROOT / "docs/architecture.md").read_text().partition("## The rooms")[2].partition("## The tree")[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
-    order = {name: n for n, row in enumerate(rows) for name in re.findall(r"`(\w+)(?:/|\.py)`", row)}
+    return {name: n for n, row in enumerate(rows) for name in re.findall(r"`(\w+)(?:/|\.py)`", row)}
+
+
+def test_rooms_import_from_those_above_them():
+    order = rooms()
     for name, path in FILES.items():
         package, _, rest = name.partition(".")
         if package == "rts" and rest not in ("", "__main__"):
@@ -261,10 +265,18 @@ def test_a_long_line_of_markdown_is_found():
     assert long_lines(f"{long}\n| {long}|\n```text\n{long}\n```\n- {long}\n") == [1, 6]
 
 
+def test_files_of_tests_lie_where_what_they_test_is():
+    folders = {*rooms(), *(name.removeprefix("rts_") for name in PACKAGES[1:]), "plugins", "project"}
+    paths = [p.relative_to(ROOT / "tests") for p in (ROOT / "tests").rglob("test_*.py")]
+    assert {p.parts[0] for p in paths} - {"plugin_example"} <= folders
+    own = [p.name for p in paths if p.parts[0] != "plugin_example"]
+    assert len(own) > 100 and len(own) == len(set(own))  # pytest knows files by their names alone.
+
+
 def test_every_file_of_tests_has_one_area():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     areas = {line.partition(":")[0] for line in project["tool"]["pytest"]["ini_options"]["markers"]}
-    for path in sorted((ROOT / "tests").glob("test_*.py")):
+    for path in sorted((ROOT / "tests").glob("*/test_*.py")):
         marks = re.findall(r"^pytestmark = pytest\.mark\.(\w+)$", path.read_text(), re.MULTILINE)
         assert len(marks) == 1 and marks[0] in areas, f"{path.name} has the areas {marks}; expected one of {areas}"
 
@@ -327,7 +339,7 @@ def test_planted_defects_apply_to_the_tree():
     assert len({defect.name for defect in planted.DEFECTS}) == len(planted.DEFECTS)
     for defect in planted.DEFECTS:
         assert (ROOT / defect.path).read_text().count(defect.before) == 1, defect.name
-        missing = [name for name in defect.tests.split() if not (ROOT / f"tests/test_{name}.py").is_file()]
+        missing = [name for name in defect.tests.split() if not [*(ROOT / "tests").glob(f"*/test_{name}.py")]]
         assert not missing and defect.after != defect.before
 
 

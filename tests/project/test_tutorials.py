@@ -12,7 +12,7 @@ import rts
 
 pytestmark = pytest.mark.docs
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = sorted((ROOT / "docs/tutorials").glob("*.py"))
 FRAMEWORKS = ("torch", "jax")
 

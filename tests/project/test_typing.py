@@ -17,7 +17,7 @@ from rts.rendering import arguments
 
 pytestmark = pytest.mark.core
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 TREE = ast.parse(stub.PATH.read_text())
 LAZY = rts.registry.built_in_attributes()
 

@@ -16,7 +16,7 @@ from rts import registry
 
 pytestmark = pytest.mark.docs
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DISTRIBUTION = "rasterize-then-splat"
 PAST = ("docs/results/history.md",)
 """Pages that name what is gone."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_radiance_field import FIELD
+from networks import FIELD
 
 import rts
 from rts import Camera, regularizers

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from example_surfaces import part_of
 from helpers import icosphere
-from test_edges_pairs import CAMERA, part_of
+from test_edges_pairs import CAMERA
 
 import rts
 

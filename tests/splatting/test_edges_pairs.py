@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from analytic import Ellipsoid
+from example_surfaces import part_of
 from helpers import icosphere
 
 import rts
@@ -22,24 +22,6 @@ PAIRS = [
     *((surface, "rays") for surface in ("isosurface", "field", "ellipsoid")),
 ]
 SLOW = {*((surface, "reference") for surface in TRIANGLES[1:]), ("isosurface", "rays"), ("field", "rays")}
-
-
-def ball_of_field(theta, points):
-    """The distance of points from a sphere."""
-    return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - theta["radius"]
-
-
-def part_of(surface):
-    """The example of a surface; skipped where its package is missing."""
-    center = np.array([0.05, 0.02, 0], np.float32)
-    if surface == "field":
-        return rts.Part(rts.Sdf(ball_of_field), {"radius": np.float32(0.8), "center": center}, "lambert")
-    if surface == "ellipsoid":
-        return rts.Part(Ellipsoid(), {"center": center, "radii": np.array([1, 0.7, 0.8], np.float32)}, "lambert")
-    try:
-        return rts.plugin("surfaces", surface).example()
-    except rts.PluginError as error:
-        pytest.skip(str(error))
 
 
 def in_double(theta):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, gradient, icosphere, mesh_part, relative_error, to_numpy
+from networks import FIELD, network
 
 import rts
 from rts import Camera, InputError, Ndc
@@ -25,28 +26,6 @@ from rts_surfaces.radiance_field.shader import RadianceShader
 pytestmark = pytest.mark.rendering
 
 CAMERA, SIZE = Camera.look_at((2, 1.5, 3), (0, 0, 0), fov_y=40), (20, 24)
-
-
-def network(seed=0, levels=(3, 2), width=8, narrow=6):
-    """Random weights of a small network, float32."""
-    rng = np.random.default_rng(seed)
-
-    def layer(outputs, inputs):
-        weight = rng.standard_normal((outputs, inputs)) / inputs**0.5
-        return {"weight": weight.astype(np.float32), "bias": (0.3 * rng.standard_normal(outputs)).astype(np.float32)}
-
-    alpha = layer(1, width)
-    return {
-        "layer1": layer(width, 3 + 6 * levels[0]),
-        "layers_xyz": [layer(width, width), layer(width, width)],
-        "fc_alpha": {"weight": 3 * alpha["weight"], "bias": 0 * alpha["bias"]},
-        "fc_feat": layer(width, width),
-        "layers_dir": [layer(narrow, width + 3 + 6 * levels[1])],
-        "fc_rgb": layer(3, narrow),
-    }
-
-
-FIELD = RadianceField({"coarse": network(2), "fine": network(6)})
 POINTS = np.random.default_rng(2).uniform(-1, 1, (50, 3)).astype(np.float32)
 DIRECTIONS = unit(np.random.default_rng(3).standard_normal((50, 3))).astype(np.float32)
 

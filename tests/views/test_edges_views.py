@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from example_surfaces import part_of
 from helpers import arrays, box, icosphere, to_numpy
-from test_edges_pairs import part_of
 
 import rts
 from rts import Camera
