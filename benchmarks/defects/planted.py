@@ -155,7 +155,7 @@ LOOPS = [
         "rts/outlines/silhouettes_loops.py",
         "if s >= 0 and (sides[s] * side > 0 or",
         "if s >= 0 and (sides[s] * side != 0 or",
-        "edges edges_bodies",
+        "sheets edges",
     ),
     Defect(
         "a triangle of two cells counts as small",

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import rts
-from rts.splatting.edges import splatter as module
 
 torch = pytest.importorskip("torch")
 
@@ -86,13 +85,3 @@ def test_pairs_lie_on_the_rays_of_breaks():
 
     for side in (0, 1):
         np.testing.assert_allclose(seen(outlines.pair[:, side]), seen(ending), atol=1e-5)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("f", [diamond, ball])
-def test_loops_draw_and_push_what_the_specification_does(f, monkeypatch):
-    image = alpha(f, "lambert")
-    value, derivative = image(torch.tensor(0.7)).numpy(), pushed(image)
-    monkeypatch.setattr(module, "EDGES", module._specification)
-    np.testing.assert_allclose(image(torch.tensor(0.7)).numpy(), value, atol=1e-5)
-    np.testing.assert_allclose(pushed(image), derivative, atol=1e-4 * np.abs(derivative).max())

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import icosphere
+from helpers import icosphere, pushed
 
 import rts
 from rts.diagnostics.smoothing import low_pass
@@ -72,13 +72,6 @@ def moved(ball, t, motion, of=tensors):
     """A ball of arrays that `of` makes."""
     ball, motion = of(ball), of(motion)
     return {name: x + t * motion[name] for name, x in ball.items()}
-
-
-def pushed(f):
-    """Image and derivative of a function of a number, at 0, by forward mode, as NumPy."""
-    with forward.dual_level():
-        result = forward.unpack_dual(f(forward.make_dual(torch.zeros(()), torch.ones(()))))
-    return result.primal.detach().numpy(), result.tangent.numpy()
 
 
 def area(balls, colors, fine=40):

@@ -1,54 +1,21 @@
 """Found edges: images and derivatives in closed form, flux that adds up, and what is refused."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import trimesh
-from polygons import covered
+from cards import SIZE, SQUARE, TWO, card, covered, flat, in_pixels, turned, two_colors
+from helpers import pushed
 
 import rts
-from rts.contracts.records import Outlines
 
 torch = pytest.importorskip("torch")
 forward = pytest.importorskip("torch.autograd.forward_ad")
 
 pytestmark = pytest.mark.splatting
 
-SIZE = 24, 24
-SQUARE = np.array([[-7.0, -6], [7, -6], [7, 6], [-7, 6]])
-TWO = np.array([[0, 1, 2], [0, 2, 3]])
-
-
-def in_pixels(size=SIZE):
-    """A camera that sees points (x, y, −z) at the pixel (x, y), at depth z."""
-    height, width = size
-    projection = np.array([[2 / width, 0, 0, -1], [0, -2 / height, 0, 1], [0, 0, -0.02, -1], [0, 0, 0, 1]])
-    return rts.Camera(np.eye(4), projection)
-
-
-def turned(corners, angle, at):
-    c, s = np.cos(angle), np.sin(angle)
-    return corners @ np.array([[c, s], [-s, c]]) + at
-
-
-def flat(corners, depth=3.0):
-    return np.column_stack([corners, np.full(len(corners), -depth)]).astype(np.float32)
-
-
-def card(vertices, color=(1.0, 1, 1), faces=TWO):
-    return rts.Part(rts.Mesh(faces), {"vertices": vertices, "color": np.asarray(color, np.float32)}, "unlit")
-
 
 def edges(parts, size=SIZE, **options):
     return rts.render(parts, in_pixels(size), size, splatter="edges", **options)
-
-
-def pushed(f):
-    """Image and derivative of a function of a number, at 0, by forward mode, as NumPy."""
-    with forward.dual_level():
-        result = forward.unpack_dual(f(forward.make_dual(torch.zeros(()), torch.ones(()))))
-    return result.primal.detach().numpy(), result.tangent.numpy()
 
 
 def moved(vertices, velocity):
@@ -178,16 +145,6 @@ def test_numpy_draws_what_torch_draws():
     np.testing.assert_allclose(edges(card(corners)), drawn.numpy(), atol=1e-5)
 
 
-def two_colors():
-    """A card whose halves differ in colour, before another one."""
-    x, y = np.array([-7.0, 0, 0, 7]), np.array([-6.0, 6])
-    corners = turned(np.array([(a, b) for a in x for b in y]), 0.3, (12.2, 11.7))
-    faces = np.array([[0, 2, 3], [0, 3, 1], [4, 6, 7], [4, 7, 5]])
-    colors = np.repeat(np.array([[0.9, 0.1, 0.2], [0.1, 0.8, 0.3]], np.float32), 4, axis=0)
-    front = rts.Part(rts.Mesh(faces), {"vertices": flat(corners), "colors": colors}, "unlit")
-    return [front, card(flat(SQUARE * 1.5 + 12, 5.0), (0.2, 0.3, 0.9))]
-
-
 def test_torch_func_draws_and_pushes_what_forward_mode_does():
     def image(t):
         along = torch.zeros(4, 4)
@@ -299,28 +256,3 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
             names, spans = names[names[:, 0] >= 0], spans[names[:, 0] >= 0]
             assert (names[:, 0] < 112).all()
             assert np.isfinite(spans).all()
-
-
-def test_a_side_where_nothing_is_seen_has_no_colour():
-    from rts.splatting.edges import splatter as module
-    from rts.splatting.edges import weights as edges_weights
-
-    drawn, given = module.EDGES, []
-
-    def kept(*operands):
-        given[:] = operands
-        return drawn(*operands)
-
-    module.EDGES = kept
-    try:
-        edges(two_colors())
-    finally:
-        module.EDGES = drawn
-    names = ["positions", "rgba", "row", *(field.name for field in dataclasses.fields(Outlines))]
-    rows = given[names.index("rows")].copy()
-    assert (given[names.index("inner")][::3, 0] >= 0).any()
-    rows[::3, 0] = -1
-    given[names.index("rows")] = rows
-    image = np.empty((*given[2].shape, 4), np.float32)
-    edges_weights.forward(given, image)
-    np.testing.assert_allclose(image, module._specification(*given), atol=1e-5)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from polygons import covered
+from cards import SIZE, SQUARE, TWO, covered, in_pixels, turned
+from helpers import pushed
 
 import rts
 
@@ -11,23 +12,8 @@ forward = pytest.importorskip("torch.autograd.forward_ad")
 
 pytestmark = pytest.mark.splatting
 
-SIZE = 24, 24
-SQUARE = np.array([[-7.0, -6], [7, -6], [7, 6], [-7, 6]])
-TWO = np.array([[0, 1, 2], [0, 2, 3]])
 RED, GREEN, BLUE = np.eye(3)
 EVERYWHERE = np.array([[-9.0, -9], [40, -9], [40, 40], [-9, 40]])
-
-
-def in_pixels(size=SIZE):
-    """A camera that sees points (x, y, −z) at the pixel (x, y), at depth z."""
-    height, width = size
-    projection = np.array([[2 / width, 0, 0, -1], [0, -2 / height, 0, 1], [0, 0, -0.02, -1], [0, 0, 0, 1]])
-    return rts.Camera(np.eye(4), projection)
-
-
-def turned(corners, angle, at):
-    c, s = np.cos(angle), np.sin(angle)
-    return corners @ np.array([[c, s], [-s, c]]) + at
 
 
 def pane(corners, depth, color, alpha, t=0.0, velocity=(0.0, 0, 0), faces=TWO):
@@ -42,13 +28,6 @@ def pane(corners, depth, color, alpha, t=0.0, velocity=(0.0, 0, 0), faces=TWO):
 
 def drawn(parts, layers=4, **options):
     return rts.render(parts, in_pixels(), SIZE, splatter="edges", layers=layers, **options)
-
-
-def pushed(f):
-    """Image and derivative of a function of a number, at 0, by forward mode, as NumPy."""
-    with forward.dual_level():
-        result = forward.unpack_dual(f(forward.make_dual(torch.zeros(()), torch.ones(()))))
-    return result.primal.detach().numpy(), result.tangent.numpy()
 
 
 def rate(corners, velocity):
@@ -251,28 +230,6 @@ def mixed(t):
     slope = 0.3 * (corners[:, 0] - 12.2)
     parts = [glass_ball(t, (1.0, 0.2, 0.3)), pane(corners, 20.5 + slope, ramp, 0.7, t, (0.3, -0.5, 0.4))]
     return [*parts, pane(turned(SQUARE, -0.2, (9, 12)), 20 - slope, ramp[::-1], 0.4), pane(EVERYWHERE, 40, ramp, 1.0)]
-
-
-def test_compiled_loops_draw_and_pull_what_the_rule_does(monkeypatch):
-    from rts.splatting.edges import splatter as edges
-    from rts.splatting.edges import stacks as edges_stacks
-
-    weights = torch.as_tensor(np.random.default_rng(0).normal(size=(*SIZE, 4)), dtype=torch.float32)
-
-    def result():
-        t = torch.zeros((), requires_grad=True)
-        image = drawn(mixed(t))
-        (image * weights).sum().backward()
-        return image.detach().numpy(), float(t.grad), pushed(lambda t: drawn(mixed(t)))[1]
-
-    image, slope, derivative = result()
-    monkeypatch.setattr(edges, "EDGES", edges._specification)
-    monkeypatch.setattr(edges, "CELLS", edges_stacks._specification)
-    monkeypatch.setattr(edges_stacks, "CELLS", edges_stacks._specification)
-    by_rule, slope_of_rule, derivative_of_rule = result()
-    np.testing.assert_allclose(image, by_rule, atol=1e-5)
-    np.testing.assert_allclose(derivative, derivative_of_rule, atol=1e-4)
-    assert slope == pytest.approx(slope_of_rule, rel=1e-3)
 
 
 def test_numpy_draws_what_torch_draws():
