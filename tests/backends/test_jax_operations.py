@@ -1,4 +1,4 @@
-"""Projection and interpolation of packed samples in jax: the same as in plain jax, in every transform."""
+"""Compiled operations in jax: the same as their specifications, in every transform."""
 
 import contextlib
 import os
@@ -45,16 +45,11 @@ def x64():
         jax.config.update("jax_enable_x64", False)
 
 
-def projected(rows, points):
-    maps = points @ rows[:, :3].T + rows[:, 3]
-    divisor = jnp.where(maps[:, 2:3] == 0, 1, maps[:, 2:3])
-    return jnp.concatenate([maps[:, :2] / divisor, maps[:, 3:]], axis=1)
+projected = PROJECTION.specification
 
 
 def interpolated(rows, weights):
-    corners = rows[IDS[:, COLUMN : COLUMN + 3]]
-    share = jnp.stack([weights[:, 0], weights[:, 1], 1 - weights[:, 0] - weights[:, 1]], axis=1)
-    return (corners * share[..., None]).sum(axis=1)
+    return COMBINE.specification(rows, weights, jnp.asarray(IDS), column=COLUMN, count=3, affine=True)
 
 
 def numbers(*shape, seed=0):
@@ -190,7 +185,7 @@ def test_what_is_not_used_is_zero_and_gives_no_gradient(mode):
     triangles = {"column": 0, "count": 3, "affine": True}
     project = lambda r, p: jax_operations.apply(PROJECTION, (r, p), {}, np.int32(USED))  # noqa: E731
     at = lambda v, w: jax_operations.apply(COMBINE, (v, w, ids), triangles, np.int32(USED))  # noqa: E731
-    blend = lambda v, w: (v[ids] * jnp.stack([w[:, 0], w[:, 1], 1 - w.sum(1)], 1)[..., None]).sum(1)  # noqa: E731
+    blend = lambda v, w: COMBINE.specification(v, w, ids, **triangles)  # noqa: E731
     for ours, plain, given in ((project, projected, (rows, points)), (at, blend, (vertices, weights))):
         value, pull = jax.vjp(MODES[mode](ours), *given)
         expected, expected_pull = jax.vjp(plain, *given)

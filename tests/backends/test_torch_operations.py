@@ -1,4 +1,4 @@
-"""Compiled projection and interpolation in torch: the same as in plain torch, in every transform."""
+"""Compiled operations in torch: the same as their specifications, in every transform."""
 
 import importlib
 import os
@@ -13,31 +13,30 @@ torch = pytest.importorskip("torch")
 
 
 import rts  # noqa: E402
-from rts.operations.combine import interpolate  # noqa: E402
-from rts.operations.projection import projective_map  # noqa: E402
+from rts.operations.combine import COMBINE, interpolate  # noqa: E402
+from rts.operations.projection import PROJECTION, projective_map  # noqa: E402
+from rts.operations.take import take  # noqa: E402
+from rts.scene.rigid import RIGID  # noqa: E402
 
 pytestmark = pytest.mark.engines
 
 ROWS, COLUMN = 6, 2
+INDEX = torch.tensor([3, 0, 3, 1, 4, 3, 5])
+"""Of 64 bits: by those of 32, torch 2.4 has no second derivatives of its own."""
 
 
-def maps(*batch, dtype=torch.float64, count=7):
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(*batch, 4, 4))
+def numbers(*shape, batch=(), dtype=torch.float64, seed=0):
+    return torch.tensor(np.random.default_rng(seed).normal(size=(*batch, *shape)), dtype=dtype)
+
+
+def maps(count=7, **of):
+    rows = numbers(4, 4, **of)
     rows[..., 2, 3] += 6
-    return torch.tensor(rows, dtype=dtype), torch.tensor(rng.normal(size=(*batch, count, 3)), dtype=dtype)
+    return rows, numbers(count, 3, seed=1, **of)
 
 
-def specified_projection(rows, points):
-    x, y, w, z = torch.addmm(rows[:, 3], points, rows[:, :3].T).unbind(1)
-    safe = torch.where(w == 0, torch.ones_like(w), w)
-    return torch.stack([x / safe, y / safe, z], dim=1)
-
-
-def corners(*batch, dtype=torch.float64, count=7):
-    rng = np.random.default_rng(0)
-    sizes = (*batch, ROWS, 3), (*batch, count, 2)
-    return tuple(torch.tensor(rng.normal(size=size), dtype=dtype) for size in sizes)
+def corners(count=7, **of):
+    return numbers(ROWS, 3, **of), numbers(count, 2, seed=1, **of)
 
 
 def ids(count):
@@ -49,26 +48,54 @@ def interpolated(rows, weights):
 
 
 def plainly_interpolated(rows, weights):
-    a, b, c = (rows[ids(weights.shape[-2])[:, COLUMN + i].long()] for i in range(3))
-    return c + weights[:, :1] * (a - c) + weights[:, 1:] * (b - c)
+    return COMBINE.specification(rows, weights, ids(weights.shape[-2]), column=COLUMN, count=3, affine=True)
+
+
+CASES = {
+    "projection": (projective_map, PROJECTION.specification, maps),
+    "interpolation": (interpolated, plainly_interpolated, corners),
+    "take": (lambda x: take(x, INDEX), lambda x: x[INDEX], lambda **of: (numbers(ROWS, 3, **of),)),
+    "rigid": (rts.rigid, RIGID.specification, lambda **of: (0.2 * numbers(6, **of), numbers(3, seed=1, **of))),
+    "rigid, hardly turned": (
+        rts.rigid,
+        RIGID.specification,
+        lambda **of: (1e-5 * numbers(6, **of), numbers(3, seed=1, **of)),
+    ),
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request):
+    """The compiled function, its specification, and what gives arguments."""
+    return CASES[request.param]
 
 
 @pytest.fixture(params=["projection", "interpolation"])
-def case(request):
-    """The compiled function, the same in plain torch, and what gives arguments."""
-    if request.param == "projection":
-        return projective_map, specified_projection, maps
-    return interpolated, plainly_interpolated, corners
+def many(request):
+    """Those of functions of many rows."""
+    return CASES[request.param]
 
 
 def weighted(f):
-    weights = torch.tensor(np.random.default_rng(1).normal(size=(7, 3)))
-    return lambda first, second: (f(first, second) ** 2 * weights).sum()
+    def total(*args):
+        out = f(*args)
+        return (out**3 * numbers(*out.shape[-2:], seed=3).to(out.dtype)).sum()
+
+    return total
+
+
+def by_each(given):
+    """For each argument, what makes a function one of it alone, and its value."""
+
+    def of_one(i):
+        return lambda f: lambda x: f(*given[:i], x, *given[i + 1 :])
+
+    return [(of_one(i), x) for i, x in enumerate(given)]
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_values_and_gradients_of_many(case, dtype, tolerance):
-    f, plain, given = case
+def test_values_and_gradients_of_many(many, dtype, tolerance):
+    f, plain, given = many
     args = given(dtype=dtype, count=20000)
     torch.testing.assert_close(f(*args), plain(*args), rtol=tolerance, atol=tolerance)
     weights = torch.rand(20000, 3, dtype=dtype)
@@ -79,12 +106,13 @@ def test_values_and_gradients_of_many(case, dtype, tolerance):
 
 def test_both_modes_and_second_derivatives_by_finite_differences(case):
     f, _, given = case
-    first, second = (x.requires_grad_(True) for x in given())
-    assert torch.autograd.gradcheck(f, (first, second), check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(f, (first, second))
-    for of_one, x in ((lambda a: f(a, second.detach()), first), (lambda b: f(first.detach(), b), second)):
-        assert torch.autograd.gradcheck(of_one, x, check_forward_ad=True, check_batched_forward_grad=True)
-        assert torch.autograd.gradgradcheck(of_one, x)
+    args = [x.requires_grad_(True) for x in given()]
+    assert torch.autograd.gradcheck(f, args, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(f, args)
+    for of_one, x in by_each([x.detach() for x in args]):
+        x = x.requires_grad_(True)
+        assert torch.autograd.gradcheck(of_one(f), x, check_forward_ad=True, check_batched_forward_grad=True)
+        assert torch.autograd.gradgradcheck(of_one(f), x)
 
 
 @pytest.mark.parametrize(
@@ -93,36 +121,62 @@ def test_both_modes_and_second_derivatives_by_finite_differences(case):
         torch.func.grad,
         torch.func.hessian,
         lambda f: torch.func.jacfwd(torch.func.grad(f)),
+        lambda f: torch.func.jacrev(torch.func.grad(f)),
         lambda f: torch.func.jacrev(torch.func.jacfwd(f)),
         torch.func.jacfwd,
         lambda f: torch.func.jacfwd(torch.func.jacfwd(f)),
+        lambda f: lambda x: torch.func.jvp(f, (x,), (torch.ones_like(x),))[1],
     ],
-    ids=["grad", "hessian", "jacfwd grad", "jacrev jacfwd", "jacfwd", "jacfwd jacfwd"],
+    ids=["grad", "hessian", "jacfwd grad", "jacrev grad", "jacrev jacfwd", "jacfwd", "jacfwd jacfwd", "jvp"],
 )
 def test_transforms_agree_with_plain_torch(case, transform):
     *functions, given = case
-    first, second = given()
-    for of_one, at in ((lambda g: lambda a: g(a, second), first), (lambda g: lambda b: g(first, b), second)):
-        found, expected = (transform(of_one(weighted(g)))(at) for g in functions)
+    for of_one, at in by_each(given()):
+        found, expected = (transform(of_one(weighted(f)))(at) for f in functions)
         torch.testing.assert_close(found, expected)
 
 
 def test_batches(case):
     *functions, given = case
-    first, second = given(3)
-    one = given()
-    for batch, dims in (((first, second), (0, 0)), ((first, one[1]), (0, None)), ((one[0], second), (None, 0))):
-        for of in (lambda f: f, lambda f: torch.func.grad(weighted(f), (0, 1))):
-            found, expected = (torch.vmap(of(f), dims)(*batch) for f in functions)
+    batch, one = given(batch=(3,)), given()
+    for dims in [(0,)] if len(one) == 1 else [(0, 0), (0, None), (None, 0)]:
+        args = [many if dim == 0 else own for many, own, dim in zip(batch, one, dims, strict=True)]
+        every = tuple(range(len(args)))
+        for of in (lambda f: f, lambda f: torch.func.grad(weighted(f), every), lambda f: torch.func.jacfwd(f)):  # noqa: B023
+            found, expected = (torch.vmap(of(f), dims)(*args) for f in functions)
             torch.testing.assert_close(found, expected)
 
 
 def test_the_older_batches_of_gradients(case):
     *functions, given = case
     args = [x.requires_grad_(True) for x in given()]
-    along = torch.rand(4, 7, 3, dtype=torch.float64)
+    along = torch.rand(4, *functions[0](*args).shape, dtype=torch.float64)
     found, expected = (torch.autograd.grad(f(*args), args, along, is_grads_batched=True) for f in functions)
     torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("strategy", ["reverse-mode", "forward-mode"])
+def test_the_older_batches_of_jacobians(case, strategy):
+    f, plain, given = case
+    for of_one, at in by_each(given()):
+        found = torch.autograd.functional.jacobian(of_one(f), at, vectorize=True, strategy=strategy)
+        torch.testing.assert_close(found, torch.func.jacrev(of_one(plain))(at))
+
+
+def test_dual_numbers_of_torch_are_pushed(case):
+    f, plain, given = case
+    given = given()
+    along = tuple(map(torch.ones_like, given))
+    with torch.autograd.forward_ad.dual_level():
+        found = f(*map(torch.autograd.forward_ad.make_dual, given, along))
+        tangent = torch.autograd.forward_ad.unpack_dual(found).tangent
+    torch.testing.assert_close(tangent, torch.func.jvp(plain, given, along)[1])
+
+
+def test_batches_of_indices():
+    rows, both = numbers(ROWS, 3, batch=(2,)), torch.stack([INDEX, INDEX.flip(0)])
+    torch.testing.assert_close(torch.vmap(take, (None, 0))(rows[0], both), rows[0][both])
+    torch.testing.assert_close(torch.vmap(take)(rows, both), torch.stack([rows[i][both[i]] for i in range(2)]))
 
 
 def test_batches_of_ids():
@@ -216,8 +270,19 @@ def test_double_vertices_take_compiled_code_with_single_weights():
     torch.testing.assert_close(found, plainly_interpolated(rows, weights.float().double()), rtol=1e-14, atol=1e-14)
 
 
-def test_gradients_do_not_depend_on_the_number_of_threads(case, monkeypatch):
-    f, _, given = case
+def test_gradients_of_rows_that_are_taken_often_are_the_same_each_time():
+    rows, index = torch.rand(50, 3), torch.randint(0, 50, (10000,))
+    first, second = (torch.func.grad(lambda x: (take(x, index) ** 2).sum())(rows) for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_an_index_out_of_bounds_is_an_error():
+    with pytest.raises(rts.InputError, match="rows from 5 to 5 were asked for; expected 0 to 4"):
+        take(torch.rand(5, 3), torch.tensor([5]))
+
+
+def test_gradients_do_not_depend_on_the_number_of_threads(many, monkeypatch):
+    f, _, given = many
     args = given(dtype=torch.float32, count=50000)
     found = []
     for threads in ("1", "2"):

@@ -1,4 +1,4 @@
-"""Merging parts by depth, against a sort of each cell; compiled and in array code."""
+"""Merging parts by depth: the nearest layers of each cell, in order; compiled as in array code."""
 
 from dataclasses import replace
 
@@ -38,18 +38,6 @@ def offsets_of(samples):
     return np.cumsum([0, *(len(s.ids) for s in samples)])
 
 
-def by_hand(samples, layers):
-    """Row, counted over all parts, depth and triangle, (K, H, W) each, of sorted cells."""
-    shape = min(layers, sum(len(s.row) for s in samples)), *samples[0].row.shape[1:]
-    row, depth, triangle = np.full(shape, -1), np.zeros(shape), np.full(shape, -1)
-    for y, x in np.ndindex(shape[1:]):
-        cell = [(s.depth[k, y, x], i, k, s.row[k, y, x]) for i, s in enumerate(samples) for k in range(len(s.row))]
-        for k, (z, i, own_layer, own) in enumerate(sorted(c for c in cell if c[3] >= 0)[:layers]):
-            row[k, y, x], depth[k, y, x] = offsets_of(samples)[i] + own, z
-            triangle[k, y, x] = samples[i].triangle[own_layer, y, x]
-    return row, depth, triangle
-
-
 def given_to(interleave, samples, layers, target="numpy"):
     """Row, depth and triangle from one of the two ways to interleave."""
     given = *(s.row for s in samples), *(s.depth for s in samples), *(s.triangle for s in samples)
@@ -57,29 +45,19 @@ def given_to(interleave, samples, layers, target="numpy"):
     return to_numpy(interleave(layers, [len(s.ids) for s in samples], *given))
 
 
-# ------------------------------------------------------------------------------------------------- by hand
-
-
-@PROPERTIES
-@given(parts())
-def test_compiled_it_is_what_one_does_by_hand(given):
-    samples, layers = given
-    found = given_to(merging._interleaved_on_the_host, samples, layers)
-    for values, expected in zip(found, by_hand(samples, layers), strict=True):
-        np.testing.assert_array_equal(values, expected)
-    assert found[1].dtype == np.result_type(*(s.depth for s in samples))
+# ------------------------------------------------------------------------------------------------ compiled
 
 
 @pytest.mark.parametrize("target", ["numpy", TORCH[0]])
 @PROPERTIES
 @given(given=parts())
-def test_in_array_code_it_is_what_one_does_by_hand(target, given):
-    samples, layers = given
-    row, *others = given_to(merging._interleaved, samples, layers, target)
-    expected = by_hand(samples, layers)
-    np.testing.assert_array_equal(row, expected[0])
-    for values, own, empty in zip(others, expected[1:], (0, -1), strict=True):
-        np.testing.assert_array_equal(np.where(row >= 0, values, empty), own)
+def test_compiled_it_is_the_array_code(target, given):
+    row, depth, triangle = given_to(merging._interleaved_on_the_host, *given)
+    own, *others = given_to(merging._interleaved, *given, target)
+    np.testing.assert_array_equal(row, own)
+    for found, expected, empty in zip((depth, triangle), others, (0, -1), strict=True):
+        np.testing.assert_array_equal(found, np.where(own >= 0, expected, empty))
+    assert depth.dtype == np.result_type(*(s.depth for s in given[0]))
 
 
 @PROPERTIES
@@ -117,7 +95,7 @@ def test_every_sample_named_is_one_of_its_part_in_its_cell(given):
         [layer] = np.flatnonzero(own.row[:, y, x] == found.row[k, y, x] - numbers[found.part[k, y, x]])
         np.testing.assert_array_equal(ids[found.row[k, y, x]], own.ids[own.row[layer, y, x]])
         assert found.depth[k, y, x] == own.depth[layer, y, x]
-    np.testing.assert_array_equal(found.row, by_hand(samples, layers)[0])
+        assert found.cells.triangle[k, y, x] == own.triangle[layer, y, x]
 
 
 @PROPERTIES

@@ -1,4 +1,4 @@
-"""The compiled rigid matrix of torch against the array code."""
+"""The compiled rigid matrix against the array code, near and far from where series end."""
 
 import math
 
@@ -7,8 +7,6 @@ import pytest
 from helpers import ALL, arrays
 
 import rts
-from rts.operations.projection import projective_map
-from rts.operations.take import take
 from rts.scene.rigid import RIGID
 
 pytestmark = pytest.mark.engines
@@ -52,37 +50,6 @@ def test_float32_stays_float32():
     torch.testing.assert_close(matrix, RIGID.specification(pose.detach(), torch.zeros(3)), rtol=0, atol=1e-6)
 
 
-def test_transforms_of_torch_look_inside():
-    pose = torch.tensor(POSES["above it"], dtype=torch.float64)
-    tangent = torch.ones(6, dtype=torch.float64)
-    expected = torch.func.jvp(lambda p: RIGID.specification(p, torch.zeros(3, dtype=p.dtype)), (pose,), (tangent,))
-    torch.testing.assert_close(torch.func.jvp(rts.rigid, (pose,), (tangent,)), expected)
-    with torch.autograd.forward_ad.dual_level():
-        dual = torch.autograd.forward_ad.make_dual(pose, tangent)
-        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(rts.rigid(dual)).tangent, expected[1])
-    batch = torch.stack([pose, 2 * pose])
-    torch.testing.assert_close(torch.func.vmap(rts.rigid)(batch)[1], rts.rigid(2 * pose))
-
-
-@pytest.mark.parametrize(
-    "transform",
-    [
-        torch.func.jacfwd,
-        torch.func.jacrev,
-        torch.func.hessian,
-        lambda f: torch.func.jacfwd(torch.func.jacfwd(f)),
-        lambda f: torch.func.jacrev(torch.func.jacfwd(f)),
-        lambda f: torch.func.jacrev(torch.func.jacrev(f)),
-    ],
-    ids=["forward", "reverse", "forward reverse", "forward forward", "reverse forward", "reverse reverse"],
-)
-@pytest.mark.parametrize("pose", [POSES["tiny"], POSES["above it"]], ids=["tiny", "turned"])
-def test_transforms_give_the_derivatives_of_the_array_code(pose, transform):
-    given = torch.tensor([*pose, *CENTER], dtype=torch.float64)
-    found, expected = (transform(lambda x, f=f: f(x[:6], x[6:]))(given) for f in (rts.rigid, RIGID.specification))
-    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
-
-
 def test_batches_of_derivatives():
     poses = torch.tensor(list(POSES.values()), dtype=torch.float64)
     center = torch.tensor(CENTER, dtype=torch.float64)
@@ -91,21 +58,6 @@ def test_batches_of_derivatives():
             torch.func.vmap(derivative(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, RIGID.specification)
         )
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize("strategy", ["reverse-mode", "forward-mode"])
-def test_the_older_batches_of_torch_are_known(strategy):
-    rng = np.random.default_rng(0)
-    rows, points = (torch.tensor(rng.normal(size=shape)) for shape in ((4, 4), (7, 3)))
-    index = torch.tensor([1, 2, 2])
-    functions = {
-        "rigid": (rts.rigid, torch.tensor(POSES["above it"], dtype=torch.float64)),
-        "projective_map": (lambda p: projective_map(rows, p), points),
-        "take": (lambda p: take(p, index), points),
-    }
-    for f, x in functions.values():
-        found = torch.autograd.functional.jacobian(f, x, vectorize=True, strategy=strategy)
-        torch.testing.assert_close(found, torch.func.jacrev(f)(x))
 
 
 @pytest.mark.parametrize("target", ALL)
