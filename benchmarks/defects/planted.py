@@ -183,7 +183,7 @@ LOOPS = [
         "rts/outlines/segments_loops.py",
         "if other >= 0 and not (sign > 0 or (sign == 0 and (ends[other, 2] < 0",
         "if other >= 0 and not (sign < 0 or (sign == 0 and (ends[other, 2] < 0",
-        "edges edges_bodies",
+        "segments edges",
     ),
     Defect(
         "the lower side of a square is counted from the left",
@@ -355,14 +355,14 @@ ARRAYS = [
         "rts/outlines/gaps.py",
         "(depths[1] < depths[0]).astype(np.int32)",
         "(depths[1] > depths[0]).astype(np.int32)",
-        "field_outlines edges_fields",
+        "field_outlines gaps",
     ),
     Defect(
         "slopes are taken beyond a crossing",
         "rts/outlines/gaps.py",
         "inward, across = way * BESIDE * step,",
         "inward, across = -way * BESIDE * step,",
-        "field_outlines edges_fields edges",
+        "gaps",
     ),
     Defect(
         "rows beside outlines of earlier parts are not counted",

@@ -24,30 +24,10 @@ RNG = np.random.default_rng(0)
 # --------------------------------------------------------------------------------------- the library's, by closed form
 
 
-@pytest.mark.parametrize("target", ALL)
-def test_combine_is_a_sum_of_rows_with_weights(target):
+def test_combine_is_a_sum_of_rows_with_weights():
     rows, weights = RNG.normal(size=(7, 4)), RNG.normal(size=(50, 16))
     ids = RNG.integers(0, 7, (50, 16)).astype(np.int32)
-    found = combine(*arrays(target, (rows, ids, weights)))
-    np.testing.assert_allclose(to_numpy(found), (weights[..., None] * rows[ids]).sum(1), rtol=0, atol=2e-5)
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_combine_has_the_derivatives_of_a_bilinear_map(target):
-    rows, weights, g = RNG.normal(size=(7, 3)), RNG.normal(size=(50, 5)), RNG.normal(size=(50, 3))
-    ids = RNG.integers(0, 7, (50, 5)).astype(np.int32)
-    index, factors = arrays(target, (ids, g))
-    total = lambda x: (combine(x[0], index, x[1]) * factors).sum()  # noqa: E731
-    g_rows, g_weights = gradient(target, total, list(arrays(target, (rows, weights))))
-    expected = np.zeros_like(rows)
-    np.add.at(expected, ids, weights[..., None] * g[:, None, :])
-    np.testing.assert_allclose(g_rows, expected, rtol=0, atol=5e-5)
-    np.testing.assert_allclose(g_weights, (rows[ids] * g[:, None, :]).sum(-1), rtol=0, atol=2e-5)
-    moves = [RNG.normal(size=x.shape) for x in (rows, weights)]
-    given = list(arrays(target, (rows, weights)))
-    along = derivative(target, lambda x: combine(x[0], index, x[1]), given, list(arrays(target, moves)))[1]
-    expected = (moves[1][..., None] * rows[ids] + weights[..., None] * moves[0][ids]).sum(1)
-    np.testing.assert_allclose(along, expected, rtol=0, atol=5e-5)
+    np.testing.assert_allclose(combine(rows, ids, weights), (weights[..., None] * rows[ids]).sum(1), atol=1e-12)
 
 
 def test_interpolation_is_combine_with_the_weight_that_the_others_lack_of_one():
@@ -85,12 +65,14 @@ def test_combine_refuses_what_does_not_fit_in_one_line():
 
 
 @pytest.mark.parametrize("target", ALL)
-def test_maps_and_products_are_those_of_linear_algebra(target):
+def test_products_are_those_of_linear_algebra(target):
+    a, b = RNG.normal(size=(2, 4, 4))
+    np.testing.assert_allclose(to_numpy(matmul(*arrays(target, (a, b)))), a @ b, atol=1e-5)
+
+
+def test_affine_maps_are_those_of_linear_algebra():
     rows, points = RNG.normal(size=(5, 4)), RNG.normal(size=(30, 3))
-    a, b = RNG.normal(size=(4, 4)), RNG.normal(size=(4, 4))
-    given = arrays(target, (rows, points, a, b))
-    np.testing.assert_allclose(to_numpy(affine_map(*given[:2])), points @ rows[:, :3].T + rows[:, 3], atol=1e-5)
-    np.testing.assert_allclose(to_numpy(matmul(*given[2:])), a @ b, atol=1e-5)
+    np.testing.assert_allclose(affine_map(rows, points), points @ rows[:, :3].T + rows[:, 3], atol=1e-12)
 
 
 def test_arrays_of_numpy_beside_those_of_another_engine_are_constants():
@@ -283,13 +265,6 @@ def test_operations_of_one_name_do_not_take_each_other_s_place():
     other = replace(CLAMP, forward=doubled, keeps=False)
     one, two = (jax.jit(lambda x, s, f=f: f(x, s, power=2))(x, scale) for f in (CLAMP, other))
     np.testing.assert_allclose(two, 2 * one, rtol=1e-6)
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_take_adds_gradients_of_rows_that_are_taken_twice(target):
-    index = np.array([2, 0, 2, 2], np.int32)
-    found = gradient(target, lambda r: take(r, arrays(target, index)).sum(), arrays(target, np.ones((4, 2))))
-    np.testing.assert_array_equal(found[:, 0], [1, 0, 3, 0])
 
 
 # ------------------------------------------------------------------------------------------- all of them, by the kit
