@@ -139,6 +139,17 @@ def test_forward_mode_and_reverse_mode_agree(sampler):
     assert float(t.grad) == pytest.approx(by_forward, rel=1e-5)
 
 
+def test_parts_beside_one_another_are_drawn_as_each_alone():
+    """Their colours change across them, so that rows of other cells would show."""
+    parts, ramp = [], np.random.default_rng(3).random((4, 3)).astype(np.float32)
+    for number, (place, angle) in enumerate([((6.1, 12.2), 0.3), ((17.8, 11.7), -0.2)]):
+        corners = flat(turned(SQUARE * (0.6, 1), angle, place))
+        parts.append(rts.Part(rts.Mesh(TWO), {"vertices": corners, "colors": np.roll(ramp, number, 0)}, "unlit"))
+    alone = [edges(part) for part in parts]
+    assert all(image[..., 3].max() > 0.9 for image in alone)
+    np.testing.assert_allclose(edges(parts), alone[0] + alone[1], atol=1e-6)
+
+
 def test_numpy_draws_what_torch_draws():
     corners = flat(turned(SQUARE, 0.3, (12.2, 11.7)))
     drawn = edges(card(torch.as_tensor(corners)))
