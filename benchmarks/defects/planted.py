@@ -85,7 +85,7 @@ LOOPS = [
         "rts/operations/combine_loops.py",
         "g_rows[ids[n, column + i], c] += w * g[n, c]",
         "g_rows[ids[n, column + i], c] = w * g[n, c]",
-        "operations patches subdivision",
+        "operations",
     ),
     Defect(
         "a thin triangle misses its last row",
@@ -225,14 +225,14 @@ LOOPS = [
         "rts/splatting/edges/stacks_loops.py",
         "g_rgba[n, 3] -= through[k] * behind[k, c] * g[y, x, c]",
         "g_rgba[n, 3] -= behind[k, c] * g[y, x, c]",
-        "edges_glass",
+        "edges_operations",
     ),
     Defect(
         "composites behind a layer are those behind the next",
         "rts/splatting/edges/stacks_loops.py",
         "behind[k, c] = rgba[n, c] + (1 - rgba[n, 3]) * behind[k + 1, c]",
         "behind[k, c] = (1 - rgba[n, 3]) * behind[k + 1, c]",
-        "edges_glass",
+        "edges_operations edges_glass",
     ),
     Defect(
         "merging leaves triangles where they were",
@@ -376,7 +376,7 @@ ARRAYS = [
         "rts/outlines/of_scene.py",
         "np.cumsum([0, *more[:-1]])",
         "np.cumsum(more)",
-        "edges edges_bodies",
+        "edges",
     ),
     Defect(
         "layers beside a break move twice",
@@ -397,7 +397,7 @@ ARRAYS = [
         "rts/views/picture.py",
         "np.stack([across * self.view[1], down * self.view[0]], axis=1)",
         "np.stack([across * self.view[0], down * self.view[0]], axis=1)",
-        "render_views",
+        "render_views edges_views",
     ),
     Defect(
         "the first row of a table stays",
