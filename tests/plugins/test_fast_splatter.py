@@ -3,17 +3,13 @@
 import numpy as np
 import pytest
 from fast_splatter.rts_fast_splatter import IMAGE, FastSingle
-from samples import cells, noise
+from samples import cells
 
 import rts
 from rts import splatting
-from rts.plugin_api.records import Cells, Splats
 from rts.testing import OperationConformance, SplatterConformance
 
 pytestmark = pytest.mark.plugins
-
-TOLERANCE = {np.float32: 1e-5, np.float64: 1e-10}
-SETTINGS = {"sigma": 0.8, "epsilon": 0.2, "calibration": None}
 
 
 class TestFastSingle(SplatterConformance):
@@ -22,59 +18,38 @@ class TestFastSingle(SplatterConformance):
         return FastSingle()
 
 
+def scenes():
+    """Splats, and the border: more than a tile, two layers, a border, a sample in several cells, and nothing."""
+    wide, two, empty = cells(1, (13, 75)), cells(2), cells(1, (5, 40), holes=2)
+    repeated = np.where(np.random.default_rng(0).random(two[2].shape) < 0.2, 1, two[2]).astype(np.int32)
+    return {
+        "wide": (wide, 0),
+        "border": (wide, 2),
+        "two": (two, 0),
+        "repeated": ((*two[:2], repeated), 0),
+        "empty": (empty, 0),
+    }
+
+
+SCENES = scenes()
+
+
 class TestImage(OperationConformance):
+    @pytest.fixture(params=SCENES)
+    def scene(self, request):
+        return SCENES[request.param]
+
     @pytest.fixture
     def operation(self):
         return IMAGE
 
     @pytest.fixture
-    def operands(self):
-        return cells(1, (6, 7))
+    def operands(self, scene):
+        return scene[0]
 
-    @pytest.fixture
-    def params(self):
-        return {"numbers": (0.5, 0.05, 1.0), "border": 1}
-
-
-def scenes(dtype):
-    """Splats: more than a tile, two layers, a border, a sample in several cells, and nothing."""
-    wide, two, empty = (
-        Splats(p, c, Cells(r))
-        for p, c, r in (cells(1, (13, 75), dtype=dtype), cells(2, dtype=dtype), cells(1, (5, 40), dtype=dtype, holes=2))
-    )
-    repeated = np.where(np.random.default_rng(0).random(two.row.shape) < 0.2, 1, two.row).astype(np.int32)
-    return {
-        "wide": wide,
-        "border": wide.replace(border=2),
-        "two": two,
-        "repeated": two.replace(row=repeated),
-        "empty": empty,
-    }
-
-
-@pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("scene", scenes(np.float32))
-@pytest.mark.parametrize("settings", [{}, SETTINGS])
-def test_it_is_single(scene, dtype, settings):
-    """Image, tangents and gradients are those of the specification."""
-    torch, splats = pytest.importorskip("torch"), scenes(dtype)[scene]
-    given = [torch.tensor(x) for x in (splats.positions, splats.rgba)]
-    along = [torch.tensor(noise(*x.shape, dtype=dtype, seed=n)) for n, x in enumerate(given)]
-
-    def found(splatter):
-        row = torch.tensor(splats.row)
-
-        def image(positions, rgba):
-            return splatter.cropped(Splats(positions, rgba, Cells(row), border=splats.border))
-
-        value, tangent = torch.func.jvp(image, tuple(given), tuple(along))
-        _, pull = torch.func.vjp(image, *given)
-        return value, tangent, *pull(torch.tensor(noise(*value.shape, dtype=dtype)))
-
-    ours, numpy = found(FastSingle(**settings)), FastSingle(**settings).cropped(splats)
-    np.testing.assert_array_equal(numpy, ours[0])
-    for x, y in zip(ours, found(splatting.Single(**settings)), strict=True):
-        np.testing.assert_allclose(x, y, atol=TOLERANCE[dtype] * max(1, float(y.abs().max())), rtol=TOLERANCE[dtype])
+    @pytest.fixture(params=[(0.5, 0.05, 1.0), (0.8, 0.2, splatting.exact_calibration(0.8))], ids=["plain", "others"])
+    def params(self, request, scene):
+        return {"numbers": request.param, "border": scene[1]}
 
 
 def test_a_compiled_program_of_jax_renders_with_it():

@@ -35,32 +35,6 @@ def column(*depths, camera=PLANES):
     return found.row[:, 0, 0].tolist(), found.depth[:, 0, 0].tolist()
 
 
-def settled_by_hand(samples, camera, spread):
-    """`settle`, cell by cell."""
-    row, depth = np.full_like(samples.row, -1), np.zeros_like(samples.depth)
-    near, far = (float(x) for x in camera.depth_range())
-    for y, x in np.ndindex(row.shape[1:]):
-        layers = zip(samples.depth[:, y, x].tolist(), samples.row[:, y, x].tolist(), strict=True)
-        kept = []
-        for z, i in sorted([(z, i) for z, i in layers if i >= 0 and near <= z <= far], key=lambda layer: layer[0]):
-            if not kept or z - kept[-1][0] > 0.01 * (spread[0] + spread[1] * z) + 1e-6 * z:
-                kept.append((z, i))
-        for k, layer in enumerate(kept):
-            depth[k, y, x], row[k, y, x] = layer
-    return row, depth
-
-
-def repacked_by_hand(samples, kept, capacity):
-    """The new table of rows, the old row of each new one, and the number of lost rows."""
-    cells = np.argwhere(kept)
-    fitting = cells if capacity is None else cells[:capacity]
-    row, old = np.full_like(samples.row, -1), []
-    for number, cell in enumerate(map(tuple, fitting)):
-        row[cell] = number
-        old.append(samples.row[cell])
-    return row, old, len(cells) - len(fitting)
-
-
 # ------------------------------------------------------------------------------------------------ settle
 
 
@@ -116,25 +90,6 @@ def test_settling_changes_rows_and_depths_only():
         assert getattr(found, name) is getattr(given, name)
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 4), (2, 5, 7), (3, 6, 5), (5, 9, 8), (4, 60, 70)])
-@pytest.mark.parametrize("view", ["perspective", "orthographic"])
-def test_settling_is_what_one_does_by_hand(view, shape):
-    camera = VIEWS[view]
-    spread, (near, far) = rays_spread(camera), camera.depth_range()
-    rng = np.random.default_rng(sum(shape))
-    for _ in range(4):
-        # Few depths, around which layers are nearer than, and farther than what counts as one root.
-        z = rng.choice([0.5 * near, 2.0, 2.5, 4.0, 8.0, 2 * far], shape, p=[0.05, 0.3, 0.3, 0.2, 0.1, 0.05])
-        width = 0.01 * (spread[0] + spread[1] * z) + 1e-6 * z
-        depth = z + width * rng.choice([0.0, 0.4, -0.4, 1.5, -1.5], shape)
-        row = np.where(rng.random(shape) < 0.8, rng.permutation(depth.size).reshape(shape), -1)
-        given = made(row, depth)
-        found = layer_order.settle(given, camera, spread)
-        row, depth = settled_by_hand(given, camera, spread)
-        np.testing.assert_array_equal(found.depth, depth)
-        np.testing.assert_array_equal(found.row, row)
-
-
 # ------------------------------------------------------------------------------------------------ repack
 
 
@@ -172,29 +127,6 @@ def test_there_is_a_row_of_zeros_where_nothing_is_kept():
     found = packing.repack(given, np.zeros((2, 1, 1), bool), None)
     assert (found.row == -1).all() and not found.depth.any()
     np.testing.assert_array_equal(found.ids, np.zeros((1, 2)))
-
-
-def test_packing_is_what_one_does_by_hand():
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        shape = tuple(rng.integers(1, 6, 3))
-        row = np.where(rng.random(shape) < 0.7, rng.permutation(np.prod(shape)).reshape(shape), -1)
-        given = made(row, np.where(row >= 0, rng.random(shape) + 1, 0))
-        given = replace(given, tables={"t": rng.random((len(given.ids), 2))}, by_sample=("t",), overflow=np.int32(3))
-        kept = (row >= 0) & (rng.random(shape) < 0.8)
-        for capacity in (None, 1, 5, 200):
-            found = packing.repack(given, kept, capacity)
-            rows, old, lost = repacked_by_hand(given, kept, capacity)
-            np.testing.assert_array_equal(found.row, rows)
-            np.testing.assert_array_equal(found.depth, np.where(rows >= 0, given.depth, 0))
-            assert found.overflow == 3 + lost and len(found.ids) == (max(1, len(old)) if capacity is None else capacity)
-            for new, before in (
-                (found.ids, given.ids),
-                (found.params, given.params),
-                (found.tables["t"], given.tables["t"]),
-            ):
-                np.testing.assert_array_equal(new[: len(old)], before[old])
-                assert not new[len(old) :].any()
 
 
 # ------------------------------------------------------------------------------- what refine may not give
