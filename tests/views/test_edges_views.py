@@ -299,13 +299,11 @@ def test_views_that_see_nothing_lie_beside_others():
 
 def test_prepared_parts_and_constant_surfaces_have_views_of_a_loop():
     parts = crossing()
-    expected = np.stack([rts.render(parts, camera, SIZE, splatter="edges") for camera in CAMERAS])
-    found = rts.render_views(rts.prepare(parts), CAMERAS, SIZE, splatter="edges")
-    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
+    expected = np.stack([rts.render(parts, camera, SIZE) for camera in CAMERAS])
     # Surfaces are evaluated where they are sampled, beside cameras of torch.
     seen = [camera.replace(view=torch.as_tensor(camera.view)) for camera in CAMERAS]
-    found = rts.render_views(parts, seen, SIZE, splatter="edges")
-    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
+    for found in (rts.render_views(rts.prepare(parts), CAMERAS, SIZE), rts.render_views(parts, seen, SIZE)):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
 
 
 def test_cameras_are_fitted_alike():
