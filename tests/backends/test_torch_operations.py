@@ -22,7 +22,7 @@ pytestmark = pytest.mark.engines
 
 ROWS, COLUMN = 6, 2
 INDEX = torch.tensor([3, 0, 3, 1, 4, 3, 5])
-"""Of 64 bits: by those of 32, torch 2.4 has no second derivatives of its own."""
+"""64 bits: by indices of 32, torch 2.4 has no second derivatives of its own."""
 
 
 def numbers(*shape, batch=(), dtype=torch.float64, seed=0):

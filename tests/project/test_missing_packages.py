@@ -13,12 +13,13 @@ from helpers import icosphere
 
 import rts
 from rts import InputError, Part, PluginError
+from rts.scene.camera import perspective
 from rts.testing.compatibility import APRON
 
 pytestmark = pytest.mark.core
 
 SIZE = (96, 120)
-CAMERA = rts.Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
+CAMERA = rts.Camera(rts.Camera.look_at((1, 2, 3), (0, 0, 0)).view, perspective(50.0, 1.25, 0.5, 9.0))
 Mesh = rts.plugin("surfaces", "mesh")
 
 HIDE = """
