@@ -940,9 +940,6 @@ ODD_ENGINES = {
             by_rows_in_use=lambda self, f, rows, row, whole: f({"x": rows["x"] * (row.max() > 2)})
         ),
     },
-    "functions_are_chosen_by_a_value": {
-        "the other one": engine_with(choose=lambda self, which, usual, rare: rare() if self.known(which) else usual()),
-    },
     "compiled_functions_are_the_same": {"off by one": engine_with(jit=lambda self, f: lambda *args: f(*args) + 1)},
     "without_derivatives_it_says_so": {"has them": engine_with(differentiates=False)},
     "gradients_are_those_of_closed_forms": {
