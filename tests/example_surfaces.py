@@ -1,6 +1,8 @@
 """Surfaces that are not their triangles: Bézier patches, refined by Newton's method, and a torus, sphere-traced."""
 
 import numpy as np
+import pytest
+from analytic import Ellipsoid
 
 import rts
 from rts.arrays.array_functions import described, unit
@@ -291,3 +293,21 @@ def root(f, low, high, steps=6):
         low, high = xp.where(first, middle, low), xp.where(first, high, middle)
         below, above = xp.where(first, value, 0.5 * below), xp.where(first, 0.5 * above, value)
     return xp.where(xp.abs(above) < xp.abs(below), high, low)
+
+
+def ball_of_field(theta, points):
+    """The distance of points from a sphere."""
+    return ((points - theta["center"]) ** 2).sum(-1) ** 0.5 - theta["radius"]
+
+
+def part_of(surface):
+    """The example of a surface; skipped where its package is missing."""
+    center = np.array([0.05, 0.02, 0], np.float32)
+    if surface == "field":
+        return rts.Part(rts.Sdf(ball_of_field), {"radius": np.float32(0.8), "center": center}, "lambert")
+    if surface == "ellipsoid":
+        return rts.Part(Ellipsoid(), {"center": center, "radii": np.array([1, 0.7, 0.8], np.float32)}, "lambert")
+    try:
+        return rts.plugin("surfaces", surface).example()
+    except rts.PluginError as error:
+        pytest.skip(str(error))

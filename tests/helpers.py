@@ -84,6 +84,16 @@ def derivative(target, f, x, dx):
     return to_numpy(pytest.importorskip("torch").func.jvp(f, (x,), (dx,)))
 
 
+def pushed(f):
+    """Image and derivative of a function of a number, at 0, by forward mode, as NumPy."""
+    import torch
+    from torch.autograd import forward_ad as forward
+
+    with forward.dual_level():
+        result = forward.unpack_dual(f(forward.make_dual(torch.zeros(()), torch.ones(()))))
+    return result.primal.detach().numpy(), result.tangent.numpy()
+
+
 def finite_difference(f, x, step=1e-6):
     """The gradient of a scalar function of a tree of NumPy arrays, by central differences in float64."""
     assert is_constant(x)

@@ -100,7 +100,11 @@ def catch(defect: Defect, copy: Path, likely_only: bool) -> dict[str, str | None
     path = copy / defect.path
     text, times = path.read_text(), (path.stat().st_atime, path.stat().st_mtime)
     assert text.count(defect.before) == 1, f"{defect.name}: the text occurs {text.count(defect.before)} times"
-    likely = [f"tests/test_{name}.py" for name in defect.tests.split()]
+    likely = [
+        str(found.relative_to(copy))
+        for name in defect.tests.split()
+        for found in (copy / "tests").glob(f"*/test_{name}.py")
+    ]
     stages = [("make test", [*likely, *QUICK]), ("make test", [*QUICK, "-n", "2"])]
     stages += [("make test-all", [*likely, *THOROUGH]), ("make test-all", [*THOROUGH, "-n", "2"])]
     path.write_text(text.replace(defect.before, defect.after))

@@ -303,7 +303,7 @@ class _Segments(NamedTuple):
                 share = (right if dx else 1 - right) * (below if dy else 1 - below)
                 change = change + share[:, None] * flux
             on_right, x, y = self._on_the_right(k), self.square[:, 0] + dx, self.square[:, 1] + dy
-            share = area - xp.where(on_right, 0.25, 0.0)
+            share = xp.where(on_right, area - 0.25, area)
             beside = (self.side[:, 0] == k) | (self.side[:, 0] == (k + 3) % 4)
             share = xp.where(self.lone & ~beside, 0.0, share)[:, None]
             own = xp.where(on_right[:, None], self.right, self.right - self.jump)

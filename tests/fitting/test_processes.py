@@ -1,0 +1,79 @@
+"""Fits that several processes share, as torchrun starts them."""
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.fitting
+pytest.importorskip("torch")
+
+SCRIPT = Path(__file__).parents[1] / "distributed_fit.py"
+
+
+def run(count, *args, restarts=0):
+    """The output of the script in `count` processes."""
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+    command = [sys.executable, *(launch if count > 1 else []), *(["--max-restarts", str(restarts)] if restarts else [])]
+    paths = [str(SCRIPT.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+        "OMP_NUM_THREADS": "1",
+        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",  # Restarts may hang without, see docs/guides/many_views.md.
+    }
+    done = subprocess.run(
+        [*command, str(SCRIPT), *map(str, args)], env=environment, capture_output=True, text=True, timeout=300
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def results(path):
+    with np.load(path) as known:
+        return {name: known[name] for name in known.files}
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """What one process finds, by method; computed once."""
+
+    @functools.cache
+    def found(method):
+        path = tmp_path_factory.mktemp("alone") / f"{method}.npz"
+        code, output = run(1, method, path)
+        assert code == 0, output
+        return results(path)
+
+    return found
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("method", ["adam", "lm"])
+def test_two_processes_take_the_steps_of_one(tmp_path, method, alone):
+    code, output = run(2, method, tmp_path / "two.npz")
+    assert code == 0, output
+    one, two = alone(method), results(tmp_path / "two.npz")
+    assert len(one["history"]) >= 8
+    for name in one:
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.thorough
+def test_a_job_goes_on_after_a_process_has_ended(tmp_path, alone):
+    ended = tmp_path / "ended.npz"
+    code, output = run(2, "adam", ended, tmp_path / "checkpoint", "1:23", restarts=1)
+    assert code == 0, output
+    assert Path(f"{ended}.ended").exists() and "has ended" in output
+    np.testing.assert_allclose(results(ended)["history"], alone("adam")["history"], rtol=1e-5)
+
+
+@pytest.mark.thorough
+def test_without_a_restart_the_job_ends_with_a_line(tmp_path):
+    code, output = run(2, "adam", tmp_path / "ended.npz", tmp_path / "checkpoint", "1:23")
+    assert code != 0
+    lines = [line for line in output.splitlines() if "waited for the others, and one has ended" in line]
+    assert len(lines) == 1 and "process 0 of 2" in lines[0]

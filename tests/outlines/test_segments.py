@@ -1,0 +1,52 @@
+"""Breaks joined into segments: where their ends lie on squares of four centres, and which way outlines run."""
+
+import numpy as np
+import pytest
+
+from rts.outlines import segments_loops as loops
+
+pytestmark = pytest.mark.sampling
+
+WIDTH = 5
+
+
+def test_ends_lie_clockwise_on_the_sides_of_the_squares_beside_their_gaps():
+    """A break at 0.3 of each side of the square (1, 1): 0.3 along the top, 1.3 on the right, then back."""
+    gap = np.array([(1, 1, 1), (1, 2, 0), (2, 1, 1), (1, 1, 0)], np.int32)
+    step = np.column_stack([gap[:, 2], 1 - gap[:, 2]])
+    place = gap[:, 1::-1] + 0.5 + 0.3 * step
+    square, along, ends = loops.ends_of(gap, place, np.zeros(4, np.int32), np.zeros((4, 2), np.int32), 5, WIDTH)
+    own = square == WIDTH + 1
+    found = {int(side): (int(b), at, int(way)) for (b, side, way, *_), at in zip(ends[own], along[own], strict=True)}
+    assert set(found) == {0, 1, 2, 3}
+    # Clockwise, the way along the upper and the right side leaves what lies before their breaks.
+    expected = {0: (0, 0.3, 1), 1: (1, 1.3, 1), 2: (2, 2.7, -1), 3: (3, 3.7, -1)}
+    for side, (b, at, way) in expected.items():
+        assert found[side][0] == b and found[side][2] == way and found[side][1] == pytest.approx(at)
+
+
+def segments_between(gap, place, near):
+    """Squares, ties and sides of the segments between breaks of one part, before nothing."""
+    gap, place, near = np.array(gap, np.int32), np.array(place), np.array(near, np.int32)
+    parts = np.where(near[:, None] == [0, 1], 0, -1).astype(np.int32)
+    square, along, ends = loops.ends_of(gap, place, near, parts, 5, WIDTH)
+    order = np.lexsort((along, square))
+    square, ends = square[order], ends[order]
+    begins = np.append(np.flatnonzero(np.diff(square, prepend=-1)), len(square))
+    partner = np.full(len(square), -1, np.int32)
+    loops.join(begins, ends, place, np.zeros((len(place), 2)), partner)
+    return loops.segments_of(square, ends, partner, WIDTH)
+
+
+@pytest.mark.parametrize("near", [0, 1])
+def test_a_segment_starts_where_the_way_clockwise_leaves_the_front(near):
+    """An outline from top to bottom through the square (1, 1); what ends lies on its left, or on its right."""
+    origin, ties, side = segments_between([(1, 1, 1), (2, 1, 1)], [(1.8, 1.5), (1.8, 2.5)], [near, near])
+    across = [tuple(t) for t, s in zip(ties.tolist(), side.tolist(), strict=True) if min(s) >= 0]
+    assert across == [(0, 1) if near == 0 else (1, 0)]
+
+
+def test_the_breaks_before_and_after_a_segment_are_in_order():
+    ties = np.array([(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)], np.int32)
+    expected = [(-1, -1, 2, 3), (-1, 0, 3, 4), (0, 1, 4, 5), (1, 2, 5, -1), (2, 3, -1, -1)]
+    np.testing.assert_array_equal(loops.beyond(ties, 6), expected)

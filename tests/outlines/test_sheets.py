@@ -1,0 +1,125 @@
+"""Triangles as a camera sees them: neighbours, sides, and the gaps between centres that meet silhouettes."""
+
+import numpy as np
+import pytest
+
+from rts.compiling.threads import read_only
+from rts.contracts.records import Proxy
+from rts.outlines import sheets, spans_loops
+from rts.outlines.gaps import Fronts
+from rts.outlines.sheets import Gaps, Sheets
+from rts.scene.camera import Camera
+
+pytestmark = pytest.mark.sampling
+
+SIZE = (8, 8)
+CAMERA = Camera.orthographic((0, 0, 5), (0, 0, 0), height=8.0, near=0.1, far=10)
+"""A cell is one unit; the centre of the image's first cell is at (−3.5, 3.5)."""
+TWO = np.array([(0, 1, 2), (1, 0, 3)], np.int32)
+THREE = np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)], np.int32)
+
+
+def of(corners, faces):
+    """The sheets of triangles with these corners, x and y in cells from the upper left corner, at depth 5."""
+    x, y = np.asarray(corners, float).T
+    vertices = np.column_stack([x - 4, 4 - y, 0 * x]).astype(np.float32)
+    return Sheets.of(Proxy(vertices, np.asarray(faces, np.int32)), CAMERA, SIZE, "none")
+
+
+def test_two_triangles_are_neighbours_beyond_the_edge_opposite_their_third_corners():
+    np.testing.assert_array_equal(sheets._beyond(TWO), [(-1, -1, 1), (-1, -1, 0)])
+
+
+def test_an_edge_that_three_triangles_share_has_no_neighbours():
+    np.testing.assert_array_equal(sheets._beyond(THREE), np.full((3, 3), -1))
+
+
+def test_neighbours_are_kept_for_faces_that_nobody_writes_alone():
+    fixed, free = TWO.copy(), TWO.copy()
+    fixed.flags.writeable = False
+    assert sheets._beyond(fixed) is sheets._beyond(fixed)
+    assert sheets._beyond(free)[0, 2] == 1
+    free[1] = (1, 4, 3)
+    np.testing.assert_array_equal(sheets._beyond(free), np.full((2, 3), -1))
+
+
+@pytest.mark.parametrize(("wide", "side"), [(0.9, 1), (1.1, 2), (3.0, 2)])
+def test_triangles_larger_than_a_cell_are_told_from_smaller_ones(wide, side):
+    """By the size of the number; its sign tells clockwise from counterclockwise."""
+    corners = [(2, 2), (2 + wide, 2), (2, 2.5)]
+    there, back = of(corners, [(0, 1, 2)]).sides[0], of(corners, [(0, 2, 1)]).sides[0]
+    assert abs(there) == side and there == -back
+
+
+def quad(left, top, right, bottom):
+    return [(left, top), (right, top), (right, bottom), (left, bottom)]
+
+
+def marked(own, part):
+    """The gaps, along rows and along columns, that the silhouettes of some sheets meet where `part` is seen."""
+    met = np.zeros((2, *SIZE), np.uint8)
+    own.meet(Fronts(part, 0 * part, 5.0 * np.ones(SIZE)), np.array([1.0, 0.0]), met)
+    return {(axis, y, x) for axis, y, x in np.argwhere(met == 2).tolist()}
+
+
+def test_the_border_of_a_card_meets_the_gaps_that_it_crosses():
+    part = np.full(SIZE, -1, np.int32)
+    part[2:5, 2:6] = 0
+    own = of(quad(2.1, 2.1, 5.9, 4.9), [(0, 1, 2), (0, 2, 3)])
+    # Its diagonal is no silhouette.
+    expected = {(0, y, x) for y in (2, 3, 4) for x in (1, 5)} | {(1, y, x) for y in (1, 4) for x in (2, 3, 4, 5)}
+    assert marked(own, part) == expected
+
+
+def test_a_fold_is_a_silhouette():
+    part = np.full(SIZE, -1, np.int32)
+    part[2:5, 2:5] = 0
+    # The second triangle lies on the first: the sheet turns away at x = 4.7, the edge that both have in common.
+    own = of([(4.7, 2.2), (4.7, 4.8), (0.2, 3.5), (1.2, 3.5)], [(0, 1, 2), (1, 0, 3)])
+    assert {(0, y, 4) for y in (2, 3, 4)} <= marked(own, part)
+
+
+@pytest.mark.parametrize("faces", [[(0, 1, 2)], [(0, 2, 1)]])
+@pytest.mark.parametrize("wide", [0.4, 1.6, 3.4])
+def test_a_span_is_the_chord_of_a_triangle(wide, faces):
+    """The chord of a triangle along the gap from (3.5, 3.5) to (4.5, 3.5), wherever the triangle lies on it."""
+    marks = np.zeros((2, *SIZE), bool)
+    marks[0, 3, 3] = True
+    gaps = Gaps.of(marks)
+    np.testing.assert_array_equal(gaps.gap, [(3, 3, 1)])
+    for shift in np.arange(-wide, 1, 0.23):
+        low = 3.5 + shift
+        names, spans = of([(low, 3.0), (low + wide, 3.0), (low, 4.0)], faces).spans(gaps)
+        found = spans[names[:, 0] >= 0]
+        if min(shift + wide / 2, 1) - max(shift, 0) < 1e-4:
+            assert not len(found)
+            continue
+        np.testing.assert_allclose(found[:, :2], [(shift, shift + wide / 2)], atol=1e-5)
+        a, b, c, d = found[0, 2:]
+        np.testing.assert_allclose([a / c, (a + b) / (c + d)], 5, atol=1e-5)
+
+
+def test_cells_around_a_gap_are_marked():
+    cells = np.zeros((5, 6), np.int8)
+    spans_loops.around(np.array([(2, 2, 1)], np.int32), cells)
+    expected = np.zeros((5, 6), np.int8)
+    expected[1:4, 1:5] = 1
+    np.testing.assert_array_equal(cells, expected)
+
+
+def test_sheets_join_the_centres_between_which_they_go_on():
+    part = np.full(SIZE, -1, np.int32)
+    part[2:5, 2:6] = 0
+    own = of([*quad(2.1, 2.1, 4.1, 4.9), (5.9, 2.1), (5.9, 4.9)], [(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
+    seen = [(x, y) for y, x in np.argwhere(part == 0) + 0.5]
+    triangle = np.full(SIZE, -1, np.int32)
+    for x, y in seen:
+        left = x < 4.1
+        below = (y - 2.1) / 2.8 > ((x - 2.1) / 2 if left else (x - 4.1) / 1.8)
+        triangle[int(y), int(x)] = (1 if below else 0) if left else (3 if below else 2)
+    met, joined = np.zeros((2, *SIZE), np.uint8), np.zeros((2, *SIZE), bool)
+    fronts = Fronts(read_only(part), read_only(triangle), read_only(5.0 * np.ones(SIZE)))
+    own.meet(fronts, np.array([1.0, 0.0]), met)
+    own.join(0, fronts, met, joined)
+    both = [(part >= 0) & (np.roll(part, -1, axis) >= 0) for axis in (1, 0)]
+    np.testing.assert_array_equal(joined, both)

@@ -1,0 +1,110 @@
+"""The compiled operations of found edges, by the kit: their array code is the rule."""
+
+import numpy as np
+import pytest
+from cards import SIZE, SQUARE, in_pixels, turned, two_colors
+from helpers import box, icosphere
+
+import rts
+from rts.splatting.edges import splatter, stacks
+from rts.splatting.edges.splatter import EDGES, FIELDS
+from rts.splatting.edges.stacks import CELLS
+from rts.testing import OperationConformance
+
+pytestmark = pytest.mark.splatting
+
+
+def pane(corners, depth, color, alpha):
+    """A sheet that lets light through, at a depth for each corner; colours are of its corners."""
+    vertices = np.column_stack([corners, -np.broadcast_to(depth, (4,))]).astype(np.float32)
+    colors = np.column_stack([color, np.full(4, alpha)]).astype(np.float32)
+    shader = rts.plugin("shaders", "unlit")(opaque=False)
+    return rts.Part(rts.Mesh([(0, 1, 2), (0, 2, 3)]), {"vertices": vertices, "colors": colors}, shader)
+
+
+def panes():
+    """Two panes that cross, before a third."""
+    colors, slope = np.random.default_rng(2).random((3, 4, 3)), np.array([-2.0, 2, 2, -2])
+    return [
+        pane(turned(SQUARE, 0.3, (14.2, 11.7)), 20.5 + slope, colors[0], 0.7),
+        pane(turned(SQUARE, -0.2, (9, 12)), 20 - slope, colors[1], 0.4),
+        pane(turned(1.3 * SQUARE, 0.1, (12.3, 12.4)), 40, colors[2], 0.6),
+    ]
+
+
+def bodies():
+    """A box that passes through a ball."""
+    parts = []
+    for vertices, faces in (icosphere(1, 0.7, (0.2, 0.1, 0)), box(0.5)):
+        colors = np.random.default_rng(len(parts)).random((len(vertices), 3)).astype(np.float32)
+        parts.append(rts.Part(rts.Mesh(faces), {"vertices": np.float32(vertices), "colors": colors}, "unlit"))
+    return parts
+
+
+def wave(theta, points):
+    xp = rts.namespace(points)
+    return xp.abs(points[:, 0]) + xp.abs(points[:, 2]) + 0.2 * points[:, 1] ** 2 - theta["radius"]
+
+
+def field():
+    return [rts.Part(rts.Sdf(wave, 1.6), {"radius": np.float32(0.7)}, "lambert")]
+
+
+NEAR = rts.Camera.look_at((0.5, 0.7, 3.0), (0, 0, 0), fov_y=40)
+SCENES = {
+    "cards": (two_colors, in_pixels(), SIZE),
+    "bodies": (bodies, NEAR, (14, 17)),
+    "a field": (field, NEAR, (16, 15)),
+    "panes": (panes, in_pixels(), SIZE),
+}
+KNOWN = {}
+
+
+def operands_of(name, operation):
+    """What an operation, "EDGES" or "CELLS", is given where a scene is drawn."""
+    if name not in KNOWN:
+        make, camera, size = SCENES[name]
+        known = KNOWN[name] = {}
+        with pytest.MonkeyPatch.context() as patch:
+            for module, own, called in ((splatter, "EDGES", EDGES), (stacks, "CELLS", CELLS)):
+                patch.setattr(module, own, lambda *x, own=own, called=called: called(*known.setdefault(own, x)))
+            rts.render(make(), camera, size, splatter="edges", layers=3 if name == "panes" else 1)
+    return list(KNOWN[name][operation])
+
+
+def unseen():
+    """Cards, beside some of whose breaks nothing is seen."""
+    operands = operands_of("cards", "EDGES")
+    at = 3 + FIELDS.index("rows")
+    rows = operands[at].copy()
+    assert (operands[3 + FIELDS.index("inner")][::3, 0] >= 0).any()
+    rows[::3, 0] = -1
+    operands[at] = rows
+    return operands
+
+
+def test_scenes_have_pairs_and_lines_of_crossing_and_slopes():
+    near, pair = 3 + FIELDS.index("near"), 3 + FIELDS.index("pair")
+    assert (operands_of("bodies", "EDGES")[near] == 2).any()
+    assert (operands_of("panes", "EDGES")[near] == 2).any()
+    assert (operands_of("a field", "EDGES")[pair] >= 0).any()
+
+
+class TestEdges(OperationConformance):
+    @pytest.fixture
+    def operation(self):
+        return EDGES
+
+    @pytest.fixture(params=[*SCENES, "cards, some sides unseen"])
+    def operands(self, request):
+        return unseen() if request.param not in SCENES else operands_of(request.param, "EDGES")
+
+
+class TestCells(OperationConformance):
+    @pytest.fixture
+    def operation(self):
+        return CELLS
+
+    @pytest.fixture
+    def operands(self):
+        return operands_of("panes", "CELLS")
