@@ -95,7 +95,7 @@ class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
-        """Take for each part its sampler, camera, entry and, where triangles tell all, sheets; joint parts share one."""
+        """Take of each part its sampler, camera, entry and, where triangles tell all, sheets, shared by joint parts."""
         self._scene, self._grid, self._parts = scene, grid, parts
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 

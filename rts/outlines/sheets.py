@@ -97,8 +97,8 @@ class Sheets(NamedTuple):
         """
         from rts.outlines import sheets_loops, silhouettes_loops
 
-        arrays = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
-        vertices, faces = map(read_only, arrays)  # One type, for which loops are compiled once.
+        # Vertices of joint parts may be float64: moved into the camera's space, they are as exact as before.
+        vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
         starts = np.cumsum([0, *(len(own.faces) for own in proxies or [proxy])], dtype=np.int32)
@@ -138,7 +138,7 @@ class Sheets(NamedTuple):
         parallel(sheets_loops.seams, height, *arguments, work=20 * joined[0].size)
 
     def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The spans of triangles on gaps, (N, 2) int32 and (N, 6), see `spans_loops.spans_of`; their parts (N,) int32."""
+        """Spans of triangles on gaps, (N, 2) int32 and (N, 6), see `spans_loops.spans_of`; their parts, (N,) int32."""
         from rts.outlines import spans_loops
 
         close = np.empty(len(self.seen), np.int8)

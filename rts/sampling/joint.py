@@ -17,7 +17,6 @@ from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.plugin_base import overrides
 from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
 from rts.sampling.packing import lift
 from rts.sampling.sample_checks import check_camera, check_fragments
@@ -141,8 +140,8 @@ class Joint:
 def with_joints(scene: Scene, grid: Grid) -> Scene:
     """The scene with its `joints`, where neighbouring parts can be sampled at once.
 
-    These are parts of meshes and other triangles that are no approximation, sampled by one sampler that builds no
-    structure over them. Engines that pad arrays, and traced values, have none.
+    These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`. Engines
+    that pad arrays, and traced values, have none.
     """
     suited = [_is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
     if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)) or not is_known(scene, grid):
@@ -185,16 +184,14 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
 def _is_suited(part: CheckedPart, sampler: object) -> bool:
     """True if a part can be sampled along with others."""
     surface = part.surface
-    if not isinstance(sampler, TriangleSampler) or overrides(sampler, "prepare", TriangleSampler):
+    if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
         return False
-    if not isinstance(surface, TriangleSurface):
-        return False
-    return surface.centered and not surface.refines and not surface.depends_on_view
+    return sampler.joins_parts and surface.centered and not surface.refines and not surface.depends_on_view
 
 
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3) float32, moved by a matrix (4, 4)."""
-    return (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+    """Vertices (V, 3), moved by a matrix (4, 4), float64."""
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _evaluated(part: CheckedPart, ids: np.ndarray, params: np.ndarray, differentiates: bool) -> dict[str, Array] | None:
