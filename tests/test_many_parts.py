@@ -92,7 +92,7 @@ def test_moved_parts_give_the_image_and_the_gradient_of_one_at_a_time(singly, op
 def test_the_gradient_is_that_of_a_merged_mesh():
     transforms, parts = crowd(9, shader="silhouette")
     # Outlines of a part go on along it alone, and no two parts hide one another here.
-    transforms[:, :3, :3] *= 0.4
+    transforms[:, :3, :3] *= 0.25
     transforms[:, :3, 3] = [(i % 3 - 1, i // 3 - 1, 0.1 * i) for i in range(9)]
     own = parts(transforms)
     shifts = np.cumsum([0, *(len(part.theta["vertices"]) for part in own)])
