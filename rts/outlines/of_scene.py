@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
+from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns
-from rts.outlines.points import Points, at_centres, entry_of, found_in_views, host_value, on_host, proxy_inputs
+from rts.outlines.points import Points, at_centres, found_in_views
+from rts.sampling.entries import host_value, is_batched, proxy_inputs
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
-from rts.sampling.triangle_sampler import TriangleSampler
 
 
 def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
@@ -44,7 +44,8 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         known.append((part.transform, read, proxy_inputs(part) if entry is None else None))
     inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
     traced = any(map(is_traced, leaves(inputs)))
-    if traced or all(map(has_sheets, scene.parts, scene.samplers)) or any(map(_batched, leaves(inputs))):
+    on_sheets = not scene.joints and all(map(has_sheets, scene.parts, scene.samplers))
+    if traced or on_sheets or any(map(is_batched, leaves(inputs))):
         most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
         found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
     else:
@@ -79,25 +80,6 @@ def _without_gaps(whole: Samples, own: Samples, beside: Array) -> Samples:
     used, last = (xp.max(xp.concat([xp.reshape(x, (-1,)), 0 * rows[:1] - 1])) + 1 for x in (own.row, beside))
     there = (rows < used) | ((rows >= count) & (rows < count + last))
     return taken_rows(whole, xp.where(there, rows, xp.where(used > 0, 0, count)))
-
-
-def with_entries(scene: Scene, grid: Grid) -> Scene:
-    """The scene with prepared entries of parts whose triangles are not cheap, so that outlines make none anew.
-
-    The scene itself where values are traced, or several at once.
-    """
-    if not any(map(_is_dear, scene.parts)):
-        return scene
-    inputs = stopped((scene.read, [part.transform for part in scene.parts], grid.camera))
-    if any(is_traced(x) or _batched(x) for x in leaves(inputs)):
-        return scene
-    entries = []
-    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
-        if entry is None and isinstance(sampler, TriangleSampler) and _is_dear(part):
-            camera = on_host(grid.camera.within(part.transform).for_size(grid.size))
-            entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
-        entries.append(entry)
-    return scene._replace(entries=entries)
 
 
 def _found_on_host(
@@ -188,14 +170,3 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
     xp = namespace(row)
     moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
     return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)
-
-
-def _is_dear(part: CheckedPart) -> bool:
-    """True if making a part's triangles costs more than to compare their inputs."""
-    return isinstance(part.surface, TriangleSurface) and not part.surface.proxy_is_cheap
-
-
-def _batched(x: Array) -> bool:
-    """True for an array of which a transform maps over several values."""
-    value = value_of(x)
-    return value is not None and value.ndim != x.ndim

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, exemplar, stopped, value_of
-from rts.arrays.trees import Array, Tree, map_leaves
+from rts.arrays.engines import engine_of, exemplar
+from rts.arrays.trees import Tree
 from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart
 from rts.contracts.records import Cells, Fragments, Request, Samples
@@ -23,6 +23,8 @@ from rts.outlines.spans import breaks_of_triangles
 from rts.outlines.stacks import breaks_of_stacks
 from rts.plugin_base import overrides
 from rts.registry import name_of
+from rts.sampling.entries import entry_of, host_value, on_host
+from rts.sampling.joint import Joint
 from rts.sampling.points import pixel_widths
 from rts.sampling.sample_checks import check_samples
 from rts.sampling.scene import Grid, Scene, has_sheets
@@ -40,14 +42,24 @@ def found_in_views(
     """
     broken = each(lambda b: views[b].broken(layers[b], most), range(len(views)))
     rows, samples = [np.full(own.parts.shape, -1, np.int32) for own in broken], []
-    for part in range(len(views[0].entries)):
-        asked = [own.parts == part for own in broken]
+    while len(samples) < len(views[0].entries):
+        part = len(samples)
+        joint = views[0].joint(part)
+        stop = part + 1 if joint is None else joint.stop
+        asked = [(own.parts >= part) & (own.parts < stop) for own in broken]
         points = [own.points[here] for own, here in zip(broken, asked, strict=True)]
         known = [own.triangles[here] for own, here in zip(broken, asked, strict=True)]
         fragments = [view.on_sheets(part, *own) for view, *own in zip(views, points, known, strict=True)]
         together = None
         if None not in fragments:
             together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
+        if joint is not None:  # In a single view.
+            assert together is not None
+            lifted = joint.lifted(together)
+            firsts = np.cumsum([0, *(len(own.ids) for own in lifted.samples)], dtype=np.int32)
+            samples += lifted.samples
+            rows[0][asked[0]] = host_value(lifted.row)[0, 0] - firsts[broken[0].parts[asked[0]] - part]
+            continue
         numbers = np.concatenate([own.numbers[here] for own, here in zip(broken, asked, strict=True)])
         own, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
         ends = np.cumsum([len(x) for x in points])
@@ -83,21 +95,27 @@ class Points:
     """A scene that can be sampled at any point of a grid, part by part."""
 
     def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
-        """Take for each part its sampler, camera, entry and, where triangles tell all, sheets."""
+        """Take of each part its sampler, camera, entry and, where triangles tell all, sheets, shared by joint parts."""
         self._scene, self._grid, self._parts = scene, grid, parts
         self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
 
     @classmethod
     def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> Points:
         """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
-        parts = []
-        for part, sampler, entry, own in zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True):
-            camera, sheets = grid.camera.within(part.transform), None
-            if isinstance(sampler, TriangleSampler):
+        parts, joints = [], {joint.first: joint for joint in scene.joints}
+        for index, (part, sampler, entry, own) in enumerate(
+            zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
+        ):
+            camera, sheets, joint = grid.camera.within(part.transform), None, joints.get(index)
+            if joint is not None:
+                sheets = Sheets.of(joint.proxy, joint.camera, grid.size, joint.cull, index, joint.proxies)
+            elif parts and parts[-1][3] is not None and index in parts[-1][3].parts:
+                sheets = parts[-1][3]
+            elif isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
                 entry = entry or entry_of(part, sampler, own, host, grid.size)
                 if has_sheets(part, sampler):
-                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
+                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index)
             parts.append((sampler, camera, entry, sheets))
         return cls(scene, grid, parts)
 
@@ -105,6 +123,10 @@ class Points:
     def entries(self) -> list[Any]:
         """The prepared entry of each part."""
         return [entry for _, _, entry, _ in self._parts]
+
+    def joint(self, part: int) -> Joint | None:
+        """The joint that begins with a part, if any."""
+        return next((joint for joint in self._scene.joints if joint.first == part), None)
 
     def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Found:
         """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
@@ -155,8 +177,9 @@ class Points:
 
     def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """All breaks, and the other arrays of `_Broken`."""
-        sheets, opaque = [own for *_, own in self._parts if own is not None], np.array(self._scene.opaque)
-        known, count = len(sheets) == len(self._parts), len(layers.part)
+        every, opaque = [own for *_, own in self._parts], np.array(self._scene.opaque)
+        known, count = None not in every, len(layers.part)
+        sheets = list({id(own): own for own in every}.values())
         if count == 1 and known:
             breaks, stacks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width), None
         elif known:
@@ -286,32 +309,3 @@ class _OnTriangles(TriangleSampler):
     ) -> Fragments:
         """The fragments."""
         return self._fragments
-
-
-def host_value(x: Array) -> np.ndarray:
-    """The value of an array, which is not traced."""
-    value = value_of(x)
-    assert value is not None
-    return value
-
-
-def on_host(camera: Camera) -> Camera:
-    """A camera that is not traced, with matrices on the host."""
-    return camera.map(lambda m: np.asarray(host_value(m), np.float64))
-
-
-def inputs_of(scene: Scene) -> list[Tree]:
-    """The inputs of the proxies of all parts, on the host; none of them is traced."""
-    return [map_leaves(host_value, proxy_inputs(part)) for part in scene.parts]
-
-
-def proxy_inputs(part: CheckedPart) -> Tree:
-    """The inputs of a part's proxy, without derivatives; None if it has no triangles."""
-    surface = part.surface
-    return stopped(surface.proxy_inputs(stopped(part.theta))) if isinstance(surface, TriangleSurface) else None
-
-
-def entry_of(part: CheckedPart, sampler: TriangleSampler, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Any:
-    """The part's prepared entry, with the inputs of its proxy, on the host."""
-    surface: Any = part.surface
-    return sampler.working_on(surface, inputs, camera, size, None, lambda known: known._replace(inputs=inputs))

@@ -49,7 +49,11 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     origin, ties, side = loops.segments_of(square, ends, partner, width)
     around = loops.beyond(ties, len(breaks.place))
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
-    index = np.arange(len(breaks.near))
-    own = breaks.place, breaks.tangent, breaks.triangles[index, np.where(breaks.near == 1, 1, 0)]
+    ending = np.arange(len(breaks.near)), np.where(breaks.near == 1, 1, 0)
+    triangle, part = breaks.triangles[ending].astype(np.int64), breaks.parts[ending]
+    triangle = np.where(
+        triangle >= 0, triangle + part * (1 + triangle.max(initial=0)), -1
+    )  # Of all parts, no two alike.
+    own = breaks.place, breaks.tangent, triangle
     parallel(loops.corners, len(ties), origin, ties, side, around, *own, corner, pull, work=300 * len(ties))
     return Segments(origin, ties, side, np.ascontiguousarray(around[:, 1:3]), corner, pull)

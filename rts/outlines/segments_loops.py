@@ -237,7 +237,7 @@ def corners(first, last, origin, ties, side, around, place, tangent, triangle, c
         around: (S, 4), the result of `beyond`.
         place: (B, 2), x and y of breaks.
         tangent: (B, 2), see `join`.
-        triangle: (B,) int32, the triangle that ends at each break, or −1.
+        triangle: (B,) int64, the triangle that ends at each break, or −1.
         corner: to fill.
         pull: to fill.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,9 +44,11 @@ class Gaps(NamedTuple):
 
 
 class Sheets(NamedTuple):
-    """A part's triangles as a camera sees them.
+    """The triangles of a part, or of neighbouring parts, as a camera sees them.
 
     Attributes:
+        first: the index of the first part.
+        starts: (P + 1,) int32, where the triangles of each part begin.
         vertices: (V, 3) float32.
         faces: (T, 3) int32.
         beyond: (T, 3) int32, the triangle beyond the edge opposite each corner; −1 where none or several share it.
@@ -56,6 +59,8 @@ class Sheets(NamedTuple):
         sides: (T + 1,) int8, which side of triangles is seen, and 0; see `silhouettes_loops.turns`.
     """
 
+    first: int
+    starts: np.ndarray
     vertices: np.ndarray
     faces: np.ndarray
     beyond: np.ndarray
@@ -65,18 +70,49 @@ class Sheets(NamedTuple):
     seen: np.ndarray
     sides: np.ndarray
 
+    @property
+    def parts(self) -> range:
+        """The indices of the parts."""
+        return range(self.first, self.first + len(self.starts) - 1)
+
     @classmethod
-    def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int], cull: str) -> Sheets:
-        """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
+    def of(
+        cls,
+        proxy: Proxy,
+        camera: Camera,
+        size: tuple[int, int],
+        cull: str,
+        first: int = 0,
+        proxies: Sequence[Proxy] | None = None,
+    ) -> Sheets:
+        """The sheets of a proxy.
+
+        Args:
+            proxy: the triangles.
+            camera: host matrices, in the proxy's space, for images of `size`.
+            size: (height, width) of the grid of cells.
+            cull: as in `TriangleSampler.rasterize`.
+            first: the index of the first part.
+            proxies: those of neighbouring parts, whose triangles the proxy has one part after the other; None for one.
+        """
         from rts.outlines import sheets_loops, silhouettes_loops
 
-        arrays = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
-        vertices, faces = map(read_only, arrays)  # One type, for which loops are compiled once.
+        # Vertices of joint parts may be float64: moved into the camera's space, they are as exact as before.
+        vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
-        beyond, sides = _beyond(proxy.faces), np.zeros(len(faces) + 1, np.int8)
+        starts = np.cumsum([0, *(len(own.faces) for own in proxies or [proxy])], dtype=np.int32)
+        beyond, sides = [_beyond(own.faces) for own in proxies or [proxy]], np.zeros(len(faces) + 1, np.int8)
+        if proxies is not None:
+            beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
+        beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
-        return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen, sides)
+        planes, keep = near_and_far(camera), kept_sign(camera, cull)
+        return cls(first, starts, vertices, faces, beyond, rows, planes, keep, seen, sides)
+
+    def holds(self, parts: np.ndarray) -> np.ndarray:
+        """True for those of `parts` that the sheets are of."""
+        return (parts >= self.parts.start) & (parts < self.parts.stop)
 
     def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.
@@ -89,19 +125,20 @@ class Sheets(NamedTuple):
         own = self.clip[0], self.keep, self.seen, self.beyond, self.sides
         parallel(silhouettes_loops.meet, count, *mesh, *own, fronts.part, fronts.depth, width, met, work=10 * count)
 
-    def join(self, own: int, fronts: Fronts, met: np.ndarray, joined: np.ndarray) -> None:
-        """Mark, in `joined` (2, H, W), the centres whose fronts, of the part `own`, a sheet joins to the next ones'.
+    def join(self, fronts: Fronts, met: np.ndarray, joined: np.ndarray) -> None:
+        """Mark, in `joined` (2, H, W), the centres whose fronts, of one of the parts, a sheet joins to the next ones'.
 
         `fronts` (H, W) are seen at centres; for `met` see `meet`.
         """
         from rts.outlines import sheets_loops
 
         mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
+        own = np.int32(self.parts.start), np.int32(self.parts.stop)
         arguments = *map(read_only, fronts), own, *mesh, self.keep != 0, met, joined
         parallel(sheets_loops.seams, height, *arguments, work=20 * joined[0].size)
 
-    def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
-        """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
+    def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Spans of triangles on gaps, (N, 2) int32 and (N, 6), see `spans_loops.spans_of`; their parts, (N,) int32."""
         from rts.outlines import spans_loops
 
         close = np.empty(len(self.seen), np.int8)
@@ -116,7 +153,8 @@ class Sheets(NamedTuple):
         mesh = self.rows, self.vertices, self.faces, self.clip, self.keep, self.seen
         arguments = triangles, begins, *mesh, *gaps[:3], names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=200 * len(names))
-        return names, spans
+        part = np.searchsorted(self.starts[1:-1], names[:, 1], side="right") + self.first
+        return names, spans, part.astype(np.int32)
 
     def at(self, triangle: np.ndarray, points: np.ndarray) -> tuple[Fragments, np.ndarray]:
         """Fragments (1, 1, M) of triangles (M,) at points (M, 2); slopes (M, 2) of depth along x and y, a cell."""

@@ -144,7 +144,7 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
         part: (H, W) int32, the parts seen at centres.
         triangle: (H, W) int32, and their triangles.
         depth: (H, W) float64.
-        own: the part that the further arguments belong to.
+        own: the first part that the further arguments belong to, and the one after the last.
         seen: (V, 2), see `projected`.
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
@@ -157,11 +157,13 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
     (height, width), corners = part.shape, np.empty((3, 4))
     for y in range(first, last):
         for x in range(width):
-            if part[y, x] != own:
+            if not own[0] <= part[y, x] < own[1]:
                 continue
             for axis in range(2):
                 dx, dy = 1 - axis, axis
-                if x + dx == width or y + dy == height or part[y + dy, x + dx] != own or met[axis, y, x] == 2:
+                if x + dx == width or y + dy == height or met[axis, y, x] == 2:
+                    continue
+                if part[y + dy, x + dx] != part[y, x]:
                     continue
                 t, s = triangle[y, x], triangle[y + dy, x + dx]
                 end = s

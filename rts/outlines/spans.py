@@ -22,7 +22,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
 
     Args:
         fronts: what is seen at centres.
-        sheets: the triangles of each part.
+        sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
     from rts.outlines import spans_loops
@@ -31,8 +31,8 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     for own in sheets:
         own.meet(fronts, width, met)
     joined = np.zeros(met.shape, np.bool_)
-    for part, own in enumerate(sheets):
-        own.join(part, fronts, met, joined)
+    for own in sheets:
+        own.join(fronts, met, joined)
     gaps = np.empty_like(joined)
     parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, gaps, work=2 * fronts.part.size)
     gap, whole, numbers = _breaks_in(gaps, fronts, sheets)
@@ -78,8 +78,7 @@ def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarr
     from rts.outlines import spans_loops
 
     several = [own.spans(gaps) for own in sheets]
-    parts = np.repeat(np.arange(len(several), dtype=np.int32), [len(names) for names, _ in several])
-    names, spans = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
+    names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
     begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
     return begins, names.take(order, 0), spans.take(order, 0), parts.take(order)
 
@@ -101,13 +100,13 @@ def crossings(
         parts: (B, 2), before and behind.
         triangles: (B, 2), alike.
         points: (B, 2), where breaks are.
-        sheets: the triangles of each part.
+        sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
     slopes, depth = np.zeros((len(near), 2, 2)), np.zeros(len(near))
-    for part, own in enumerate(sheets):
+    for own in sheets:
         for side in (0, 1):
-            at = np.flatnonzero((near == 2) & (parts[:, side] == part))
+            at = np.flatnonzero((near == 2) & own.holds(parts[:, side]))
             if len(at):
                 found, slopes[at, side] = own.at(triangles[at, side], points[at])
                 depth[at] = found.depth[0, 0]
@@ -134,8 +133,8 @@ def tangents(
     side = np.where(near == 1, 1, 0)
     index = np.arange(len(near))
     part, triangle = parts[index, side], triangles[index, side]
-    for own, sheet in enumerate(sheets):
-        at = np.flatnonzero((near < 2) & (part == own))
+    for sheet in sheets:
+        at = np.flatnonzero((near < 2) & sheet.holds(part))
         found[at] = sheet.along(triangle[at], points[at])
     length = np.hypot(*found.T)
     return found / np.where(length > 0, length, 1.0)[:, None]

@@ -24,7 +24,7 @@ def breaks_of_stacks(
     Args:
         layers: what is seen at centres, arrays (K, H, W), front to back; nothing behind an opaque layer.
         opaque: (P,) bool, the parts that let no light through.
-        sheets: the triangles of each part.
+        sheets: the triangles of all parts.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
     gaps = Gaps.of(_gaps_to_search(layers, opaque, sheets, width))
@@ -64,8 +64,8 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
         if layer and not (front.part >= 0).any():
             break
         joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
-        for part, own in enumerate(sheets):
-            own.join(part, front, met, joined)
+        for own in sheets:
+            own.join(front, met, joined)
         parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=2 * front.part.size)
         marks = marks | wanted
     return np.asarray(marks)

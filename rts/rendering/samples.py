@@ -9,9 +9,11 @@ from functools import partial
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
-from rts.outlines.of_scene import with_entries, with_outlines
+from rts.outlines.of_scene import with_outlines
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
 from rts.rendering.settings import RenderSettings
+from rts.sampling.entries import with_entries
+from rts.sampling.joint import with_joints
 from rts.sampling.layer_count import with_all_layers
 from rts.sampling.merging import merge
 from rts.sampling.prepared import Prepared
@@ -77,6 +79,7 @@ def sampled_scene(
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     scene = with_entries(scene, grid) if outlines else scene
+    scene = with_joints(scene, grid) if capacity is None else scene
     # Inside of one colour nothing depends on where a sample lies.
     uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
     taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines, uniform=uniform))
@@ -89,9 +92,15 @@ def sampled_scene(
 
 def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:
     """The samples of all parts, `count` layers of a grid of cells."""
-    samples = []
-    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
-        camera = grid.camera.within(part.transform)
-        own = sampler.sample(part, camera, grid.size, count, replace(request, entry=entry))
-        samples.append(check_samples(own, grid.size, sampler))
-    return merge(samples, count)
+    tables, number, joints = [], 0, {joint.first: joint for joint in scene.joints}
+    while number < len(scene.parts):
+        joint = joints.get(number)
+        if joint is not None:
+            tables.append(joint.sampled(grid.size, count))
+            number = joint.stop
+            continue
+        part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
+        own = sampler.sample(part, grid.camera.within(part.transform), grid.size, count, replace(request, entry=entry))
+        tables.append(check_samples(own, grid.size, sampler))
+        number += 1
+    return merge(tables, count)

@@ -13,25 +13,32 @@ from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.errors import InputError
 
 
-def merge(samples: Sequence[Samples], layers: int) -> Sampled:
+def merge(tables: Sequence[Samples | Sampled], layers: int) -> Sampled:
     """Interleave the layers of several parts by depth and keep the nearest `layers`; the earlier part is first at ties.
 
-    A single part keeps its cells as they are. The result has fewer layers if all parts together have fewer.
+    A single table keeps its cells as they are. The result has fewer layers if all tables together have fewer.
+
+    Args:
+        tables: the samples of each part, or of neighbouring parts that were sampled at once.
+        layers: K.
 
     Raises:
         InputError: known cells of one of several parts name a sample that does not exist.
     """
-    overflow = samples[0].overflow
-    for s in samples[1:]:
-        overflow = overflow + s.overflow
-    if len(samples) == 1:
-        return Sampled(tuple(samples), samples[0].cells, overflow)
-    tables = [*(s.row for s in samples), *(s.depth for s in samples)]
-    if all(s.triangle is not None for s in samples):
-        tables += [s.triangle for s in samples]
-    sizes = tuple(s.ids.shape[0] for s in samples)
+    overflow = tables[0].overflow
+    for own in tables[1:]:
+        overflow = overflow + own.overflow
+    samples = [own for table in tables for own in (table.samples if isinstance(table, Sampled) else [table])]
+    if len(tables) == 1:
+        return Sampled(tuple(samples), tables[0].cells, overflow)
+    sizes = tuple(
+        sum(own.ids.shape[0] for own in (table.samples if isinstance(table, Sampled) else [table])) for table in tables
+    )
+    arrays = [*(own.row for own in tables), *(own.depth for own in tables)]
+    if all(own.triangle is not None for own in tables):
+        arrays += [own.triangle for own in tables]
     on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
-    return Sampled(tuple(samples), Cells(*engine_of(tables).by_host(on_host, elsewhere, *tables)), overflow)
+    return Sampled(tuple(samples), Cells(*engine_of(arrays).by_host(on_host, elsewhere, *arrays)), overflow)
 
 
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:

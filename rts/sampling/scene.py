@@ -27,6 +27,7 @@ class Scene(NamedTuple):
         samplers: the sampler of each part.
         entries: the structure that each sampler has built for its part, or None.
         context: the engine of parts and camera, and an array that sets dtype and device of its constants.
+        joints: neighbouring parts that are sampled at once; see `rts.sampling.joint`.
     """
 
     parts: list[CheckedPart]
@@ -34,6 +35,7 @@ class Scene(NamedTuple):
     samplers: Sequence[Sampler]
     entries: Sequence[Any]
     context: Context
+    joints: Sequence[Any] = ()
 
     @property
     def channels(self) -> int:

@@ -45,8 +45,11 @@ class TriangleSampler(Sampler):
     Attributes:
         concurrent: True if several threads may call `rasterize` at once. Threads of a sampler with an `update` always
             wait for one another.
+        joins_parts: True if `rasterize` takes the result of `prepare` for any proxy, with vertices in float64 too, as
+            soon as it is made. Neighbouring parts of few triangles are then drawn at once; see `rts.sampling.joint`.
     """
 
+    joins_parts: bool = False
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:

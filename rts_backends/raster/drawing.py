@@ -67,7 +67,7 @@ def _draw(items, given, top, end, width, layered):
             M, 2). They hold the layers found so far, or empty ones.
     """
     rows, vertices, matrix, view_depth, keep = given
-    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
+    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), vertices.dtype)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most = 4 * BLOCK
     # Room for hits left from a row, four for each small triangle, and one more row.

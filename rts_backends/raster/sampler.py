@@ -55,6 +55,7 @@ class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; of triangles at one depth, the lower index comes first."""
 
     concurrent = True
+    joins_parts = True
     _scratch: tuple[tuple, list[tuple]]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -181,7 +182,7 @@ def _project(first, last, used, vertices, m, screen):
     Only the blocks `used[first:last]` of vertices are projected, by `m` (4, 4) to homogeneous steps. The lower 16 bits
     are the column, the upper ones the row. Positions are clamped to ±`LIMIT`; see `BEFORE` for vertices out of view.
     """
-    points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
+    points, pixels = np.empty((3, LONG_BLOCK), vertices.dtype), np.empty((2, LONG_BLOCK), np.int32)
     for n in used[first:last]:
         block = slice(n * LONG_BLOCK, min(len(vertices), (n + 1) * LONG_BLOCK))
         read, written = vertices[block], screen[block]

@@ -1,0 +1,204 @@
+"""Neighbouring parts of few triangles as one table, in the camera's space, so that a sampler draws all at once.
+
+Each part still has samples of its own, behind one another: the table says which part a triangle belongs to. A part
+costs a transform of its vertices and a call of its shader, but no pass over the image.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rts.arrays.engines import floating_bits, is_constant
+from rts.arrays.trees import Array, map_leaves
+from rts.contracts.checks import CheckedPart
+from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, Sampled, Samples
+from rts.contracts.surface import TriangleSurface
+from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
+from rts.sampling.packing import lift
+from rts.sampling.sample_checks import check_camera, check_fragments
+from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.triangle_sampler import TriangleSampler
+from rts.scene.camera import Camera
+
+MOST = 2**15
+"""Triangles of a part that is joined: to move the vertices of a larger one costs more than a pass over the image."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """The triangles of neighbouring parts.
+
+    Attributes:
+        scene: the scene.
+        first: the index of the first part.
+        starts: (P + 1,) int32, where the triangles of each part begin.
+        proxies: those of the parts, in their local spaces.
+        proxy: all triangles, in the space of `camera`; its `ids` are those of the parts.
+        camera: float64 matrices on the host.
+        cull: of all parts.
+        sampler: of all parts.
+    """
+
+    scene: Scene
+    first: int
+    starts: np.ndarray
+    proxies: Sequence[Proxy]
+    proxy: Proxy
+    camera: Camera
+    cull: str
+    sampler: TriangleSampler
+
+    @property
+    def parts(self) -> Sequence[CheckedPart]:
+        """The parts."""
+        return self.scene.parts[self.first : self.stop]
+
+    @property
+    def stop(self) -> int:
+        """The index after that of the last part."""
+        return self.first + len(self.proxies)
+
+    @classmethod
+    def of(cls, scene: Scene, first: int, proxies: Sequence[Proxy], cameras: Sequence[Camera]) -> Joint:
+        """Join the parts from `first` on, given their proxies and the camera in the local space of each."""
+        starts = np.cumsum([0, *(len(proxy.faces) for proxy in proxies)], dtype=np.int32)
+        alike = all(np.array_equal(camera.view, cameras[0].view) for camera in cameras[1:])
+        vertices = [proxy.vertices for proxy in proxies]
+        if not alike:
+            vertices = [_moved(x, camera.view) for x, camera in zip(vertices, cameras, strict=True)]
+        shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
+        faces = np.concatenate([proxy.faces + shift for proxy, shift in zip(proxies, shifts, strict=False)])
+        ids = np.concatenate([proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies])
+        params = [proxy.corner_params for proxy in proxies if proxy.corner_params is not None]
+        proxy = Proxy(np.concatenate(vertices), faces, ids, np.concatenate(params) if params else None)
+        camera = cameras[0] if alike else Camera(np.eye(4), cameras[0].projection)
+        sampler = scene.samplers[first]
+        assert isinstance(sampler, TriangleSampler)
+        return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler)
+
+    def sampled(self, size: tuple[int, int], layers: int) -> Sampled:
+        """The samples at the centres of all cells; `Cells.triangle` counts triangles over the parts."""
+        grid = layers, *size
+        fragments = self.sampler.rasterize(self.sampler.prepare(self.proxy), self.camera, size, layers, self.cull)
+        covered = check_fragments(fragments, grid, len(self.proxy.faces), self.sampler)
+        return self.lifted(fragments, covered)
+
+    def lifted(self, fragments: Fragments, covered: np.ndarray | None = None) -> Sampled:
+        """The samples of fragments (K, H, W), whose triangles are counted over the parts.
+
+        Args:
+            fragments: on the host.
+            covered: (K, H, W) bool, the cells in which there is one; None for all.
+        """
+        ids = fragments.triangle_ids
+        covered = ids >= 0 if covered is None else covered
+        packed = lift(fragments, self.proxy, None, covered)
+        row, tables = self._by_part(packed, ids[covered])
+        context = self.scene.context
+        real = np.float64 if context.like is not None and floating_bits(context.like) == 64 else np.float32
+        arrays: list[np.ndarray] = [row, packed.depth, ids, packed.overflow]
+        names = []
+        for part, (own, params) in zip(self.parts, tables, strict=True):
+            used = np.arange(len(own), dtype=np.int32)[None, None]
+            known = _evaluated(part, own, params, context.engine.differentiates)
+            names.append(None if known is None else list(known))
+            arrays += [own, params, used, *(np.asarray(x, real) for x in (known or {}).values())]
+        specs = [ArraySpec(x.shape, x.dtype) for x in arrays]
+        like = [] if context.like is None else [context.like]
+        results = iter(context.engine.call_host(lambda *_: arrays, specs, *like))
+        row, depth, triangle, overflow = (next(results) for _ in range(4))
+        samples = []
+        for part, known in zip(self.parts, names, strict=True):
+            own, params, used = next(results), next(results), next(results)
+            gbuffer = None if known is None else {name: next(results) for name in known}
+            cells = Cells(used)
+            samples.append(Samples(own, params, cells, overflow, gbuffer=gbuffer, asked=part.reads))
+        return Sampled(tuple(samples), Cells(row, depth, triangle), overflow)
+
+    def _by_part(self, packed: Samples, triangles: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+        """The cells' rows, and ids and params of each part, at least one row; `triangles` (N,) are those of samples."""
+        count = len(self.proxies)
+        part = (np.searchsorted(self.starts, triangles, side="right") - 1).astype(np.int16)
+        order, counts = np.argsort(part, kind="stable"), np.bincount(part, minlength=count)
+        rows = np.maximum(counts, 1)
+        ends = np.cumsum(rows)
+        place = np.empty(max(1, len(part)), np.int32)
+        place[order] = np.arange(len(part)) + np.repeat(ends - rows - (np.cumsum(counts) - counts), counts)
+        ids = np.zeros((ends[-1], packed.ids.shape[1]), np.int32)
+        params = np.zeros((ends[-1], packed.params.shape[1]), np.float32)
+        if len(part):
+            ids[place], params[place] = packed.ids, packed.params
+        row = np.where(packed.row >= 0, place[packed.row], np.int32(-1))
+        bounds = itertools.pairwise([0, *ends.tolist()])
+        return row, [(ids[a:b], params[a:b]) for a, b in bounds]
+
+
+def with_joints(scene: Scene, grid: Grid) -> Scene:
+    """The scene with its `joints`, where neighbouring parts can be sampled at once.
+
+    These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`. Engines
+    that pad arrays, and traced values, have none.
+    """
+    suited = [_is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
+    if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)) or not is_known(scene, grid):
+        return scene
+    like = scene.context.like
+    if like is not None and scene.context.engine.padded(like):
+        return scene
+    joints = []
+    runs = itertools.groupby(range(len(scene.parts)), lambda i: (suited[i], scene.parts[i].cull, id(scene.samplers[i])))
+    for (is_suited, *_), run in runs:
+        indices = list(run)
+        if is_suited and len(indices) > 1:
+            joints += _joined(scene, grid, indices)
+    return scene._replace(joints=tuple(joints))
+
+
+def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]:
+    """Joints of some of neighbouring parts: those of few triangles, alike in their tables, and not mirrored."""
+    proxies, cameras = {}, {}
+    for index in indices:
+        part, entry, sampler = scene.parts[index], scene.entries[index], scene.samplers[index]
+        camera = on_host(grid.camera.within(part.transform).for_size(grid.size))
+        cameras[index] = check_camera(camera, *([] if part.transform is None else [host_value(part.transform)]))
+        if entry is None:
+            assert isinstance(sampler, TriangleSampler)
+            entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
+        proxies[index] = entry.proxy
+
+    def kind(index: int) -> tuple:
+        proxy, mirrored = proxies[index], np.linalg.det(cameras[index].view[:3, :3]) < 0
+        tables = (None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params))
+        return 0 < len(proxy.faces) <= MOST, scene.parts[index].cull == "back" and mirrored, *tables
+
+    for (few, *_), run in itertools.groupby(indices, kind):
+        own = list(run)
+        if few and len(own) > 1:
+            yield Joint.of(scene, own[0], [proxies[i] for i in own], [cameras[i] for i in own])
+
+
+def _is_suited(part: CheckedPart, sampler: object) -> bool:
+    """True if a part can be sampled along with others."""
+    surface = part.surface
+    if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
+        return False
+    return sampler.joins_parts and surface.centered and not surface.refines and not surface.depends_on_view
+
+
+def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3), moved by a matrix (4, 4), float64."""
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _evaluated(part: CheckedPart, ids: np.ndarray, params: np.ndarray, differentiates: bool) -> dict[str, Array] | None:
+    """The attributes at samples that the shader reads, if θ is constant; see `Samples.gbuffer`."""
+    if not (differentiates and is_constant(part.read)):
+        return None
+    row = np.arange(len(ids), dtype=np.int32)[None, None]
+    gbuffer = part.surface.evaluate(part.read, Samples(ids, params, Cells(row), np.asarray(0, np.int32)))
+    names = list(gbuffer) if part.reads is None else ["position", *(n for n in part.reads if n in gbuffer)]
+    return {name: gbuffer[name] for name in dict.fromkeys(names)}
