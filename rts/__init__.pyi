@@ -47,7 +47,6 @@ from rts.fitting.schedule import Stage, pyramid
 from rts.fitting.view_residuals import ViewResiduals
 from rts.registry import plugin, plugins
 from rts.rendering.arguments import Adaptive as Adaptive
-from rts.rendering.batched import render_views
 from rts.rendering.image import render, render_samples
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
@@ -56,6 +55,7 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.scene.rigid import rigid
 from rts.scene.view import View
+from rts.views.render_views import render_views
 
 __version__: str
 __all__ = [

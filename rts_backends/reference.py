@@ -10,13 +10,6 @@ from rts.plugin_api.records import Fragments, Proxy
 CANDIDATES_AT_ONCE = 1 << 20
 """About how many pairs of a triangle and a pixel are tested at once, which bounds memory."""
 
-SLACK = 0.5
-"""How far in front of the nearest depth around a cell the surface may come, as a share of the range of these depths: at
-a ridge between two centres, half of it."""
-
-ROUNDING = 1e-4
-"""How far it may come in any case, as a share of the depth."""
-
 
 class Reference(TriangleSampler):
     """Sampler that tests each triangle against each pixel near it: slow and obvious.
@@ -35,8 +28,8 @@ class Reference(TriangleSampler):
         corners, depth = clip[prepared.faces], -in_camera[prepared.faces, 2]
 
         first, last, kept = _pixel_boxes(corners, size)
-        if cull != "none":
-            kept &= _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
+        if cull == "back":
+            kept &= _faces_viewer(in_camera[prepared.faces], camera)
         hits = []
         counts = np.where(kept, (last - first + 1).clip(0).prod(axis=1), 0)
         for chunk in _chunks(counts):
@@ -58,8 +51,8 @@ class Reference(TriangleSampler):
         in_camera = homogeneous @ camera.view.T
         corners, depth = (in_camera @ camera.projection.T)[prepared.faces], -in_camera[prepared.faces, 2]
         kept = np.ones(len(corners), bool)
-        if cull != "none":
-            kept = _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
+        if cull == "back":
+            kept = _faces_viewer(in_camera[prepared.faces], camera)
         triangles, hits = np.flatnonzero(kept), []
         for chunk in _chunks(np.full(len(points), len(triangles))):
             triangle, place = np.tile(triangles, len(chunk)), np.repeat(chunk, len(triangles))

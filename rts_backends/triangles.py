@@ -31,7 +31,7 @@ def facing(camera: Camera, cull: str) -> float:
     """
     p = camera.projection
     winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return float(winding) * {"back": -1.0, "front": 1.0, "none": 0.0}[cull]
+    return -float(winding) if cull == "back" else 0.0
 
 
 @loop

@@ -207,15 +207,6 @@ def show(parts, camera=CAMERA, size=SIZE, **options):
     return to_numpy(rts.render(parts, camera, size, **options))
 
 
-def low_passed(image):
-    """The image (H, W) or (H, W, C) after a Gaussian of 2 pixels."""
-    t = np.arange(-6, 7)
-    g = np.exp(-(t**2) / 8) / np.exp(-(t**2) / 8).sum()
-    for axis in (0, 1):
-        image = np.apply_along_axis(np.convolve, axis, image, g, mode="same")
-    return image
-
-
 def crooked_block(folder):
     """The file of a block that no turn maps to itself."""
     import trimesh
@@ -227,6 +218,6 @@ def crooked_block(folder):
     return path
 
 
-def splats_of(positions, rgba, row, part=None, **more):
+def splats_of(positions, rgba, row, **more):
     """Splats of arrays of samples and of cells."""
-    return Splats(positions, rgba, Cells(row), part, **more)
+    return Splats(positions, rgba, Cells(row), **more)

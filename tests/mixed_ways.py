@@ -19,7 +19,8 @@ from mixed_scenes import mixed_of
 import rts
 from rts.arrays.trees import leaves, map_leaves
 from rts.compiling import threads
-from rts.splatting import edges, edges_stacks
+from rts.splatting.edges import splatter as edges
+from rts.splatting.edges import stacks as edges_stacks
 
 FLAGS = ("threads", "views", "prepared", "enough", "specified", "forward", "numpy", "jax", "jit")
 """How a way differs from `rts.render` of torch arrays, and a gradient in reverse mode.

@@ -116,16 +116,13 @@ def test_clusters_are_refused_where_all_their_triangles_face_away(eye, flip):
     a, b, c = np.moveaxis(made.vertices[made.faces].astype(np.float64), 1, 0)
     fronts = (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0
     split = np.arange(0, len(faces), 256)
-    some, all_of = np.logical_or.reduceat(fronts, split), np.logical_and.reduceat(fronts, split)
+    some = np.logical_or.reduceat(fronts, split)
     camera = Camera.look_at(eye, (0, 0, 0), fov_y=3 if eye[2] == 100 else 120, near=1e-3, far=1e3)
     camera = camera.replace(projection=np.diag([1, flip, 1, 1]) @ camera.projection)
-    beside, back, front = (seen(made, camera, cull) for cull in ("none", "back", "front"))
-    assert back[some & beside].all() and front[~all_of & beside].all()
-    inside = np.linalg.norm(eye) < 1
-    assert inside == (not some.any())
+    beside, back = (seen(made, camera, cull) for cull in ("none", "back"))
+    assert back[some & beside].all()
+    assert (np.linalg.norm(eye) < 1) == (not some.any())
     assert (~back & beside).sum() > 0.6 * (~some & beside).sum() > 20
-    if not inside:
-        assert (~front & beside).sum() > 0.5 * (all_of & beside).sum() > 20
 
 
 def test_clusters_out_of_view_are_refused():
@@ -151,7 +148,7 @@ def test_fragments_of_clusters_are_those_of_the_triangles(kind):
     proxy = Proxy(*mesh(kind))
     made, refused = Clusters.of(proxy), 0
     for n, camera in enumerate([*CAMERAS.values(), *looks()]):
-        for layers, cull in ((1 + n % 3, "none"), (1 + n % 2, "back"), (1, "front")):
+        for layers, cull in ((1 + n % 3, "none"), (1 + n % 2, "back")):
             view = camera, size, layers, cull
             assert_same(sampler.rasterize(made, *view), sampler.rasterize(proxy, *view))
             found, _ = made.seen(pixel_matrix(camera, size), size, facing(camera, cull))

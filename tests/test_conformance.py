@@ -461,13 +461,24 @@ def covering(samples, part):
     return samples.replace(row=samples.row * 0, depth=samples.depth * 0 + 1)
 
 
-class Aside(type(rts.plugin("samplers", "raster")())):
-    """Samples half a cell beside the points that are asked for."""
+class AtPoints(type(rts.plugin("samplers", "raster")())):
+    """A rasterizer whose points, or the samples of them, are altered."""
+
+    def __init__(self, points=lambda points: points, alter=lambda found: found):
+        self.points, self.alter = points, alter
 
     def sample(self, part, camera, size, layers, request):
-        if request.points is not None:
-            request = replace(request, points=request.points + 0.5)
-        return super().sample(part, camera, size, layers, request)
+        if request.points is None:
+            return super().sample(part, camera, size, layers, request)
+        return self.alter(
+            super().sample(part, camera, size, layers, replace(request, points=self.points(request.points)))
+        )
+
+
+def without_the_last_layer(found):
+    row = found.row.copy()
+    row[-1] = -1
+    return found.replace(row=row)
 
 
 class OddTriangles(type(rts.plugin("samplers", "raster")())):
@@ -500,7 +511,14 @@ SAMPLERS = {
         "fronts lost": OddTriangles(lambda found: found.replace(row=found.row * 0 - 1), uniform=True),
         "no such row": OddTriangles(lambda found: found.replace(row=found.row + (found.row >= 0)), uniform=True),
     },
-    "points_are_sampled_as_centres_are": {"half a cell aside": Aside()},
+    "points_are_sampled_as_centres_are": {
+        "half a cell aside": AtPoints(lambda points: points + 0.5),
+        "a hair aside": AtPoints(lambda points: points + 0.01),
+        "each once": AtPoints(lambda points: np.unique(points, axis=0)),
+        "centres alone": AtPoints(lambda points: np.floor(points) + 0.5),
+        "a layer less": AtPoints(alter=without_the_last_layer),
+        "other triangles": AtPoints(alter=lambda found: found.replace(triangle=found.triangle + 1)),
+    },
     "it_agrees_with_the_reference": {
         "nothing culled": OddRaster(cull="none"),
         "edges lost": OddRaster(eroded),

@@ -284,7 +284,7 @@ def test_a_needle_reaches_to_its_tip():
 
 def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over():
     """A triangle through the camera plane may meet a line of centres farther away than integers reach."""
-    from rts.sampling.sheets import Gaps, Sheets
+    from rts.outlines.sheets import Gaps, Sheets
 
     clip, rows = np.array([[0, 0, 1, -0.1], [0, 0, -1, 100.0]]), np.eye(4)[[0, 1, 2, 2]]
     faces, none = np.array([[0, 1, 2], [1, 0, 2]], np.int32), np.full((2, 3), -1, np.int32)
@@ -302,8 +302,8 @@ def test_edges_that_run_along_a_line_of_centres_but_for_rounding_are_passed_over
 
 
 def test_a_side_where_nothing_is_seen_has_no_colour():
-    from rts.splatting import edges as module
-    from rts.splatting import edges_weights
+    from rts.splatting.edges import splatter as module
+    from rts.splatting.edges import weights as edges_weights
 
     drawn, given = module.EDGES, []
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rts
-from rts.splatting import edges as module
+from rts.splatting.edges import splatter as module
 
 torch = pytest.importorskip("torch")
 

@@ -254,7 +254,8 @@ def mixed(t):
 
 
 def test_compiled_loops_draw_and_pull_what_the_rule_does(monkeypatch):
-    from rts.splatting import edges, edges_stacks
+    from rts.splatting.edges import splatter as edges
+    from rts.splatting.edges import stacks as edges_stacks
 
     weights = torch.as_tensor(np.random.default_rng(0).normal(size=(*SIZE, 4)), dtype=torch.float32)
 

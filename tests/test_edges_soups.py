@@ -13,7 +13,7 @@ from soups import soup_of
 from ties import ties_of
 
 import rts
-from rts.splatting import edges
+from rts.splatting.edges import splatter as edges
 
 torch = pytest.importorskip("torch")
 

@@ -8,9 +8,9 @@ from test_edges_pairs import part_of
 import rts
 from rts import Camera
 from rts.arrays.engines import engine_of, namespace
-from rts.splatting import side_by_side
 from rts.splatting.edges import Edges
-from rts.splatting.side_by_side import Picture
+from rts.views import picture as side_by_side
+from rts.views.picture import Picture
 
 torch = pytest.importorskip("torch")
 

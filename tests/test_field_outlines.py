@@ -114,9 +114,7 @@ def test_areas_of_outlines_grow_as_closed_forms_say(name, way):
     f, q, eye, expected = SHAPES[name]
     image, shift = coverage(f, eye, way), torch.tensor([SHIFT, SHIFT, SHIFT])
     found = torch.func.jacrev(lambda q: image(q, shift).sum() * PIXEL**2)(torch.tensor(q)).numpy()
-    # On a lattice sharp edges, and the middle of a wall, spread over a cell, and a kink moves as one of its sides does.
-    rounding = 0.02
-    np.testing.assert_allclose(found, expected(q), rtol=rounding, atol=rounding * max(map(abs, expected(q))))
+    np.testing.assert_allclose(found, expected(q), rtol=0.02, atol=0.02 * max(map(abs, expected(q))))
 
 
 @pytest.mark.parametrize("way", quick(["sdf", "lattice", "edge", "rays", "band"], 2))

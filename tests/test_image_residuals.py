@@ -12,7 +12,7 @@ from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts.rendering import settings
-from rts.splatting import edges_weights
+from rts.splatting.edges import weights as edges_weights
 
 pytestmark = pytest.mark.fitting
 

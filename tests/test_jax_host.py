@@ -122,23 +122,6 @@ def test_functions_live_as_long_as_their_programs():
     assert life() is None
 
 
-def test_all_items_of_a_batch_take_one_branch():
-    choice = pytest.importorskip("rts_backends.jax_engine.choice")
-
-    def chosen(which, x):
-        return choice.choose(which, lambda: 3 * x, lambda: -(x**2))
-
-    x = jnp.float32([1, 2])
-    for which, expected in (([True, True], 3 * x), ([True, False], -(x**2)), ([False, False], -(x**2))):
-        batched = jax.vmap(jax.value_and_grad(chosen, argnums=1))
-        for call in (batched, jax.jit(batched)):
-            values, slopes = call(jnp.array(which), x)
-            np.testing.assert_allclose(values, expected)
-            np.testing.assert_allclose(slopes, [3, 3] if all(which) else -2 * x)
-    along = jax.jit(jax.jacfwd(chosen, argnums=1))(True, x)
-    np.testing.assert_allclose(along, 3 * np.eye(2))
-
-
 @pytest.mark.parametrize("live", [(), ([True],)], ids=["before jax 0.12", "jax 0.12"])
 def test_results_that_a_program_does_not_use_are_left_out_of_its_call(live):
     shapes = [jax.ShapeDtypeStruct((2,), np.float32)] * 2

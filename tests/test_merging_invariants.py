@@ -39,19 +39,19 @@ def offsets_of(samples):
 
 
 def by_hand(samples, layers):
-    """Part, row within it, depth and triangle, (K, H, W) each, of sorted cells."""
+    """Row, counted over all parts, depth and triangle, (K, H, W) each, of sorted cells."""
     shape = min(layers, sum(len(s.row) for s in samples)), *samples[0].row.shape[1:]
-    part, row, depth, triangle = np.full(shape, -1), np.full(shape, -1), np.zeros(shape), np.full(shape, -1)
+    row, depth, triangle = np.full(shape, -1), np.zeros(shape), np.full(shape, -1)
     for y, x in np.ndindex(shape[1:]):
         cell = [(s.depth[k, y, x], i, k, s.row[k, y, x]) for i, s in enumerate(samples) for k in range(len(s.row))]
         for k, (z, i, own_layer, own) in enumerate(sorted(c for c in cell if c[3] >= 0)[:layers]):
-            part[k, y, x], row[k, y, x], depth[k, y, x] = i, own, z
+            row[k, y, x], depth[k, y, x] = offsets_of(samples)[i] + own, z
             triangle[k, y, x] = samples[i].triangle[own_layer, y, x]
-    return part, row, depth, triangle
+    return row, depth, triangle
 
 
 def given_to(interleave, samples, layers, target="numpy"):
-    """Part, row, depth and triangle from one of the two ways to interleave."""
+    """Row, depth and triangle from one of the two ways to interleave."""
     given = *(s.row for s in samples), *(s.depth for s in samples), *(s.triangle for s in samples)
     given = given if target == "numpy" else map(lambda x: arrays(target, x, x.dtype), given)
     return to_numpy(interleave(layers, [len(s.ids) for s in samples], *given))
@@ -67,7 +67,7 @@ def test_compiled_it_is_what_one_does_by_hand(given):
     found = given_to(merging._interleaved_on_the_host, samples, layers)
     for values, expected in zip(found, by_hand(samples, layers), strict=True):
         np.testing.assert_array_equal(values, expected)
-    assert found[2].dtype == np.result_type(*(s.depth for s in samples))
+    assert found[1].dtype == np.result_type(*(s.depth for s in samples))
 
 
 @pytest.mark.parametrize("target", ["numpy", TORCH[0]])
@@ -75,11 +75,10 @@ def test_compiled_it_is_what_one_does_by_hand(given):
 @given(given=parts())
 def test_in_array_code_it_is_what_one_does_by_hand(target, given):
     samples, layers = given
-    part, row, *others = given_to(merging._interleaved, samples, layers, target)
+    row, *others = given_to(merging._interleaved, samples, layers, target)
     expected = by_hand(samples, layers)
-    for values, own in zip((part, row), expected[:2], strict=True):
-        np.testing.assert_array_equal(values, own)
-    for values, own, empty in zip(others, expected[2:], (0, -1), strict=True):
+    np.testing.assert_array_equal(row, expected[0])
+    for values, own, empty in zip(others, expected[1:], (0, -1), strict=True):
         np.testing.assert_array_equal(np.where(row >= 0, values, empty), own)
 
 
@@ -118,7 +117,7 @@ def test_every_sample_named_is_one_of_its_part_in_its_cell(given):
         [layer] = np.flatnonzero(own.row[:, y, x] == found.row[k, y, x] - numbers[found.part[k, y, x]])
         np.testing.assert_array_equal(ids[found.row[k, y, x]], own.ids[own.row[layer, y, x]])
         assert found.depth[k, y, x] == own.depth[layer, y, x]
-    np.testing.assert_array_equal(found.part, by_hand(samples, layers)[0])
+    np.testing.assert_array_equal(found.row, by_hand(samples, layers)[0])
 
 
 @PROPERTIES
@@ -197,5 +196,5 @@ def test_the_unit_of_depth_does_not_matter(given, exponent):
 
 def test_in_array_code_the_unit_of_depth_does_not_matter():
     rows, depths = (x.reshape(2, 1, 1, 1) for x in (np.array([-1, 0]), np.array([0, 2**24], np.float32)))
-    part, row, depth = (x.item() for x in merging._interleaved(1, [1, 1], *rows, *depths))
-    assert (part, row, depth) == (1, 0, 2**24)
+    row, depth = (x.item() for x in merging._interleaved(1, [1, 1], *rows, *depths))
+    assert (row, depth) == (1, 2**24)

@@ -443,4 +443,4 @@ def test_bad_budgets_are_refused(change, said):
 def test_colours_of_kinds_are_distinct():
     used = [color for _, color in KINDS.values() if color is not None]
     names = [name for name, color in KINDS.values() if color is not None]
-    assert len(set(used)) == len(used) == len(set(names)) >= 12
+    assert len(set(used)) == len(used) == len(set(names)) >= 11

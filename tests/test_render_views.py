@@ -11,8 +11,8 @@ from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
 from rts.scene.row_cameras import RowCameras
 from rts.shading.shaders import Lambert
-from rts.splatting import side_by_side
-from rts.splatting.side_by_side import Picture
+from rts.views import picture as side_by_side
+from rts.views.picture import Picture
 
 pytestmark = pytest.mark.rendering
 

@@ -41,8 +41,8 @@ LOOPS = [
     Defect(
         "merging takes the deeper part first",
         "rts/sampling/merging_loops.py",
-        "own_depth[b] < depth[a]",
-        "own_depth[b] > depth[a]",
+        "not z < depth[k, y, x]",
+        "z < depth[k, y, x]",
         "merging_invariants rendering",
     ),
     Defect(

@@ -27,13 +27,11 @@ class Engine(Plugin):
         name: the name of its entry point.
         namespace: the array-API namespace of its arrays.
         differentiates: whether it has derivatives: `value_and_grad`, `jvp`, `jacobian` and `optimizer`.
-        branches: whether its compiled programs hold both functions of `choose`.
     """
 
     name: ClassVar[str]
     namespace: ClassVar[Any]
     differentiates: ClassVar[bool] = True
-    branches: ClassVar[bool] = False
 
     # ------------------------------------------------------------------------------------- methods of every framework
 
@@ -258,20 +256,6 @@ class Engine(Plugin):
         """
         return f(make())
 
-    def choose(self, which: Array, usual: Callable[[], Array], rare: Callable[[], Array]) -> Array:
-        """The result of `usual()` if `which` () bool is true, else that of `rare()`, arrays of one shape and dtype.
-
-        An engine that `branches` chooses when a compiled program runs; others have to know the value. For the gradient
-        `rare` may run again, so that programs need no room for its intermediate arrays where `usual` runs.
-
-        Raises:
-            EngineError: the value is traced, and the engine has no branches.
-        """
-        value = self.known(which)
-        if value is None:
-            raise EngineError(f"{self.name} has no branches in compiled programs; expected a value that is known")
-        return usual() if value else rare()
-
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
         """The gradient (N, C) of a function of rows (N, C) of which each value (N,) depends on its own row alone.
 
@@ -472,13 +456,11 @@ def _float64(engine: Engine) -> Array:
 _names: list[str] = []
 
 
-def load_engines() -> None:
-    """Load the engines whose framework has been imported, so that these frameworks accept the library's records."""
-    _imported()
+def load_engines() -> list[Engine]:
+    """The engines whose framework has been imported, loaded now if need be; broken ones are left out.
 
-
-def _imported() -> list[Engine]:
-    """The engines whose framework has been imported, loaded now if need be; broken ones are left out."""
+    Once they are loaded, these frameworks accept the library's records.
+    """
     if not _names:
         _names.extend(registry.plugins("rts.engines"))
     engines = []
@@ -504,7 +486,7 @@ def uncompiled(f: _F) -> _F:
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
         outside = f
-        for engine in _imported():
+        for engine in load_engines():
             outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 

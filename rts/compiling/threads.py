@@ -29,16 +29,9 @@ _In = TypeVar("_In")
 _Out = TypeVar("_Out")
 
 
-def _nothing() -> None:
-    pass
+_core = getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
+"""A function that returns the core that it is called on; None if the system does not know."""
 
-
-def _core_of_caller() -> Callable[[], int] | None:
-    """A function that returns the core that it is called on; None if the system does not know."""
-    return getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
-
-
-_core = _core_of_caller()
 _local = threading.local()
 
 
@@ -71,7 +64,7 @@ class _Job:
         """Claim the job so that nobody does it, and release its arrays. False if it is claimed already."""
         mine = self.claim()
         if mine:
-            self.work = _nothing
+            self.work = lambda: None
         return mine
 
     def run(self) -> None:

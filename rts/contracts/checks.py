@@ -38,6 +38,11 @@ class CheckedPart(Part):
     cull: str = "none"
 
     @functools.cached_property
+    def read(self) -> dict[str, Tree]:
+        """The entries of θ that the surface reads."""
+        return {name: self.theta[name] for name in self.surface.reads(self.theta)}
+
+    @functools.cached_property
     def uniform(self) -> bool:
         """True if the shader promises one colour for all samples."""
         return promised(self.shader, "uniform")

@@ -176,9 +176,9 @@ class Request:
 
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are samples.
-        points: (M, 2) float64, x and y in cells from the grid's upper left corner: the only points to sample, in place
-            of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None for
-            centres.
+        points: (M, 2) float64, M > 0, x and y in cells from the grid's upper left corner: the only points to sample, in
+            place of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None
+            for centres.
         pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
             move.
         triangles: whether to record `Cells.triangle`.
@@ -286,22 +286,15 @@ class Sampled(_OnCells):
     @property
     def part(self) -> Array:
         """(K, H, W) int32, the part of the sample in each cell and layer, or −1."""
-        if self.one_part:
-            return _first_part(self.row)
         xp, first = namespace(self.row), 0
-        part = xp.astype(self.row >= 0, self.row.dtype) - 1
+        part = xp.clip(self.row, None, 0)
         for samples in self.samples[:-1]:
             first += samples.ids.shape[-2]
             part = part + xp.astype(self.row >= first, self.row.dtype)
         return part
 
 
-def _first_part(row: Array) -> Array:
-    """Part numbers (K, H, W) of the samples of a single part: 0, or −1 where `row` is −1."""
-    return namespace(row).clip(row, None, 0)
-
-
-@record(static=("border", "one_part", "opaque"))
+@record(static=("border", "opaque"))
 class Splats(_OnCells):
     """Shaded samples in their cells, the input of a splatter.
 
@@ -313,10 +306,7 @@ class Splats(_OnCells):
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
             channels, (N, C + 1): splatters are given three of them at a time, and alpha.
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
-        part: (K, H, W) int32, the part of each sample, or −1; None if unknown, or if all samples are of `one_part`.
-            See `parts`.
         border: cells at each side that splat into the image but are no part of it.
-        one_part: whether all samples are of one part.
         opaque: a promise that alpha is 1 at all samples.
         outlines: outlines between centres, if the splatter reads them; arrays of the positions' engine.
     """
@@ -324,13 +314,6 @@ class Splats(_OnCells):
     positions: Array
     rgba: Array
     cells: Cells
-    part: Array | None = None
     border: int = 0
-    one_part: bool = False
     opaque: bool = True
     outlines: Outlines | None = None
-
-    @property
-    def parts(self) -> Array | None:
-        """`part`, computed from `row` where all samples are of one part. None if parts are unknown."""
-        return _first_part(self.row) if self.part is None and self.one_part else self.part

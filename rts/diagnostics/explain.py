@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rts.advice.unread_entries import Observed, likely_name, shaded_by, unread
+from rts.advice.winding import INSIDE_OUT, is_inside_out
 from rts.arrays.engines import engine_of
 from rts.contracts.checks import CheckedPart, check_scene
 from rts.contracts.records import Samples
@@ -17,10 +19,8 @@ from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import Prepared
-from rts.sampling.winding import INSIDE_OUT, is_inside_out
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
-from rts.shading.unused_entries import Observed, likely_name, shaded_by, unread
 
 NO_PROMISE = (
     "its shader, a function, does not say whether light passes through it: all layers are kept, which takes two to "

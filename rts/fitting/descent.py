@@ -60,9 +60,10 @@ def descend(
     engine: Engine,
     method: Method,
     run: Run,
+    saving: Saving,
+    *,
     jit: bool,
     validation: Validation | None,
-    saving: Saving,
 ) -> None:
     """Minimise the loss by a first-order optimiser.
 
@@ -73,9 +74,9 @@ def descend(
         engine: their engine.
         method: the optimiser.
         run: takes note of each step, and says when to stop.
+        saving: keeps checkpoints, and gives the state to go on from.
         jit: True to compile.
         validation: the loss that decides; None where that of each step does.
-        saving: keeps checkpoints, and gives the state to go on from.
     """
     xp = engine.namespace
 

@@ -189,9 +189,11 @@ def fit(
                 if isinstance(reduced, Loss) and title == "lm":
                     own = fits and overrides(stage, "normal_equations", Residuals)
                     supersample = getattr(stage, "supersample", None)
-                    levenberg_marquardt(terms, parameters, engine, run, jit, reduced, own, supersample, saving)
+                    levenberg_marquardt(
+                        terms, parameters, engine, run, saving, jit=jit, loss=reduced, own=own, supersample=supersample
+                    )
                 else:
-                    descend(terms, reduced, parameters, engine, optimizer, run, jit, judge, saving)
+                    descend(terms, reduced, parameters, engine, optimizer, run, saving, jit=jit, validation=judge)
                 saving.write()
             except Astray as stop:
                 run.stop(str(stop))

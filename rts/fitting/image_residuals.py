@@ -32,15 +32,15 @@ from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
-from rts.rendering.batched import render_views
 from rts.rendering.image import render
 from rts.rendering.samples import sampled_scene
-from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
 from rts.sampling.prepared import Prepared
+from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
+from rts.views.render_views import render_views
 
 Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]

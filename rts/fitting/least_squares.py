@@ -139,11 +139,12 @@ def levenberg_marquardt(
     parameters: Tree,
     engine: Engine,
     run: Run,
+    saving: Saving,
+    *,
     jit: bool,
     loss: Loss,
     own: bool,
     supersample: int | None,
-    saving: Saving,
 ) -> None:
     """Minimise a loss of residuals by normal equations; `run` records the steps and keeps the result.
 
@@ -159,11 +160,11 @@ def levenberg_marquardt(
         parameters: where to start; a private copy.
         engine: the engine of the parameters.
         run: takes note of each step, and says when to stop.
+        saving: keeps checkpoints, and gives the state to go on from.
         jit: True to compile.
         loss: the loss of the residuals.
         own: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
         supersample: samples a pixel along each axis, for words on why the fit stopped; None if no images are fitted.
-        saving: keeps checkpoints, and gives the state to go on from.
 
     Raises:
         InputError: the terms are drawn in batches; or at the start the residuals do not depend on the parameters, or

@@ -5,7 +5,7 @@ Matrix units of some devices round float32 products to fewer bits. There, produc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,8 @@ import numpy as np
 from rts.arrays.engines import constants, engine_of, exemplar, namespace
 from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.operations.by_view import index_of_views, of_view, ranges_of_views, rows_in_views
-from rts.operations.operation import Arrays, Operation, Some
+from rts.operations.by_view import index_of_views, operation_of_views, ranges_of_views
+from rts.operations.operation import Operation
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -101,48 +101,5 @@ def _specification_of_views(rows: Array, points: Array, view: Array) -> Array:
     return terms[0] + terms[1] + terms[2] + own[..., 3]
 
 
-def _shape_of_views(rows: tuple[int, ...], points: tuple[int, ...], view: tuple[int, ...]) -> tuple[int, ...]:
-    return points[0], rows[1]
-
-
-def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
-    """For each view its index, the slice of its points, and its operands of `AFFINE`."""
-    rows, points, view = operands
-    if rows.shape[2] != 4 or points.shape != (len(view), 3):
-        shapes = ", ".join(str(x.shape) for x in operands)
-        raise InputError(f"rows, points and view have shapes {shapes}; expected (B, R, 4), (N, 3) and (N,)")
-    for b, own in ranges_of_views(view, len(rows)):
-        yield b, own, (rows[b], points[own])
-
-
-def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
-    out[rows_in_views(operands[2]) :] = 0
-    for _, own, given in _each_view(operands):
-        AFFINE.forward(given, out[own])
-
-
-def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    out[rows_in_views(operands[2]) :] = 0
-    for b, own, given in _each_view(operands):
-        AFFINE.push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
-
-
-def _pull_of_views(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    for b, own, given in _each_view(operands):
-        AFFINE.pull(given, g[own], [of_view(results[0], b), of_view(results[1], own)])
-
-
-VIEWS = Operation(
-    "rts.affine_of_views",
-    _specification_of_views,
-    ranks=(3, 2, 1),
-    shape=_shape_of_views,
-    forward=_forward_of_views,
-    push=_push_of_views,
-    pull=_pull_of_views,
-    differentiable=2,
-    packed=(1, 2),
-    packed_result=True,
-    used=lambda operands: rows_in_views(operands[2]),
-)
+VIEWS = operation_of_views("rts.affine_of_views", AFFINE, _specification_of_views, placed=False)
 """The operation of `affine_map_of_views`."""

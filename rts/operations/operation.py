@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
@@ -17,23 +16,7 @@ from rts.arrays.trees import Array
 from rts.compiling.threads import read_only
 from rts.errors import InputError, RtsError
 
-_SHAPED = ("shape",)
-"""Entry of `Operation._seen` that says that the first shape of a result has been checked."""
-
 _SHAPE = attrgetter("shape")
-
-
-SMALL = 4096
-"""Largest count of numbers in operands and result for which the specification checks a result without NaN."""
-
-
-class _Specifying(threading.local):
-    """`on` while a specification runs as a check. Operations inside it then run as array code, and compile nothing."""
-
-    on = False
-
-
-_specifying = _Specifying()
 
 
 def _listed(shapes: Iterable[tuple[int, ...]]) -> str:
@@ -83,7 +66,6 @@ class Operation:
             gradients.
         packed_result: whether the result has a row for each sample, too.
         used: (operands) → number of rows of the packed operands in use; None to rely on the engine.
-        even: the indices of packed operands whose rows are often all equal, which a compiling engine may exploit.
         keeps: whether `forward` returns an object that helps the derivatives at the same operands. `push` and `pull`
             then take a keyword `kept`: that object, or None if it is lost.
         sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). Otherwise it is called
@@ -101,12 +83,8 @@ class Operation:
     packed: tuple[int, ...] = ()
     packed_result: bool = False
     used: Callable[[Arrays], int] | None = None
-    even: tuple[int, ...] = ()
     keeps: bool = False
     sweeps: bool = False
-
-    _seen: set[tuple] = field(default_factory=set, init=False, repr=False)
-    """Dtype and parameters' names of calls whose first value has been checked; also `_SHAPED`."""
 
     @classmethod
     def of_loops(
@@ -164,7 +142,7 @@ class Operation:
             function = getattr(self, name)
             if not callable(function) and not (name == "used" and function is None):
                 raise InputError(f"{name} of the operation {self.name} is {quoted(function)}; expected a function")
-        for name in ("ranks", "packed", "even"):
+        for name in ("ranks", "packed"):
             object.__setattr__(self, name, self._integers(name))
         for name in ("packed_result", "keeps", "sweeps"):
             if type(getattr(self, name)) is not bool:
@@ -189,7 +167,7 @@ class Operation:
                 f"the operation {self.name} has {count} operands, by its ranks, of which the first "
                 f"{quoted(self.differentiable)} are to have derivatives; expected from 1 to {count}"
             )
-        for i in (*self.packed, *self.even):
+        for i in self.packed:
             if i >= count or self.ranks[i] < 1:
                 raise InputError(
                     f"the operation {self.name} has no operand {i} of packed rows; its ranks are {self.ranks}"
@@ -232,9 +210,9 @@ class Operation:
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
-        """True if compiled code takes operands of these NumPy dtypes; never while a specification runs as a check."""
+        """True if compiled code takes operands of these NumPy dtypes."""
         first = dtypes[0]
-        if _specifying.on or (first != np.float32 and first != np.float64):
+        if first != np.float32 and first != np.float64:
             return False
         for dtype in dtypes:
             if dtype != first and dtype.kind not in "iub":
@@ -253,15 +231,11 @@ class Operation:
             result = self.shape(*shapes, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("shape", shapes, error) from error
-        # Entries are checked once: the first shape shows their type.
-        if result.__class__ is tuple and _SHAPED in self._seen:
-            return result
         if type(result) is not tuple or not all(isinstance(n, (int, np.integer)) and n >= 0 for n in result):
             raise InputError(
                 f"shape of the operation {self.name} gives {quoted(result)} for operands of shapes {_listed(shapes)}; "
                 f"expected a tuple of integers of at least 0"
             )
-        self._seen.add(_SHAPED)
         return result
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
@@ -272,56 +246,13 @@ class Operation:
     def forward_on_host(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> Any:
         """Fill `out` with the value, and return the object that `forward` keeps for the derivatives.
 
-        The first value of each dtype and set of parameters is checked: `forward` must write all of it, and its shape
-        be the specification's, which is looked at if the value is small or has NaN.
-
         Raises:
-            InputError: `forward` cannot take the operands, or its first value fails the check.
+            InputError: `forward` cannot take the operands.
         """
-        seen = (out.dtype.char, *params)
-        first = seen not in self._seen and out.size > 0
-        if first:
-            out.fill(np.nan)
         try:
-            kept = self.forward(operands, out, **params)
+            return self.forward(operands, out, **params)
         except (TypeError, ValueError, IndexError) as error:
             raise self._refused("forward", list(map(_SHAPE, operands)), error) from error
-        if first:
-            self._look_at(operands, out, params)
-            self._seen.add(seen)
-        return kept
-
-    def _look_at(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> None:
-        """Raise an InputError if the value `out` lacks numbers that the specification has, or is of another shape.
-
-        No check is made where a value without NaN is large, where one with NaN has operands that are not finite, or
-        where the specification fails.
-        """
-        missing = np.isnan(out)
-        if missing.any():
-            if not all(np.isfinite(x).all() for x in operands if x.dtype == out.dtype):
-                return
-        elif out.size + sum(x.size for x in operands) > SMALL:
-            return
-        _specifying.on = True
-        try:
-            with np.errstate(all="ignore"):
-                expected = np.asarray(self.specification(*operands, **params))
-        except Exception:  # The specification may take arrays of other engines alone; its errors show where it is used.
-            return
-        finally:
-            _specifying.on = False
-        if expected.shape != out.shape:
-            raise InputError(
-                f"the operation {self.name} has a result of shape {out.shape}, by its `shape`, but its specification "
-                f"gives {expected.shape} for operands of shapes {_listed(map(_SHAPE, operands))}; make them agree"
-            )
-        missing &= ~np.isnan(expected)
-        if missing.any():
-            raise InputError(
-                f"forward of the operation {self.name} leaves {missing.sum()} of {out.size} numbers of its result NaN, "
-                f"or unwritten, where its specification has numbers; write them all, as in `out[...] = value`"
-            )
 
     def _refused(self, function: str, shapes: Sequence[tuple[int, ...]], error: Exception) -> Exception:
         """The error to raise after `function` failed: errors of the library as they are, others as `InputError`."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+from rts.advice.empty_images import why_empty
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import averaged
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
@@ -16,11 +17,10 @@ from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.samples import sampled_scene
-from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
-from rts.sampling.empty_images import why_empty
 from rts.sampling.prepared import Prepared
+from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image

@@ -10,9 +10,9 @@ from rts.arrays.trees import Array
 from rts.contracts.checks import changed_part, check_background, check_changes, check_channels
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_over
-from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.prepared import Prepared
+from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

@@ -9,14 +9,14 @@ from functools import partial
 from rts.arrays.engines import uncompiled
 from rts.contracts.checks import check_memory
 from rts.contracts.records import Request, Sampled
+from rts.outlines.of_scene import with_entries, with_outlines
 from rts.rendering.arguments import Layers, SamplerLike, SplatterLike
-from rts.rendering.outlines import with_entries, with_outlines
-from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.layer_count import with_all_layers
 from rts.sampling.merging import merge
 from rts.sampling.prepared import Prepared
 from rts.sampling.sample_checks import check_samples
+from rts.sampling.scene import Grid, Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from rts.contracts.checks import check_size, check_splatter, is_auto
 from rts.contracts.splatter import Splatter
 from rts.plugin_base import promised
-from rts.rendering.scene import Scene
 from rts.sampling.layer_count import TRACED_LAYERS, planned
+from rts.sampling.scene import Scene
 
 BAND = 2**20
 """Number of cells, over all layers, above which a supersampled image is rendered in bands of rows."""

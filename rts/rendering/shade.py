@@ -28,7 +28,7 @@ def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
     The samples' own G-buffer is taken, if they have one, where the surface's θ is constant and the G-buffer has all
     that the shader reads.
     """
-    theta = _read(part)
+    theta = part.read
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
@@ -44,11 +44,6 @@ def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
     return gbuffer
 
 
-def _read(part: CheckedPart) -> dict[str, Tree]:
-    """The entries of θ that a part's surface reads."""
-    return {name: part.theta[name] for name in part.surface.reads(part.theta)}
-
-
 def shaded_at_once(part: CheckedPart) -> bool:
     """True if a part's shader takes the samples of several views in one call, or gives one colour."""
     # The footprint of a sample depends on the camera of its view.
@@ -58,8 +53,7 @@ def shaded_at_once(part: CheckedPart) -> bool:
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
     """The θ that a part's shader sees; NumPy entries that the surface does not read become the engine's constants."""
-    reads = part.surface.reads(part.theta)
-    return {k: v if k in reads else context.constants(v) for k, v in part.theta.items()}
+    return {k: v if k in part.read else context.constants(v) for k, v in part.theta.items()}
 
 
 def add_footprint(
@@ -75,7 +69,7 @@ def add_footprint(
     Arguments are as in `uv_footprint`; `own` is its camera.
     """
     if "uv" in local and FOOTPRINT not in local:
-        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, _read(part), samples, local, own, grid, *context))
+        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, part.read, samples, local, own, grid, *context))
 
 
 def shade(

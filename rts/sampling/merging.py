@@ -31,16 +31,11 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         tables += [s.triangle for s in samples]
     sizes = tuple(s.ids.shape[0] for s in samples)
     on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
-    part, row, depth, *triangle = engine_of(tables).by_host(on_host, elsewhere, *tables)
-    xp, start = namespace(row), 0
-    for i, s in enumerate(samples):
-        row = xp.where(part == i, row + start, row) if start else row
-        start += s.ids.shape[0]
-    return Sampled(tuple(samples), Cells(row, depth, *triangle), overflow)
+    return Sampled(tuple(samples), Cells(*engine_of(tables).by_host(on_host, elsewhere, *tables)), overflow)
 
 
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
-    """Part, row within the part, depth, and triangle (K, H, W), merged from those of all parts; −1 in empty layers.
+    """Row, counted over all parts, depth, and triangle (K, H, W), merged from those of all parts; −1 in empty layers.
 
     Args:
         layers: K; fewer layers are returned if all parts together have fewer.
@@ -48,11 +43,13 @@ def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Arr
         *tables: the rows of all parts, then their depths, then their triangles. Without these, none are returned.
     """
     xp, count = namespace(tables[0]), len(sizes)
-    rows = tables[:count]
-    row, depth, *triangle = (xp.concat(tables[first : first + count]) for first in range(0, len(tables), count))
-    part = xp.concat([xp.where(r >= 0, i, r) for i, r in enumerate(rows)])
+    firsts = np.cumsum(sizes) - sizes
+    rows = [xp.where(r >= 0, r + int(first), r) for r, first in zip(tables, firsts, strict=False)]
+    row, depth, *triangle = (
+        xp.concat(x) for x in (rows, *(tables[n : n + count] for n in range(count, len(tables), count)))
+    )
     order = xp.argsort(xp.where(row >= 0, depth, xp.inf), axis=0, stable=True)[:layers]
-    return tuple(xp.take_along_axis(x, order, axis=0) for x in (part, row, depth, *triangle))
+    return tuple(xp.take_along_axis(x, order, axis=0) for x in (row, depth, *triangle))
 
 
 def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:
@@ -61,6 +58,7 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) 
     rows, depths = tables[:count], tables[count : 2 * count]
     shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
     dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
+    firsts = (np.cumsum(sizes) - sizes).tolist()
 
     def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         from rts.sampling import merging_loops
@@ -68,8 +66,9 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *tables: Array) 
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
-        return merging_loops.interleave(arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers)
+        own_rows, own_depths, triangles = (arrays[n : n + count] for n in (0, count, 2 * count))
+        return merging_loops.interleave(own_rows, own_depths, triangles, firsts, layers)
 
-    specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
+    specs = ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
     specs = specs if len(tables) == 2 * count else (*specs, ArraySpec(shape, np.int32))
     return engine_of(tables).call_host(host, specs, *tables)

@@ -24,7 +24,7 @@ def at_points(
     Returns:
         Fragments (K, 1, M).
     """
-    from rts.sampling import sheets_loops
+    from rts.sampling import points_loops
 
     line = np.floor(points[:, 1])
     line = np.where((line >= 0) & (line < size[0]), line, size[0]).astype(np.int64)
@@ -35,7 +35,7 @@ def at_points(
     arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size)
     faces = np.ascontiguousarray(proxy.faces, np.int32)
     vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-    sheets_loops.hits(*arguments, near_and_far(camera), kept_sign(camera, cull), vertices, faces, ids, weights, depth)
+    points_loops.hits(*arguments, near_and_far(camera), kept_sign(camera, cull), vertices, faces, ids, weights, depth)
     depth = np.where(ids >= 0, depth, 0).astype(np.float32)
     return Fragments(ids[:, None], weights[:, None], depth[:, None])
 
@@ -55,7 +55,7 @@ def kept_sign(camera: Camera, cull: str) -> float:
     """Sign of the determinant on screen of triangles to keep; 0 for both. A mirrored view or image reverses it."""
     p = camera.projection
     winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return float(winding) * {"back": -1.0, "front": 1.0, "none": 0.0}[cull]
+    return -float(winding) if cull == "back" else 0.0
 
 
 def pixel_widths(camera: Camera, size: tuple[int, int]) -> np.ndarray:

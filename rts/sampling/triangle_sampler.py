@@ -95,8 +95,7 @@ class TriangleSampler(Sampler):
             camera: NumPy float64 matrices; world is the proxy's local space.
             size: (height, width).
             layers: K.
-            cull: "none"; "back": ignore triangles whose normal (counter-clockwise winding) faces away; or "front":
-                ignore the others.
+            cull: "none", or "back" to ignore triangles whose normal (counter-clockwise winding) faces away.
 
         Returns:
             Fragments, front to back in each pixel; no layer follows an empty one.

@@ -187,21 +187,6 @@ class EngineConformance(Conformance):
                 result = chosen.to_numpy(function(chosen.constant(x), chosen.constant(row)))
             claim_close(result[:3], 2 * x[:3], 0, f"what by_rows_in_use gives{how}")
 
-    def test_functions_are_chosen_by_a_value(self, engine: Any) -> None:
-        """`choose` differentiates the function that its value names; in compiled programs, too, if it `branches`."""
-        chosen = _differentiating(engine)
-        xp, positive = chosen.namespace, np.abs(numbers(N, 3)) + 1
-
-        def f(x: Any) -> Any:
-            return chosen.choose(xp.sum(chosen.stop_gradient(x)) > 0, lambda: xp.sum(2 * x), lambda: xp.sum(x * x))
-
-        both = _both_ways(chosen, lambda x: chosen.value_and_grad(f)(x)[1])
-        for how, gradient in both if chosen.branches else both[:1]:
-            for value, expected in ((positive, 2 + 0 * positive), (-positive, -2 * positive)):
-                with owning(chosen), no_error(f"choose{how}"):
-                    slopes = chosen.to_numpy(gradient(chosen.constant(value)))
-                claim_close(slopes, expected, 1e-5, f"the gradient of what choose{how} gives")
-
     def test_compiled_functions_are_the_same(self, engine: Any) -> None:
         """`jit` of a function of a record returns the function's result; `block` returns its argument."""
         chosen = _instance(engine)

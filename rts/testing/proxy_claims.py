@@ -71,16 +71,12 @@ def claim_keys_tell_views(part: Part, surface: TriangleSurface) -> None:
         key = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
         proxy = surface.proxy(inputs, camera, size)
         other, before = first.setdefault(key, (view, proxy))
-        differing = [name for name in Proxy._fields if not np.array_equal(*_both(before, proxy, name))]
+        differing = [name for name in Proxy._fields if not np.array_equal(getattr(before, name), getattr(proxy, name))]
         claim(
             not differing,
             f"{' and '.join(differing)} of the triangles differ between {other} and {view}, but "
             + ("proxy_key is the same" if surface.depends_on_view else "there is no proxy_key"),
         )
-
-
-def _both(one: Proxy, other: Proxy, name: str) -> tuple[Any, Any]:
-    return getattr(one, name), getattr(other, name)
 
 
 def _at_corner(proxy: Proxy, i: int) -> Samples:

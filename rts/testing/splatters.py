@@ -10,7 +10,6 @@ import pytest
 
 from rts.contracts.checks import check_splatter
 from rts.contracts.records import Cells, Splats
-from rts.contracts.splatter import Splatter
 from rts.plugin_base import promised
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_close, no_error
@@ -40,7 +39,7 @@ class SplatterConformance(Conformance):
 
     def test_it_reads_what_there_is(self, splatter: Any) -> None:
         """`reads` names nothing but "outlines"."""
-        unknown = set(_instance(splatter).reads) - {"outlines"}
+        unknown = set(check_splatter(splatter).reads) - {"outlines"}
         claim(not unknown, f"reads names {sorted(unknown)}; expected 'outlines', or nothing")
 
     def test_a_constant_interior_stays(self, splatter: Any) -> None:
@@ -50,7 +49,7 @@ class SplatterConformance(Conformance):
             splats = everywhere(layers)
             image = _splat(splatter, splats.replace(rgba=np.broadcast_to(color, splats.rgba.shape)))
             claim(image.shape == (HEIGHT, WIDTH, 4), f"the image is {image.shape}; expected {(HEIGHT, WIDTH, 4)}")
-            r = _instance(splatter).reach
+            r = check_splatter(splatter).reach
             inside = image[r : HEIGHT - r, r : WIDTH - r]
             expected = np.broadcast_to(color, inside.shape)
             claim_close(inside, expected, TOLERANCE, f"a constant colour of {layers} layers")
@@ -61,19 +60,19 @@ class SplatterConformance(Conformance):
         rgba = splats.rgba.copy()
         rgba[splats.row[0].ravel()] = [1, 0, 0, 1]
         rgba[splats.row[1].ravel()] = [0, 1, 0, 1]
-        r = _instance(splatter).reach
+        r = check_splatter(splatter).reach
         image = _splat(splatter, splats.replace(rgba=rgba))[r : HEIGHT - r, r : WIDTH - r]
         claim_close(image, np.broadcast_to([1, 0, 0, 1], image.shape), TOLERANCE, "the color of a covered surface")
 
     def test_light_passes_through_translucent_layers(self, splatter: Any) -> None:
         """A splatter that promises to be `translucent` composites a front layer of alpha ½ over the one behind."""
-        if not promised(_instance(splatter), "translucent"):
+        if not promised(check_splatter(splatter), "translucent"):
             pytest.skip("the splatter does not promise to be translucent")
         splats = everywhere(LAYERS)
         rgba = splats.rgba.copy()
         rgba[splats.row[0].ravel()] = [0.5, 0, 0, 0.5]
         rgba[splats.row[1].ravel()] = [0, 1, 0, 1]
-        r = _instance(splatter).reach
+        r = check_splatter(splatter).reach
         image = _splat(splatter, splats.replace(rgba=rgba, opaque=False))[r : HEIGHT - r, r : WIDTH - r]
         claim_close(image, np.broadcast_to([0.5, 0.5, 0, 1], image.shape), TOLERANCE, "the colour of two layers")
 
@@ -85,7 +84,7 @@ class SplatterConformance(Conformance):
         row = np.full_like(splats.row, -1)
         row[:, 2, 3] = splats.row[:, 2, 3]
         image = _splat(splatter, splats.replace(row=row))
-        far, r = np.ones((HEIGHT, WIDTH), bool), _instance(splatter).reach
+        far, r = np.ones((HEIGHT, WIDTH), bool), check_splatter(splatter).reach
         far[max(0, 2 - r) : 3 + r, max(0, 3 - r) : 4 + r] = False
         claim((image[far] == 0).all(), f"a sample reaches beyond the cells that `reach` says, {r} on each side")
         own, most = image[2, 3, 3], image[..., 3].max()
@@ -119,7 +118,7 @@ class SplatterConformance(Conformance):
         """`cropped` returns the image that all cells splat into, those of the border too, with the border cut off."""
         whole = _splat(splatter, scattered())
         for border in (1, 2):
-            image = np.asarray(_instance(splatter).cropped(scattered().replace(border=border)))
+            image = np.asarray(check_splatter(splatter).cropped(scattered().replace(border=border)))
             expected = whole[border : HEIGHT - border, border : WIDTH - border]
             claim(image.shape == expected.shape, f"with border={border} it is {image.shape}; not {expected.shape}")
             claim_close(image, expected, TOLERANCE, f"the image with border={border}")
@@ -131,7 +130,7 @@ class SplatterConformance(Conformance):
         row = np.full((LAYERS, HEIGHT, WIDTH), -1, np.int32)
         given = derivatives.on(chosen, (np.zeros((0, 3)), np.zeros((0, 4)), row))
         with no_error(f"splat in {engine} with no rows, where nothing can be taken by index"):
-            image = chosen.to_numpy(_instance(splatter).splat(*given))
+            image = chosen.to_numpy(check_splatter(splatter).splat(*given))
         claim_close(image, np.zeros((HEIGHT, WIDTH, 4)), 0, f"the image of no rows in {engine}")
 
     # -------------------------------------------------------------------------------------- derivatives
@@ -157,7 +156,7 @@ class SplatterConformance(Conformance):
         chosen = differentiating(engine)
         for splats in (everywhere(LAYERS), scattered()):
             with no_error(f"splatting in {engine}"):
-                image = chosen.to_numpy(_instance(splatter).cropped(derivatives.on(chosen, splats)))
+                image = chosen.to_numpy(check_splatter(splatter).cropped(derivatives.on(chosen, splats)))
             claim_close(image, _splat(splatter, splats), TOLERANCE, f"the image in {engine}")
 
     def test_engines_agree(self, splatter: Any) -> None:
@@ -215,25 +214,17 @@ def _numbered(layers: int) -> np.ndarray:
     return np.arange(layers * HEIGHT * WIDTH, dtype=np.int32).reshape(layers, HEIGHT, WIDTH)
 
 
-def _instance(splatter: Any) -> Splatter:
-    return check_splatter(splatter)
-
-
 def _splat(splatter: Any, splats: Splats) -> np.ndarray:
-    return np.asarray(_instance(splatter).cropped(splats))
-
-
-def _direct(splatter: Any, splats: Splats) -> Any:
-    """The image by a direct call with arrays."""
-    return _instance(splatter).splat(splats.positions, splats.rgba, splats.row)
+    return np.asarray(check_splatter(splatter).cropped(splats))
 
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:
-    return lambda x: _direct(splatter, Splats(x[0], x[1], Cells(row)))
+    """The image by a direct call with arrays, as a function of a list of positions and colours."""
+    return lambda x: check_splatter(splatter).splat(x[0], x[1], row)
 
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
     """The image's derivative (h, w, 4), without border, when positions (N, 3) move along a direction (N, 3)."""
     given, d = derivatives.on(engine, (splats, [along]))
-    image = _instance(splatter).cropped
+    image = check_splatter(splatter).cropped
     return engine.to_numpy(engine.jvp(lambda x: image(given.replace(positions=x[0])), [given.positions], d)[1])

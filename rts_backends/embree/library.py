@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import ctypes.util
-import functools
 import glob
 import sys
 import threading
@@ -52,20 +51,28 @@ _device: int | None = None
 _first_use = threading.Lock()
 
 
-@functools.cache
-def find() -> str | None:
-    """Path or name of Embree 4's shared library, or None."""
+def _find() -> str:
     package = Path(embreex.__file__).parent
     patterns = {
         "darwin": [package / ".dylibs" / "libembree4*", package.parent / "embreex.dylibs" / "libembree4*"],
         "win32": [package.parent / "embreex.libs" / "embree4*.dll", package / "embree4*.dll"],
     }.get(sys.platform, [package.parent / "embreex.libs" / "libembree4*"])
     paths = [path for pattern in patterns for path in sorted(glob.glob(str(pattern)))]
-    return paths[0] if paths else ctypes.util.find_library("embree4")
+    found = paths[0] if paths else ctypes.util.find_library("embree4")
+    if found is None:
+        raise PluginError(
+            "the sampler 'embree' needs Embree 4's shared library, which wheels of the package embreex hold: "
+            "pip install --force-reinstall embreex, or install the system's libembree4"
+        )
+    return found
 
 
-def load() -> ctypes.CDLL | None:
-    """The library with its signatures, loaded once; None if it is missing.
+PATH = _find()
+"""Path or name of Embree 4's shared library. Without one this module, and so the sampler, cannot be imported."""
+
+
+def load() -> ctypes.CDLL:
+    """The library with its signatures, loaded once.
 
     Raises:
         PluginError: Embree gives no device.
@@ -73,10 +80,7 @@ def load() -> ctypes.CDLL | None:
     global _library, _device
     with _first_use:
         if _library is None:
-            path = find()
-            if path is None:
-                return None
-            library = ctypes.CDLL(path)
+            library = ctypes.CDLL(PATH)
             for name, (result, arguments) in _SIGNATURES.items():
                 function = getattr(library, name)
                 function.restype, function.argtypes = result, arguments
@@ -100,7 +104,6 @@ class Scene:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         library = load()
-        assert library is not None and _device is not None
         self._library, self.vertices, self.faces = library, vertices, faces
         self.handle = library.rtcNewScene(_device)
         library.rtcSetSceneFlags(self.handle, SCENE_ROBUST | SCENE_DYNAMIC)

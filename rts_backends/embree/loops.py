@@ -35,9 +35,9 @@ REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's sphere."""
 
 # Per ray: hits so far, pixel x, y, sign of determinants to keep, slack of depths and of the ray's end, depth where the
-# ray starts, the depths between which no plane clips, and `left_out` of `cast`.
-COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, REACH_SLACK, START, NEAREST, FARTHEST, LEFT_OUT = range(10)
-HEADER = 10
+# ray starts, and the depths between which no plane clips.
+COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, REACH_SLACK, START, NEAREST, FARTHEST = range(9)
+HEADER = 9
 
 
 def _intrinsic(definition: Callable[..., tuple]) -> Callable[..., Any]:
@@ -168,7 +168,7 @@ def _keep_nearest(arguments):
         step = ray[4] * ray[4] + ray[5] * ray[5] + ray[6] * ray[6]
         within = u > margin and v > margin and u + v < 1 - margin
         exact = not (within and along * along > GRAZING * GRAZING * normal * step)
-        if not exact and state[LEFT_OUT] * along > 0:
+        if not exact and state[KEEP] != 0 and along > 0:  # Seen from behind.
             return
     if exact:
         t = owners[cover]
@@ -190,7 +190,7 @@ def keep_nearest_address() -> int:
 
 @loop
 def cast(
-    first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
+    first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep,
     vertices, faces, owners, margins, width, height, points, triangle_ids, barycentrics, depths_out,
 ):  # fmt: skip
     """Fill the fragment arrays for tiles of pixels, or for pieces of the list `points`.
@@ -207,15 +207,14 @@ def cast(
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
         planes: (4,) depths: nothing nearer than the first or beyond the second is seen; between the others no plane
             clips.
-        keep: sign of the determinants of triangles to keep; 0 keeps both.
-        left_out: 1 to leave out triangles seen from behind, −1 from the front, 0 for none.
+        keep: sign of the determinants of triangles to keep, those seen from the front; 0 keeps all.
         vertices: (V, 3) of the proxy.
         faces: (T, 3).
         owners: see `Covers`.
         margins: (T,), see `Covers`.
         width: the image's width.
         height: the image's height.
-        points: (M, 2) x and y of the positions to cast rays through, NaN for none; empty for all H · W pixels' centres.
+        points: (M, 2) x and y of the positions to cast rays through; empty for all H · W pixels' centres.
         triangle_ids: (K, M or H · W) to fill.
         barycentrics: (K, M or H · W, 2) to fill.
         depths_out: (K, M or H · W) to fill.
@@ -247,13 +246,13 @@ def cast(
     radius = object_sphere[3]
     slack = SLACK * radius
     state[KEEP], state[DEPTH_SLACK], state[REACH_SLACK] = keep, slack, REACH_SLACK_SHARE * radius
-    state[NEAREST], state[FARTHEST], state[LEFT_OUT] = planes[2] + slack, planes[3] - slack, left_out
+    state[NEAREST], state[FARTHEST] = planes[2] + slack, planes[3] - slack
     for tile in range(first, last):
         pixels = _pixels(tile, across, width, height, points, at, xs, ys)
         for p in range(pixels):
             state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, xs[p], ys[p]
             x, y = xs[p] * 2 / width - 1, 1 - ys[p] * 2 / height
-            if not np.isnan(x) and _aim(ray_space, object_sphere, planes, x, y, ray, state):
+            if _aim(ray_space, object_sphere, planes, x, y, ray, state):
                 ray_bits[9], ray_bits[10], ray_bits[11] = -1, 0, 0
                 ray_bits[17], ray_bits[18], ray_bits[19] = -1, -1, -1
                 _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
@@ -301,7 +300,7 @@ def cast(
 
 @compiled
 def _pixels(tile, across, width, height, points, at, xs, ys):
-    """Fill in the positions of a tile of pixels, or of a piece of `points`: index of output, x (NaN for none), y.
+    """Fill in the positions of a tile of pixels, or of a piece of `points`: index of output, x, y.
 
     Returns the number of positions, at most TILE².
     """

@@ -1,20 +1,17 @@
 """Ray casting with Embree 4: the structure of a static mesh is built once, and only rays move.
 
-Embree's library is called directly, on shared buffers and from compiled loops on all cores. Where it cannot be found,
-the public interface of the package embreex is used instead, which is slower.
+Embree's library is called directly, on shared buffers and from compiled loops on all cores.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from rts import Camera, TriangleSampler
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
-from rts_backends.embree import embreex_fallback, library
 from rts_backends.embree.enlarged_triangles import Covers
+from rts_backends.embree.library import Scene
 from rts_backends.embree.loops import TILE, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
@@ -29,8 +26,7 @@ class Structure:
         self.proxy = _packed(proxy)
         self.sphere = bounding_sphere(self.proxy.vertices, self.proxy.faces)
         self.covers = Covers.of(self.proxy.vertices, self.proxy.faces, self.sphere)
-        embree = library if library.load() else embreex_fallback
-        self.scene = embree.Scene(self.covers.corners, self.covers.faces)
+        self.scene = Scene(self.covers.corners, self.covers.faces)
         self.refits = 0
 
     def move(self, proxy: Proxy) -> bool:
@@ -60,17 +56,13 @@ class Embree(TriangleSampler):
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        scene = prepared.scene
-        if isinstance(scene, embreex_fallback.Scene):
-            arguments = prepared.proxy, prepared.covers.owners, prepared.sphere, _planes(camera.projection)
-            return scene.cast(*arguments, camera, size, layers, cull)
         return _cast(prepared, camera, size, cull, np.empty((0, 2)), (layers, *size))
 
     def rasterize_points(
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
     ) -> Fragments | None:
-        """See `TriangleSampler.rasterize_points`: a ray for each point; the fallback casts none."""
-        if isinstance(prepared.scene, embreex_fallback.Scene) or not len(points):
+        """See `TriangleSampler.rasterize_points`: a ray for each point."""
+        if not len(points):
             return None
         return _cast(prepared, camera, size, cull, np.ascontiguousarray(points), (layers, 1, len(points)))
 
@@ -78,8 +70,7 @@ class Embree(TriangleSampler):
 def _cast(
     prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, points: np.ndarray, shape: tuple[int, ...]
 ) -> Fragments:
-    """Fragments of `shape` (K, ·, ·) at `points` (M, 2), none where NaN; at all pixels' centres if there are none."""
-    scene: Any = prepared.scene
+    """Fragments of `shape` (K, ·, ·) at `points` (M, 2); at all pixels' centres if there are none."""
     (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(points) // TILE**2) if len(points) else -(-height // TILE) * -(-width // TILE)
     flat = np.empty((shape[0], count), np.int32), np.empty((shape[0], count, 2), np.float32)
@@ -87,16 +78,15 @@ def _cast(
     parallel(
         cast,
         tiles,
-        scene.intersect,
+        prepared.scene.intersect,
         keep_nearest_address(),
-        scene.handle,
+        prepared.scene.handle,
         pixel_matrix(camera, size),
         -camera.view[2],
         np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
         prepared.sphere,
         _planes(camera.projection),
         facing(camera, cull),
-        {"back": 1.0, "front": -1.0, "none": 0.0}[cull],
         prepared.proxy.vertices,
         prepared.proxy.faces,
         prepared.covers.owners,

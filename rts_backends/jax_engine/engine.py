@@ -15,7 +15,7 @@ from rts.plugin_api.arrays import Tree
 from rts.plugin_api.checks import quoted
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
-from rts_backends.jax_engine import choice, host, operations, row_blocks
+from rts_backends.jax_engine import host, operations, row_blocks
 from rts_backends.jax_engine.used_rows import UsedRows
 
 for _cls, _split, _join in Engine.records():
@@ -58,7 +58,6 @@ class JaxEngine(Engine):
 
     name = "jax"
     namespace = jnp
-    branches = True
     _error: RtsError | None = None
 
     def __init__(self):
@@ -258,10 +257,6 @@ class JaxEngine(Engine):
         """`jax.checkpoint` of `f`. The result of `make` is kept, since tracing `make` would fix its arrays' shapes."""
         operand = make()
         return jax.checkpoint(lambda: f(operand))()
-
-    def choose(self, which: jax.Array, usual: Callable[[], jax.Array], rare: Callable[[], jax.Array]) -> jax.Array:
-        """See `Engine.choose`; all items of a batch take one branch: `usual` if `which` is true for all."""
-        return choice.choose(which, usual, rare)
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""

@@ -136,17 +136,17 @@ class _Differentiable:
         def valued(*shapes: tuple, **params: Any) -> list[tuple]:
             return [shape(*shapes[:inputs], **params), *[()] * operation.keeps]
 
-        even, noted = operation.even, operation.keeps
+        noted = operation.keeps
         ranks = *operation.ranks, *[0] * self._told
-        self._value = HostPrimitive(name, ranks, given, valued, self._host_value, self._plain, even, noted)
+        self._value = HostPrimitive(name, ranks, given, valued, self._host_value, self._plain, noted=noted)
         ranks = *ranks, *[0] * noted
         swept, backward = (*ranks, *(r + 1 for r in ranks[:varied])), (*ranks, self.rank + 1)
         self._push = HostPrimitive(
-            f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even, some=True
+            f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, some=True
         )
         own = tuple(i for i in operation.packed if i < varied)
         self._pull = HostPrimitive(
-            f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even, in_place=own
+            f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, in_place=own
         )
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
@@ -175,10 +175,7 @@ class _Differentiable:
         if operation.packed:
             used = int(given[self._inputs]) if operation.used is None else operation.used(operands)
             for i in operation.packed:
-                x = operands[i]
-                # Even operands may have a single row, which stands for all.
-                one = i in operation.even and len(x) == 1
-                operands[i] = np.broadcast_to(x, (used, *x.shape[1:])) if one else x[:used]
+                operands[i] = operands[i][:used]
         kept = _kept.get(int(given[self.count - 1])) if operation.keeps and len(given) >= self.count else None
         return operands, used, kept
 

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.extend.mlir.dialects import stablehlo as hlo
 from jax.interpreters import batching, mlir
 
 from rts_backends.jax_engine import host
@@ -31,7 +30,6 @@ class HostPrimitive:
         shapes: gives the shapes of the results, from those of the operands, both without B, and the parameters.
         host: (operands, results, **params), fills the results for one item, in NumPy.
         specified: (*operands, **params) → the results, in array code.
-        even: see `Operation`.
         noted: True if the last result is a note, () int32 (see `operations.py`).
         some: True if the operands after the samples are only those that a parameter `wanted` marks.
             Operands after the samples, tangents or gradients, have an axis T first, which a true parameter `single`
@@ -49,12 +47,12 @@ class HostPrimitive:
         shapes: Callable,
         host: Callable,
         specified: Callable,
-        even: tuple[int, ...],
+        *,
         noted: bool = False,
         some: bool = False,
         in_place: tuple[int, ...] = (),
     ):
-        self.name, self.ranks, self.samples, self._even, self._noted = name, ranks, samples, even, noted
+        self.name, self.ranks, self.samples, self._noted = name, ranks, samples, noted
         self._shapes, self._host, self._specified = shapes, host, specified
         self._some, self._in_place = some, in_place
         self.primitive = primitive = Primitive(f"rts_{name}")
@@ -108,18 +106,12 @@ class HostPrimitive:
             self._host(item, [x[b, ...] for x in results], **params)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
-        """The host call in a program for the CPU; an operand in `even` of equal rows is passed as one row."""
+        """The host call in a program for the CPU."""
         shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
-        values, avals = list(operands), list(ctx.avals_in)
-        for i in self._even:
-            row = _only_row(values[i]) if avals[i].ndim == self.ranks[i] and avals[i].shape[0] else None
-            if row is not None:
-                values[i], avals[i] = row, avals[i].update(shape=(1, *avals[i].shape[1:]))
-
         places = {}
         for i in self._in_place:
             at = sum(params["wanted"][:i])
-            if params["wanted"][i] and shapes[at].shape == (1, *avals[i].shape) and _read_once(values[i]):
+            if params["wanted"][i] and shapes[at].shape == (1, *ctx.avals_in[i].shape) and _read_once(operands[i]):
                 places[i] = at
         alike = set(places.values())
         own = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
@@ -131,7 +123,7 @@ class HostPrimitive:
         def filler(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
             self._on_host(operands, [x[None] if i in alike else x for i, x in enumerate(results)], params)
 
-        return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *values)
+        return mlir.lower_fun(call, multiple_results=True)(ctx, *operands)
 
     def _eager(self, *operands: Any, **params: Any) -> list[jax.Array]:
         device = _cpu_of(operands)
@@ -184,24 +176,6 @@ class HostPrimitive:
                 operands[i] = jnp.broadcast_to(x, (*lead, *own)).reshape(size * inner[0], *own)
         results = self(*operands, **params)
         return [x.reshape(*lead, *x.shape[1:]) for x in results], [0] * len(results)
-
-
-def _only_row(value: Any) -> Any:
-    """The first row of an array in a program about to be compiled; None unless the program shows that all are equal."""
-    ir, operation = mlir.ir, value.owner
-    name = getattr(operation, "name", "")  # An argument's owner has no name.
-    kind = ir.RankedTensorType(value.type)
-    shape = ir.RankedTensorType.get([1, *kind.shape[1:]], kind.element_type)
-    if name == "stablehlo.broadcast_in_dim":
-        operand, dims = operation.operands[0], [int(d) for d in operation.attributes["broadcast_dimensions"]]
-        if 0 in dims and ir.RankedTensorType(operand.type).shape[dims.index(0)] != 1:
-            return None
-        return hlo.broadcast_in_dim(shape, operand, mlir.dense_int_array(dims))
-    if name == "stablehlo.concatenate" and ir.IntegerAttr(operation.attributes["dimension"]).value > 0:
-        rows = [_only_row(operand) for operand in operation.operands]
-        if all(row is not None for row in rows):
-            return hlo.concatenate(rows, operation.attributes["dimension"])
-    return None
 
 
 def _read_once(value: Any) -> bool:

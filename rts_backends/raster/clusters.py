@@ -18,9 +18,6 @@ from rts.plugin_api.threads import parallel, read_only
 SIZE = 256
 """Triangles of a cluster, and vertices of a block; the last may have fewer."""
 
-FRONTS, BACKS = 1, 2
-"""Bits of a cluster: it may hold triangles whose determinant has the requested sign; or the opposite sign."""
-
 AROUND = 1e-9
 """Rounding error of a sum in float64, as a share of its terms: clusters this near to the view are kept."""
 
@@ -91,9 +88,8 @@ class Clusters(NamedTuple):
         # Positions more than a pixel outside of the image cannot be rounded into it.
         sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
         planes, rows = np.array(sums) @ matrix, matrix[[0, 1, 3]]
-        kept, sides = np.empty(self.boxes.shape[1], np.int32), np.empty(self.boxes.shape[1], np.uint8)
-        count = _find(self.boxes, self.cones, planes, rows, keep, FRONTS if keep else FRONTS | BACKS, kept, sides)
-        kept, used = kept[:count], np.empty(-(-len(self.vertices) // SIZE), np.int32)
+        kept, used = np.empty(self.boxes.shape[1], np.int32), np.empty(-(-len(self.vertices) // SIZE), np.int32)
+        kept = kept[: _find(self.boxes, self.cones, planes, rows, keep, kept)]
         return kept, used[: _use(kept, self.offsets, self.blocks, used)]
 
 
@@ -226,28 +222,24 @@ def _same(vertices, i, j):
 
 
 @loop
-def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
-    """Find clusters in view that may hold wanted triangles. Returns their number.
+def _find(boxes, cones, planes, rows, keep, kept):
+    """Find clusters in view that may hold requested triangles. Returns their number.
 
     Args:
         boxes: see `Clusters`.
         cones: see `Clusters`.
         planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
         rows: (3, 4) to homogeneous pixels (x, y, w).
-        keep: sign of the determinants of triangles of the bit FRONTS, the others have BACKS; 0 gives both bits to all.
-        wanted: bits, of which a cluster needs at least one.
+        keep: sign of the determinants of requested triangles; 0 for all.
         kept: (C,) int32, to be filled with the indices of the clusters, from the start.
-        sides: (C,) uint8, working memory.
     """
     # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
     q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
-    towards = keep * q0, keep * q1, keep * q2, keep * s
-    _test(boxes, cones, planes, towards, np.abs(rows), sides)
-    count = 0
-    for cluster in range(len(sides)):
-        some = sides[cluster]
+    seen, count = np.empty(len(kept), np.bool_), 0
+    _test(boxes, cones, planes, (keep * q0, keep * q1, keep * q2, keep * s), np.abs(rows), seen)
+    for cluster in range(len(seen)):
         kept[count] = cluster
-        count += (some & wanted) != 0
+        count += seen[cluster]
     return count
 
 
@@ -258,14 +250,14 @@ def _minor(rows, i, j, k):
 
 
 @compiled(inline="always")
-def _test(boxes, cones, planes, towards, rows, sides):
-    """Fill `sides` with the bits FRONTS and BACKS of each cluster; no bits if it is out of view.
+def _test(boxes, cones, planes, towards, rows, seen):
+    """Fill `seen` (C,): False for clusters out of view, and for those none of whose triangles is requested.
 
     `towards` are q (three numbers) and s, times `keep`: a triangle's determinant is n · (q + s a), for its corner a and
     normal n. `rows` (3, 4) are absolute values.
     """
     qx, qy, qz, s = towards
-    for cluster in range(len(sides)):
+    for cluster in range(len(seen)):
         x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
         x1, y1, z1 = np.float64(boxes[3, cluster]), np.float64(boxes[4, cluster]), np.float64(boxes[5, cluster])
         x, y, z, dx, dy, dz = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2, (x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2
@@ -285,7 +277,7 @@ def _test(boxes, cones, planes, towards, rows, sides):
         spread = across * np.sqrt(1 - cosine * cosine + AROUND) + abs(s) * np.sqrt(dx * dx + dy * dy + dz * dz)
         # For the normal farthest from the cone's axis.
         sure = (abs(along) * cosine - spread) * least > noise
-        sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
+        seen[cluster] = ~out & ~(sure & (along <= 0))
 
 
 @loop

@@ -15,8 +15,6 @@ branches, so that they compile to vector instructions and no jump is mispredicte
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -72,33 +70,15 @@ class Raster(TriangleSampler):
     def arrange(self, prepared: Any) -> Any:
         """See `TriangleSampler.arrange`: `Clusters` of a proxy of at least `MANY` triangles; else `prepared` itself.
 
-        A subclass that overrides a method that draws gets `prepared` itself, too.
+        A subclass that overrides `rasterize`, which may expect a `Proxy`, gets `prepared` itself, too.
         """
         many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
-        draws = self._draws
-        return Clusters.of(prepared) if many and draws else prepared
+        return Clusters.of(prepared) if many and type(self).rasterize is Raster.rasterize else prepared
 
     def rasterize(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, cull: str
     ) -> Fragments:
-        """See `TriangleSampler.rasterize`."""
-        with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
-            return mesh.draw(mesh.select(), layers)
-
-    @property
-    def _draws(self) -> bool:
-        """True unless a subclass overrides `rasterize`, which may expect a `Proxy`."""
-        return type(self).rasterize is Raster.rasterize
-
-    @contextmanager
-    def _seen(
-        self,
-        prepared: Proxy | Clusters,
-        camera: Camera,
-        size: tuple[int, int],
-        keep: float,
-    ) -> Iterator[_Seen]:
-        """Lend a mesh as a camera sees it, whose arrays are scratch memory kept from call to call.
+        """See `TriangleSampler.rasterize`.
 
         Drawn repeatedly, a mesh touches the same pages of memory, which the system clears only once. The memory has
         room for every vertex and triangle, but unused pages are never touched.
@@ -111,8 +91,9 @@ class Raster(TriangleSampler):
             memory = scratch[1].pop()
         except IndexError:
             memory = np.empty(key[0], np.int32), np.empty((key[1], LISTED), np.int32)
-        yield _Seen(prepared, camera, size, keep, *memory)
+        fragments = _drawn(prepared, camera, size, layers, facing(camera, cull), *memory)
         scratch[1].append(memory)
+        return fragments
 
 
 class _List(NamedTuple):
@@ -133,69 +114,51 @@ class _List(NamedTuple):
     rows: np.ndarray
 
 
-class _Seen:
-    """A mesh as a camera sees it: vertices on screen, and the blocks of triangles that may be in view.
+def _drawn(
+    mesh: Proxy | Clusters,
+    camera: Camera,
+    size: tuple[int, int],
+    layers: int,
+    keep: float,
+    screen: np.ndarray,
+    rows: np.ndarray,
+) -> Fragments:
+    """Fragments (layers, H, W) of a mesh.
 
     Args:
         mesh: the mesh.
         camera: the camera.
         size: (height, width).
+        layers: K.
         keep: sign of the determinants of triangles to draw; 0 for both signs.
         screen: (V,) int32, memory for positions on screen.
-        listed: (T, LISTED) int32, memory for a list of triangles.
+        rows: (T, LISTED) int32, memory for a list of triangles.
     """
+    # With unsigned indices compiled code need not check for negative ones, which count from the end.
+    vertices, faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
+    matrix, (height, width) = pixel_matrix(camera, size), size
+    if isinstance(mesh, Clusters):
+        order, (blocks, used) = mesh.order, mesh.seen(matrix, size, keep)
+    else:
+        order = ALL_IN_ORDER
+        blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (faces, vertices))
+    step = (max(size) / 2 + 2) / float(LIMIT)
+    to_steps = np.diag([1 / step, 1 / step, 1, 1])
+    to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
+    parallel(_project, len(used), used, vertices, to_steps @ matrix, screen, work=4 * SIZE * len(used))
 
-    def __init__(
-        self,
-        mesh: Proxy | Clusters,
-        camera: Camera,
-        size: tuple[int, int],
-        keep: float,
-        screen: np.ndarray,
-        listed: np.ndarray,
-    ):
-        # With unsigned indices compiled code need not check for negative ones, which count from the end.
-        self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
-        self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
-        self.screen, self.listed, self.step = screen, listed, (max(size) / 2 + 2) / float(LIMIT)
-        if isinstance(mesh, Clusters):
-            self.order = mesh.order
-            self.blocks, used = mesh.seen(self.matrix, size, keep)
-        else:
-            self.order = ALL_IN_ORDER
-            self.blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (self.faces, self.vertices))
-        to_steps = np.diag([1 / self.step, 1 / self.step, 1, 1])
-        to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
-        parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
+    chunks, bands = -(-len(blocks) // PER_CHUNK), -(-height // BAND_ROWS)
+    # Threads should not write to neighbouring memory.
+    spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, bands), np.int64)
+    given = blocks, faces, vertices, screen, matrix, height, width, step, keep
+    parallel(_select, chunks, *given, (rows, spans, counts), work=10 * SIZE * len(blocks))
+    listed = _sorted(keep, order, rows, spans, counts)
 
-    def select(self) -> _List:
-        """A list of the triangles that may cover pixels' centres."""
-        chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
-        # Threads should not write to neighbouring memory.
-        spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, bands), np.int64)
-        triangles = self.blocks, self.faces, self.vertices, self.screen
-        given = *triangles, self.matrix, *self.size, self.step, self.keep
-        parallel(_select, chunks, *given, (self.listed, spans, counts), work=10 * SIZE * len(self.blocks))
-        return _sorted(self.keep, self.order, self.listed, spans, counts)
-
-    def draw(self, listed: _List, layers: int) -> Fragments:
-        """Fragments (layers, H, W) of the listed triangles in all pixels."""
-        fragments = _empty((layers, *self.size))
-        given = self.vertices, self.matrix, self.depth_row, self.size
-        parallel(draw, len(listed.turns), listed, *given, _flat(fragments))
-        return fragments
-
-
-def _flat(fragments: Fragments) -> tuple[np.ndarray, ...]:
-    """Writable views of ids (K, M), barycentrics (K, M, 2) and depths (K, M), the axes of cells flattened to M."""
-    triangle_ids, barycentrics, depth = fragments
-    layers, count = len(depth), depth[0].size
-    return triangle_ids.reshape(layers, count), barycentrics.reshape(layers, count, 2), depth.reshape(layers, count)
-
-
-def _empty(shape: tuple[int, ...]) -> Fragments:
-    numbers = np.empty((4, *shape), np.float32)  # One array instead of three: the system clears fewer pages.
-    return Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
+    numbers = np.empty((4, layers, height * width), np.float32)  # One array, not three: the system clears fewer pages.
+    ids, barycentrics, depth = numbers[0].view(np.int32), numbers[1:3].reshape(layers, -1, 2), numbers[3]
+    parallel(draw, bands, listed, vertices, matrix, -camera.view[2], size, (ids, barycentrics, depth))
+    shape = layers, height, width
+    return Fragments(ids.reshape(shape), barycentrics.reshape(*shape, 2), depth.reshape(shape))
 
 
 def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:

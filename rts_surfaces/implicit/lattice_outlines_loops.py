@@ -16,7 +16,7 @@ NARROW = 0.5
 """Least distance of two rays, as a share of a cell: nearer ones tell no more than one."""
 
 OUTSIDE = 0.1
-"""Largest share of the rise across an outline that the inner ray's level may lie above zero: the outline of triangles
+"""How far above zero the inner ray's level may lie, as a share of the rise across the outline: the outline of triangles
 is not quite that of interpolated levels."""
 
 DOWNHILL, FIRST_DOWN, GROWTH_DOWN, HALVINGS_DOWN = 6, 0.3, 1.5, 4

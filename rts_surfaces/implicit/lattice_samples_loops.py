@@ -65,9 +65,8 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
         ids: (N, 8) int32: the six ends of three edges, the cell, and its caps, see `marching_cubes.Triangles`.
         near: (N, 2), the first two barycentrics.
         points: (N, 6) int32, to be filled with the numbers of lattice points.
-        params: (N, 4), of which the barycentrics (3) are filled; or (N, 16), filled with the barycentrics, the weights
-            of the six values (6), the position (3), its motion for each unit of level (3), and the weighted sum of the
-            six values less the isovalue.
+        params: (N, 16), to be filled with the barycentrics (3), the weights of the six values (6), the position (3),
+            its motion for each unit of level (3), and the weighted sum of the six values less the isovalue.
         least: lower bound for the slope, by whose square motions are divided.
     """
     a, b, at, slope = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -82,8 +81,6 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
             else:
                 number_a, number_b = np.int64(band[1][row_a]), np.int64(band[1][row_b])
             points[n, 2 * k], points[n, 2 * k + 1] = number_a, number_b
-            if params.shape[1] == 4:
-                continue
             _place(number_a, shape, low, step, a)
             _place(number_b, shape, low, step, b)
             f_a, f_b = np.float64(values[row_a]), np.float64(values[row_b])
@@ -92,8 +89,6 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
                 at[i] += share * (a[i] + along * (b[i] - a[i]))
             params[n, 3 + 2 * k], params[n, 4 + 2 * k] = share * (1 - along), share * along
             level += share * ((1 - along) * (f_a - isovalue) + along * (f_b - isovalue))
-        if params.shape[1] == 4:
-            continue
         cell = np.int64(ids[n, 6])
         base = cell if band is None else np.int64(band[1][band[0][cell, 0]])
         _slope(values, band, cell, base, at, shape, low, step, ids[n, 7], slope)

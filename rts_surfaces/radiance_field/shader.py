@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from rts import Camera, GBuffer, InputError, Shader, engine_of, namespace
+from rts import GBuffer, InputError, Shader, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, constants, exemplar, unit
 from rts.plugin_api.checks import is_count, quoted
 from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
-from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
 from rts_surfaces.radiance_field.ndc import Ndc
 from rts_surfaces.radiance_field.network import check_network, radiance
-from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
 
 
 @dataclass(frozen=True)
@@ -61,13 +58,3 @@ class RadianceShader(Shader):
         color = in_chunks(lambda p, d: radiance(weights, p, d), self.chunk, points, direction)
         xp = namespace(color)
         return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
-
-    @staticmethod
-    def load(path: Path) -> RadianceField:
-        """See `rts.load_radiance_field`."""
-        return load_radiance_field(path)
-
-    @staticmethod
-    def volume_render(field: RadianceField, camera: Camera, size: tuple[int, int], **options: Any) -> VolumeImage:
-        """See `rts.volume_render`."""
-        return volume_render(field, camera, size, **options)

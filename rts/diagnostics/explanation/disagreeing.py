@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.diagnostics.explanation import variants
-from rts.diagnostics.explanation.baseline import nearest
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
@@ -26,8 +25,8 @@ LARGE_SHARE = 0.3
 """The share of the disagreement that pixels of a kind must hold to name a reason."""
 STRONG = 0.1
 """The share of the largest error of a pixel from which a pixel counts as disagreeing."""
-ALIKE = 0.5
-"""The least error of the baseline that tells a bias of the library, as a share of the scene's error."""
+WIDER = 2
+"""Pixels count as near a mask up to this many steps from it, along rows and columns."""
 AGAIN = 4
 """Samples a pixel, along each axis, that experiments take instead of one."""
 
@@ -153,27 +152,20 @@ def _constants(case: _Case, touched: Touched) -> None:
         case.findings += [f._replace(mask=mask, share=share) for f in constants]
 
 
-def _outlines(case: _Case, touched: Touched) -> None:
+def _splatter(case: _Case, touched: Touched) -> None:
     """Add a finding on the splatter if the one that suits the scene, in its place, makes the error much smaller."""
     splatter = case.subject.options.get("splatter", "auto")
     if case.subject.splats_as("auto"):
         return
     before = case.try_out(splatter="auto")
-    if before is not None:
-        told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
-        because = f"{told} lacks derivatives of outlines that 'auto' has"
-        advice = "Leave out splatter=."
-        case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
-
-
-def _transparent(case: _Case, touched: Touched) -> None:
-    """Add a finding on shaders that are not opaque, if the splatter that suits them makes the error much smaller."""
-    if case.subject.opaque or case.subject.splats_as("auto"):
+    if before is None:
         return
-    before, advice = case.try_out(splatter="auto"), "Leave out splatter=."
-    if before is not None:
-        because = "shaders are not opaque, but the splatter loses what shines through layers"
-        case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
+    if case.subject.opaque:
+        told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
+        kind, because = "outlines", f"{told} lacks derivatives of outlines that 'auto' has"
+    else:
+        kind, because = "transparent", "shaders are not opaque, but the splatter loses what shines through layers"
+    case.findings.append(Finding(kind, because, "Leave out splatter=.", case.strong(before), case.gained(before)))
 
 
 def _layers(case: _Case, touched: Touched) -> None:
@@ -196,19 +188,32 @@ def _layers(case: _Case, touched: Touched) -> None:
 
 
 def _bounded(case: _Case, touched: Touched) -> None:
-    """Add a finding on surfaces that bound near-singular derivatives, if much of the error is where bounds matter."""
+    """Add a finding on surfaces that bound near-singular derivatives, if much of the error is where bounds matter.
+
+    Pixels near these places are then explained.
+    """
+    from scipy.ndimage import binary_dilation
+
     if all(part.surface.unbounded() is None for part in case.subject.parts):
         return
     change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
     mask = change > STRONG * max(np.abs(case.number.true).max(), np.abs(case.pushed).max())
-    _by_pixels(
-        case,
-        mask,
-        "bounded",
+    if not mask.any():
+        return
+    near: Any = binary_dilation(mask, iterations=WIDER)
+    energy = case.error.energy
+    held = float(energy[near].sum() / max(energy.sum(), 1e-30))
+    if held < LARGE_SHARE:
+        return
+    because = (
         "field values at the ends of lattice edges are so nearly alike there that crossings move without bound; the "
-        "surface bounds their derivative",
-        "Smooth the field, or take motion='normal' or near_singular='drop'.",
+        "surface bounds their derivative"
     )
+    advice = "Smooth the field, or take motion='normal' or near_singular='drop'."
+    share = held * case.error.norm**2 / case.whole.norm**2
+    case.findings.append(Finding("bounded", because, advice, near & case.strong(case.error), share))
+    case.left &= ~near
+    case.error = case.error.within(case.left)
 
 
 def _samples(case: _Case, touched: Touched) -> None:
@@ -232,72 +237,20 @@ def _each(count: int) -> str:
     return "one sample a pixel" if count == 1 else f"{count} × {count} samples a pixel"
 
 
-def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
-    """Add a finding of a `kind` if pixels near the mask hold much of the remaining error; these are then explained.
-
-    Args:
-        case: gains a finding, and loses these pixels from `left` and `error`; else it stays as it is.
-        mask: (H, W) bool; nothing is named if it is empty.
-        kind: a key of `KINDS`.
-        because: see `Finding`.
-        advice: see `Finding`.
-        widen: pixels count up to this many steps from the mask, along rows and columns.
-    """
-    from scipy.ndimage import binary_dilation
-
-    if not mask.any():
-        return
-    near: Any = binary_dilation(mask, iterations=widen) if widen else mask
-    energy = case.error.energy
-    held = float(energy[near].sum() / max(energy.sum(), 1e-30))
-    if held < LARGE_SHARE:
-        return
-    share = held * case.error.norm**2 / case.whole.norm**2
-    case.findings.append(Finding(kind, because, advice, near & case.strong(case.error), share))
-    case.left &= ~near
-    case.error = case.error.within(case.left)
-
-
-def _bias(case: _Case, touched: Touched) -> None:
-    """Add a finding on a bias of the library that a sphere or a box shows, too; else one of the kind "unknown".
-
-    Does nothing if other findings leave less than half of the error.
-    """
-    if case.findings and case.error.norm < HALVED * case.whole.norm:
-        return
-    off = _off(case.pushed, case.number.true)
-    mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
-    baseline = nearest(case.subject, case.number, touched.parts, case.options)
-    if baseline is not None:
-        theirs = _off(baseline.pushed, baseline.true)
-        ratio = f"{baseline.slope / baseline.difference:.2f}" if baseline.difference else "–"
-        told = f"{baseline.name} of this size, in this place, moved alike"
-        if theirs >= ALIKE * off:
-            because = (
-                f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
-                f"{theirs:.0%} (ratio {ratio})"
-            )
-            case.findings.append(Finding("bias", because, "More samples a pixel lessen it.", mask, share))
-            return
-        because = f"no experiment makes it agree; {told} is off by {theirs:.0%}, this by {off:.0%}"
-    else:
-        because = "no experiment makes it agree"
-    case.findings.append(Finding("unknown", because, "", mask, share))
-
-
-def _off(pushed: np.ndarray, true: np.ndarray) -> float:
-    a, b = low_pass(pushed), low_pass(true)
-    return float(np.linalg.norm(a - b) / max(np.linalg.norm(a), np.linalg.norm(b), 1e-30))
+def _unknown(case: _Case, touched: Touched) -> None:
+    """Add a finding of the kind "unknown", unless others leave less than half of the error."""
+    if not case.findings or case.error.norm >= HALVED * case.whole.norm:
+        mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
+        case.findings.append(Finding("unknown", "no experiment makes it agree", "", mask, share))
 
 
 EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _constants,
-    _transparent,
-    _outlines,
+    _splatter,
     _layers,
     _bounded,
     _samples,
-    _bias,
+    _unknown,
 )
 """Experiments, from the cheap and certain to the expensive; each adds findings to the case."""
 

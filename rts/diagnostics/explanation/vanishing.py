@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.advice.empty_images import out_of_view
 from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.checks import check_scene
 from rts.diagnostics.explanation import variants
@@ -15,7 +16,6 @@ from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched, listed_parts
 from rts.fitting.dependence import directions_in_words
-from rts.sampling.empty_images import out_of_view
 
 QUIET = 1e-4
 """The largest change of a pixel by a step that counts as none."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, namespace
-from rts.arrays.trees import Array, Tree
-from rts.contracts.gbuffer import GBuffer
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Array
 from rts.diagnostics.explanation.subject import Change
 from rts.registry import instance
 from rts.scene.camera import Camera
@@ -61,17 +60,6 @@ def farther(distance: float) -> Change:
         return parts, camera.replace(view=back @ camera.view)
 
     return moved
-
-
-def placed(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """The scene with each sample's world position as its colour."""
-
-    def place(theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        position = gbuffer["position"]
-        xp = namespace(position)
-        return xp.concat([position, xp.ones_like(position[:, :1])], axis=-1)
-
-    return [p.replace(shader=place) for p in parts], camera
 
 
 def all_of(*changes: Any) -> Change:

@@ -81,7 +81,6 @@ IMAGE = Operation(
     differentiable=2,
     packed=(0, 1),
     used=_used,
-    even=(1,),
     keeps=True,
     sweeps=True,
 )

@@ -41,7 +41,7 @@ def hits(corners, origins, directions, cull):
     across = np.cross(directions, b - c)
     determinant = across @ (a - c)
     # The determinant has the sign of the outward normal towards the viewer.
-    hit = {"back": determinant > 0, "front": determinant < 0, "none": determinant != 0}[cull]
+    hit = determinant > 0 if cull == "back" else determinant != 0
     determinant = np.where(hit, determinant, 1)
     from_c = origins - c
     first = np.sum(from_c * across, axis=-1) / determinant

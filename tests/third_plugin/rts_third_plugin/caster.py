@@ -20,7 +20,7 @@ class Caster(rts.TriangleSampler):
         left, total = np.where(sides == 0, edges @ TURN, sides) > 0, sides.sum(axis=-1)
         weights = sides / np.where(total == 0, 1, total)[..., None]  # Perspective-correct barycentrics.
         depth = (weights * camera.depth(vertices)[faces][:, None, None]).sum(axis=-1)
-        facing = {"none": total != 0, "back": total < 0, "front": total > 0}[cull]
+        facing = total < 0 if cull == "back" else total != 0
         hit = facing & (left.all(axis=-1) | ~left.any(axis=-1)) & (depth >= near) & (depth <= far)
         depth = np.concatenate([np.where(hit, depth, np.inf), np.full((layers, *size), np.inf)])
         order = np.argsort(depth, axis=0, kind="stable")[:layers]

@@ -6,7 +6,6 @@ Only the triangles are drawn view by view.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,16 +20,17 @@ from rts.contracts.checks import CheckedPart, check_memory
 from rts.contracts.records import ArraySpec, Cells, Fragments, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
-from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
 from rts.sampling.sample_checks import check_fragments
+from rts.sampling.scene import Grid, Scene
+from rts.sampling.tables import in_one_table
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
-from rts.splatting.side_by_side import Picture, outlines_side_by_side, renumbered
+from rts.views.picture import Picture, outlines_side_by_side, renumbered
 
 
 class Views(NamedTuple):
@@ -224,24 +224,6 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         outlines=outlines_side_by_side(found, picture, own_starts, shifts) if found else None,
     )
     return with_counts(sampled, picture, tuple(counts.T))
-
-
-def in_one_table(samples: Sequence[Samples]) -> Samples:
-    """Several samples of one part as one, with the cells of the first alone; `ids` become rows of a shared table."""
-    if len(samples) == 1:
-        return samples[0]
-    first, xp = samples[0], namespace(samples[0].ids)
-    shared = [name for name in first.tables if name not in first.by_sample]
-    tables = {name: xp.concat([s.tables[name] for s in samples]) for name in first.tables}
-    gbuffer = None
-    if first.gbuffer is not None:
-        gbuffer = {name: xp.concat([(s.gbuffer or {})[name] for s in samples]) for name in first.gbuffer}
-    ids, start = [first.ids], 0
-    for before, own in itertools.pairwise(samples):
-        start += before.tables[shared[0]].shape[0] if shared else 0
-        ids.append(own.ids + start)
-    ids, params = xp.concat(ids), xp.concat([s.params for s in samples])
-    return replace(first, ids=ids, params=params, tables=tables, gbuffer=gbuffer)
 
 
 def _is_plain(sampler: Any, part: CheckedPart) -> bool:

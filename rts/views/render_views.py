@@ -17,18 +17,18 @@ from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_of, over_background, seen, splatted
-from rts.rendering.outlines_of_views import with_outlines_of_views
-from rts.rendering.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.rendering.samples import sampled_scene
-from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
-from rts.rendering.splats import views_to_splats
 from rts.sampling.prepared import Prepared
+from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
-from rts.splatting.side_by_side import Picture, at_once
+from rts.views.outlines import with_outlines_of_views
+from rts.views.picture import Picture, at_once
+from rts.views.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
+from rts.views.splats import views_to_splats
 
 _T = TypeVar("_T")
 

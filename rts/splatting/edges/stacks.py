@@ -123,13 +123,13 @@ def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ..
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
-    from rts.splatting import edges_stacks_loops as loops
+    from rts.splatting.edges import stacks_loops as loops
 
     parallel(loops.cells, len(out), *operands, out, work=10 * out.size)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    from rts.splatting import edges_stacks_loops as loops
+    from rts.splatting.edges import stacks_loops as loops
 
     positions, rgba, row, joined = operands
     none = read_only(np.empty((0, 3), out.dtype))
@@ -138,7 +138,7 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    from rts.splatting import edges_stacks_loops as loops
+    from rts.splatting.edges import stacks_loops as loops
 
     positions, rgba, row, joined = operands
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
@@ -223,8 +223,8 @@ class _Sides(NamedTuple):
     def motion(self, splats: Splats) -> Array:
         """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
 
-        As `rts.splatting.edges._beside_breaks` of opaque layers, whose own part of it, of the composites and of the
-        motion of breaks, is taken off.
+        As `_beside_breaks` of `rts.splatting.edges.splatter` for opaque layers, whose own part of it, of the
+        composites and of the motion of breaks, is taken off.
         """
         outlines, own, row = self.outlines, self.stack, splats.row
         xp, engine, (layers, height, width) = namespace(own.whole), engine_of(own.whole), row.shape

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from rts.advice.unread_entries import warn_of_unread
+from rts.advice.winding import warn_of_winding
 from rts.arrays.engines import Context, context_of_scene, is_traced
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
@@ -12,10 +14,8 @@ from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.prepared import Prepared
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.sampling.winding import warn_of_winding
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
-from rts.shading.unused_entries import warn_of_unread
 
 
 class Scene(NamedTuple):
@@ -48,7 +48,7 @@ class Scene(NamedTuple):
     @property
     def read(self) -> list[dict[str, Tree]]:
         """The entries of each part's θ that its surface reads."""
-        return [{name: part.theta[name] for name in part.surface.reads(part.theta)} for part in self.parts]
+        return [part.read for part in self.parts]
 
     @property
     def traced(self) -> bool:

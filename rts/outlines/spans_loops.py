@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.sampling.sheets_loops import corners_of, edge
+from rts.sampling.points_loops import corners_of, edge
 
 TINY = 1e-9
 """Shortest length of a span."""
@@ -39,7 +39,10 @@ SLACK = np.float32(0.01)
 
 @loop
 def wanted(first, last, part, joined, met, gaps):
-    """Fill `gaps` (2, H, W) bool: something is seen at one of both centres, and no sheet joins them; or `met` is 2."""
+    """Fill `gaps` (2, H, W) bool: something is seen at one of both centres, and no sheet joins them; or `met` is 2.
+
+    Then set `joined`, where it was True if a sheet joins both centres: one part is seen at both.
+    """
     height, width = part.shape
     for y in range(first, last):
         for x in range(width):
@@ -47,6 +50,8 @@ def wanted(first, last, part, joined, met, gaps):
             across = x + 1 < width and (seen or part[y, x + 1] >= 0) and not joined[0, y, x]
             below = y + 1 < height and (seen or part[y + 1, x] >= 0) and not joined[1, y, x]
             gaps[0, y, x], gaps[1, y, x] = across or met[0, y, x] == 2, below or met[1, y, x] == 2
+            joined[0, y, x] = seen and x + 1 < width and part[y, x + 1] == part[y, x]
+            joined[1, y, x] = seen and y + 1 < height and part[y + 1, x] == part[y, x]
 
 
 @loop

@@ -15,7 +15,7 @@ Beside breaks the colour inside also changes as far as the outline, see `_beside
 and the flux ∫ v · n J ds has no value: it is the derivative of the shares. ∇C, n and, in the flux, J are constants.
 
 Where light passes through, C and the colours on both sides of a break are composites of all layers there: see
-`rts.splatting.edges_stacks`.
+`rts.splatting.edges.stacks`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from rts.arrays.trees import Array, collected, map_leaves
 from rts.contracts.records import ArraySpec, Outlines, Splats
 from rts.contracts.splatter import SummingSplatter
 from rts.operations.operation import Operation
-from rts.splatting import edges_weights
 from rts.splatting.cells import check_rows, nothing, unpack
-from rts.splatting.edges_stacks import CELLS, Operands
-from rts.splatting.edges_weights import BORDER
+from rts.splatting.edges import weights as edges_weights
+from rts.splatting.edges.stacks import CELLS, Operands
+from rts.splatting.edges.weights import BORDER
 
 FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
 """The fields of outlines that the operation takes: those of one layer."""
@@ -46,7 +46,7 @@ class Edges(SummingSplatter):
     """Found edges: sharp inside, area averages at outlines. One layer suffices where all is opaque.
 
     Where light passes through, layers are composited, and each outline that is seen moves with its own layer; see
-    `rts.splatting.edges_stacks`.
+    `rts.splatting.edges.stacks`.
     """
 
     layers = 1

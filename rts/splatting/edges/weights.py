@@ -22,7 +22,7 @@ NOWHERE = np.empty((0, 2, 2))
 
 
 class _Weights(NamedTuple):
-    """The weights of colours and motions in the image, from outlines alone; see `rts.splatting.edges_loops`.
+    """The weights of colours and motions in the image, from outlines alone; see `rts.splatting.edges.weights_loops`.
 
     Attributes:
         shown: (B, 2) int32, the samples that tell colours before and behind breaks, or −1.
@@ -51,7 +51,7 @@ class _Weights(NamedTuple):
     @classmethod
     def of(cls, outlines: Outlines) -> _Weights:
         """The weights of outlines on the host."""
-        from rts.splatting import edges_loops as loops
+        from rts.splatting.edges import weights_loops as loops
 
         count, segments, gap = len(outlines.place), len(outlines.square), outlines.gap
         shown = np.where((outlines.rows >= 0) & (outlines.inner >= 0), outlines.inner, outlines.rows)
@@ -77,7 +77,7 @@ class _Weights(NamedTuple):
 
 def forward(operands: Arrays, out: np.ndarray) -> _Weights:
     """The value, and the weights, which the derivatives use again."""
-    from rts.splatting import edges_loops as loops
+    from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines = Outlines(*arrays)
@@ -91,7 +91,7 @@ def forward(operands: Arrays, out: np.ndarray) -> _Weights:
 
 def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | None) -> None:
     """The derivative of the value along tangents of positions and colours."""
-    from rts.splatting import edges_loops as loops
+    from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines = Outlines(*arrays)
@@ -118,7 +118,7 @@ def _add(
         jumps: constant colours; jumps, constant jumps and motions, see `edges_loops.add_segments`.
         out: (H, W, C).
     """
-    from rts.splatting import edges_loops as loops
+    from rts.splatting.edges import weights_loops as loops
 
     (rgba, positions, points), (steady, *at_breaks) = samples, jumps
     loops.add_segments(*_segments(outlines, weights, row), rgba, *at_breaks, out)
@@ -128,7 +128,7 @@ def _add(
 
 def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) -> None:
     """The gradients of positions and colours."""
-    from rts.splatting import edges_loops as loops
+    from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
     outlines, g = Outlines(*arrays), read_only(g)
@@ -189,7 +189,7 @@ def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[n
 
 def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:
     """(B, C) colours before breaks, less those behind."""
-    from rts.splatting import edges_loops as loops
+    from rts.splatting.edges import weights_loops as loops
 
     found = np.empty((len(weights.shown), rgba.shape[1]))
     loops.jumps(rgba, weights.shown, found)

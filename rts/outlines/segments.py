@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import Breaks
+from rts.outlines.gaps import Breaks
 
 
 class Segments(NamedTuple):
@@ -35,7 +35,7 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
 
     Outlines of one part do not cross. With `layered`, those of different parts may, since light passes through them.
     """
-    from rts.sampling import segments_loops as loops
+    from rts.outlines import segments_loops as loops
 
     height, width = breaks.joined.shape[1:]
     square, along, ends = loops.ends_of(breaks.gap, breaks.place, breaks.near, breaks.parts, height, width)

@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments, Proxy
-from rts.sampling.gaps import Fronts
+from rts.outlines.gaps import Fronts
 from rts.sampling.points import kept_sign, near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
@@ -21,21 +21,25 @@ class Gaps(NamedTuple):
         gap: (M, 3) int32, y and x of the first centre; 1 for a gap along a row, 0 along a column.
         rows: (H, W) int32, how many of them come before each centre of a row.
         columns: (W, H) int32, and of a column.
+        around: (H, W) int8, the cells of gaps and those beside; see `spans_loops.around`.
     """
 
     gap: np.ndarray
     rows: np.ndarray
     columns: np.ndarray
+    around: np.ndarray
 
     @classmethod
     def of(cls, marks: np.ndarray) -> Gaps:
         """The gaps that are marked (2, H, W), along rows and along columns."""
-        from rts.sampling import spans_loops
+        from rts.outlines import spans_loops
 
         (height, width), gap = marks.shape[1:], np.empty((np.count_nonzero(marks), 3), np.int32)
         rows, columns = np.empty((height, width), np.int32), np.empty((width, height), np.int32)
         spans_loops.number(marks, gap, rows, columns)
-        return cls(gap, rows, columns)
+        cells = np.zeros((height, width), np.int8)
+        spans_loops.around(gap, cells)
+        return cls(gap, rows, columns, cells)
 
 
 class Sheets(NamedTuple):
@@ -64,7 +68,7 @@ class Sheets(NamedTuple):
     @classmethod
     def of(cls, proxy: Proxy, camera: Camera, size: tuple[int, int], cull: str) -> Sheets:
         """The sheets of a proxy; `camera` holds host matrices, in its space, for images of `size`."""
-        from rts.sampling import sheets_loops, silhouettes_loops
+        from rts.outlines import sheets_loops, silhouettes_loops
 
         arrays = np.ascontiguousarray(proxy.vertices, np.float32), np.ascontiguousarray(proxy.faces, np.int32)
         vertices, faces = map(read_only, arrays)  # One type, for which loops are compiled once.
@@ -79,7 +83,7 @@ class Sheets(NamedTuple):
 
         `fronts` (H, W) are seen at centres; for `width` see `Oracle`.
         """
-        from rts.sampling import silhouettes_loops
+        from rts.outlines import silhouettes_loops
 
         mesh, count = (self.rows, self.vertices, self.faces), len(self.faces)
         own = self.clip[0], self.keep, self.seen, self.beyond, self.sides
@@ -90,7 +94,7 @@ class Sheets(NamedTuple):
 
         `fronts` (H, W) are seen at centres; for `met` see `meet`.
         """
-        from rts.sampling import sheets_loops
+        from rts.outlines import sheets_loops
 
         mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
         arguments = *map(read_only, fronts), own, *mesh, self.keep != 0, met, joined
@@ -98,11 +102,10 @@ class Sheets(NamedTuple):
 
     def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray]:
         """The spans of triangles on gaps, (N, 2) int32 and (N, 6): see `spans_loops.spans_of`."""
-        from rts.sampling import spans_loops
+        from rts.outlines import spans_loops
 
-        cells, close = np.zeros(gaps.rows.shape, np.int8), np.empty(len(self.seen), np.int8)
-        spans_loops.around(gaps.gap, cells)
-        parallel(spans_loops.close, len(close), self.seen, cells, close, work=3 * len(close))
+        close = np.empty(len(self.seen), np.int8)
+        parallel(spans_loops.close, len(close), self.seen, gaps.around, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
         own = self.faces, self.seen, self.sides, self.keep, close
         parallel(spans_loops.most_spans, count, *own, gaps.rows, gaps.columns, most, work=10 * count)
@@ -111,13 +114,13 @@ class Sheets(NamedTuple):
         begins = np.cumsum(most) - most
         names, spans = np.full((most.sum(), 2), -1, np.int32), np.empty((most.sum(), 6))
         mesh = self.rows, self.vertices, self.faces, self.clip, self.keep, self.seen
-        arguments = triangles, begins, *mesh, *gaps, names, spans
+        arguments = triangles, begins, *mesh, *gaps[:3], names, spans
         parallel(spans_loops.spans_of, len(triangles), *arguments, work=200 * len(names))
         return names, spans
 
     def at(self, triangle: np.ndarray, points: np.ndarray) -> tuple[Fragments, np.ndarray]:
         """Fragments (1, 1, M) of triangles (M,) at points (M, 2); slopes (M, 2) of depth along x and y, a cell."""
-        from rts.sampling import sheets_loops
+        from rts.outlines import sheets_loops
 
         count = len(triangle)
         weights, depth, slopes = np.empty((count, 2)), np.empty(count), np.empty((count, 2))
@@ -128,7 +131,7 @@ class Sheets(NamedTuple):
 
     def along(self, triangle: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Directions (M, 2), in the image, of the edges of triangles (M,) that are nearest to points (M, 2)."""
-        from rts.sampling import silhouettes_loops
+        from rts.outlines import silhouettes_loops
 
         found = np.empty((len(triangle), 2))
         arguments = triangle, points, self.rows, self.vertices, self.faces, found
@@ -141,7 +144,7 @@ _known: dict[int, tuple[weakref.ref, np.ndarray]] = {}
 
 def _beyond(faces: np.ndarray) -> np.ndarray:
     """`Sheets.beyond`; that of a read-only table that owns its memory is kept as long as the table."""
-    from rts.sampling import sheets_loops
+    from rts.outlines import sheets_loops
 
     kept, key = not faces.flags.writeable and faces.flags.owndata, id(faces)
     if kept and key in _known and _known[key][0]() is faces:

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import INNER, Breaks, Fronts, lines_of_crossing
-from rts.sampling.sheets import Gaps, Sheets
+from rts.outlines.gaps import INNER, Breaks, Fronts, lines_of_crossing
+from rts.outlines.sheets import Gaps, Sheets
 
 
 def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndarray) -> Breaks:
@@ -25,7 +25,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
         sheets: the triangles of each part.
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
-    from rts.sampling import spans_loops
+    from rts.outlines import spans_loops
 
     met = np.zeros((2, *fronts.part.shape), np.uint8)
     for own in sheets:
@@ -36,11 +36,7 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     gaps = np.empty_like(joined)
     parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, gaps, work=2 * fronts.part.size)
     gap, whole, numbers = _breaks_in(gaps, fronts, sheets)
-    # In one surface from centre to centre.
-    inside = fronts.part >= 0
-    joined[0, :, :-1] = inside[:, 1:] & (fronts.part[:, 1:] == fronts.part[:, :-1])
-    joined[1, :-1] = inside[1:] & (fronts.part[1:] == fronts.part[:-1])
-    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False
+    joined[1 - gap[:, 2], gap[:, 0], gap[:, 1]] = False  # Elsewhere one surface goes on from centre to centre.
     along = np.column_stack([gap[:, 2], 1 - gap[:, 2]])[:, None, :]
     points = gap[:, None, 1::-1] + 0.5 + numbers[:, :, None] * along
     near, slope = crossings(whole[:, 1], whole[:, 2:4], whole[:, 4:6], points[:, 0], sheets, width)
@@ -55,7 +51,7 @@ def _breaks_in(
     marks: np.ndarray, fronts: Fronts, sheets: Sequence[Sheets]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The breaks in the gaps that are marked (2, H, W): the gap of each (B, 3); and see `spans_loops.breaks`."""
-    from rts.sampling import spans_loops
+    from rts.outlines import spans_loops
 
     gaps = Gaps.of(marks)
     gap, count = gaps.gap, len(gaps.gap)
@@ -79,7 +75,7 @@ def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarr
 
     See `Sheets.spans`.
     """
-    from rts.sampling import spans_loops
+    from rts.outlines import spans_loops
 
     several = [own.spans(gaps) for own in sheets]
     parts = np.repeat(np.arange(len(several), dtype=np.int32), [len(names) for names, _ in several])

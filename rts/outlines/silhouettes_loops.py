@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling.loops import compiled, loop
-from rts.sampling.sheets_loops import corners_of, edge
+from rts.sampling.points_loops import corners_of, edge
 
 SLACK = 0.01
 """By how much edges are wider than these, against rounding, in cells."""

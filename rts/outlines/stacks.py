@@ -1,6 +1,6 @@
 """Breaks between stacks of layers that let light through: where a layer that is seen ends, or two cross.
 
-As `rts.sampling.spans`, of all layers that are seen in place of the fronts alone. Each change of the stack along a gap
+As `rts.outlines.spans`, of all layers that are seen in place of the fronts alone. Each change of the stack along a gap
 is a break of its own, which moves with the one layer that ends there, or with the two that cross.
 """
 
@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.sampling.gaps import INNER, Breaks, Fronts, Stacks
-from rts.sampling.sheets import Gaps, Sheets
-from rts.sampling.spans import crossings, spans_on, tangents
+from rts.outlines.gaps import INNER, Breaks, Fronts, Stacks
+from rts.outlines.sheets import Gaps, Sheets
+from rts.outlines.spans import crossings, spans_on, tangents
 
 
 def breaks_of_stacks(
@@ -49,7 +49,7 @@ def breaks_of_stacks(
 
 def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets], width: np.ndarray) -> np.ndarray:
     """Marks (2, H, W) of the gaps in which a layer may change: a silhouette meets them, or no sheet joins a layer."""
-    from rts.sampling import spans_loops
+    from rts.outlines import spans_loops
 
     size = layers.part.shape[1:]
     ends = Fronts(np.full(size, -1, np.int32), np.full(size, -1, np.int32), np.zeros(size))
@@ -75,7 +75,7 @@ def _changes(
     gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The changes of stacks along gaps; see `stacks_of_spans_loops.changes`."""
-    from rts.sampling import stacks_of_spans_loops as loops
+    from rts.outlines import stacks_loops as loops
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)
     begins, names, spans, parts = spans_on(gaps, sheets)

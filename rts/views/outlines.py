@@ -9,19 +9,13 @@ import numpy as np
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array, map_leaves
 from rts.compiling.threads import each
-from rts.rendering.outlines import (
-    Found,
-    Points,
-    at_centres,
-    found_in_views,
-    host_value,
-    inputs_of,
-    real_of,
-    taken_rows,
-)
-from rts.rendering.sampled_views import Sampling, Views, in_one_table, with_counts
-from rts.sampling.gaps import Fronts
-from rts.splatting.side_by_side import outlines_side_by_side
+from rts.outlines.found import Found
+from rts.outlines.gaps import Fronts
+from rts.outlines.of_scene import real_of
+from rts.outlines.points import Points, at_centres, found_in_views, host_value, inputs_of
+from rts.sampling.tables import in_one_table, taken_rows
+from rts.views.picture import outlines_side_by_side
+from rts.views.sampled_views import Sampling, Views, with_counts
 
 
 def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:

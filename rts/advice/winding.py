@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from rts.advice.empty_images import known_tree
 from rts.arrays.engines import stopped
 from rts.contracts.checks import CheckedPart
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
-from rts.sampling.empty_images import known_tree
 from rts.scene.camera import Camera
 
 FLAT = 1e-6

@@ -1,0 +1,78 @@
+"""The record of outlines as they are found on the host, before the samples of all parts are counted."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
+from rts.contracts.records import ArraySpec, Outlines
+
+
+class Found(NamedTuple):
+    """Outlines as they are found; see `Outlines`. Rows of zeros have no effect.
+
+    Attributes:
+        rows: (B, 6) int32, for each break the two last samples, the two that tell colours, and the pair, counted in
+            their part. Of K layers (B, 2 + K + 1): the two last samples, and those of the stack there.
+        parts: of the shape of `rows`, int32, their parts, or −1.
+        sides: (B, 2, K) int32, the stacks before and behind, as indices in that stack, or −1; (B, 2, 0) for one layer.
+        places: (B, K + 1) the places of the samples of the stack along the gap; (B, 0) for one layer.
+        left: () int32, number of breaks left out for want of room.
+    """
+
+    rows: Array
+    parts: Array
+    sides: Array
+    places: Array
+    place: Array
+    gap: Array
+    points: Array
+    near: Array
+    slope: Array
+    ends: Array
+    square: Array
+    ties: Array
+    side: Array
+    beyond: Array
+    corner: Array
+    pull: Array
+    joined: Array
+    left: Array
+
+    @staticmethod
+    def specs(most: int, size: tuple[int, int], real: Any, layers: int) -> list[ArraySpec]:
+        """Specs of outlines with at most so many breaks, each of which ends at most two segments."""
+        integers, ends, (width, entries, of_sides) = np.int32, 2 * most, columns(layers)
+        breaks = [ArraySpec((most, width), integers, packed=True)] * 2
+        breaks += [ArraySpec((most, 2, of_sides), integers, packed=True), ArraySpec((most, entries), real, packed=True)]
+        breaks += [ArraySpec((most,), real, packed=True), ArraySpec((most, 3), integers, packed=True)]
+        breaks += [ArraySpec((most, 2), real, packed=True), ArraySpec((most,), integers, packed=True)]
+        breaks += [ArraySpec((most, 2, 2), real, packed=True), ArraySpec((most, 2), np.bool_, packed=True)]
+        segments = [ArraySpec((ends, 2), integers, packed=True)] * 4
+        segments += [ArraySpec((ends, 2), real, packed=True), ArraySpec((ends, 4), real, packed=True)]
+        return [*breaks, *segments, ArraySpec((2, *size), np.bool_), ArraySpec((), integers)]
+
+    def outlines(self, rows: Array) -> Outlines:
+        """The outlines, with `rows` counted over all parts."""
+        last = rows[:, :2]
+        named = {"rows": last, "inner": rows[:, 2:4], "pair": rows[:, 4:]}
+        if self.sides.shape[-1]:
+            named = {"rows": last, "inner": last, "pair": 0 * last - 1, **self._stacks(rows[:, 2:])}
+        return Outlines(**{f.name: named.get(f.name, getattr(self, f.name, None)) for f in fields(Outlines)})
+
+    def _stacks(self, rows: Array) -> dict[str, Array]:
+        """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
+        xp, shape, there = namespace(rows), self.sides.shape, self.sides >= 0
+        first = engine_of(rows).constant(np.arange(shape[0], dtype=np.int32) * rows.shape[1], rows)[:, None, None]
+        at = xp.reshape(xp.where(there, first + self.sides, 0), (-1,))
+        stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, self.places))
+        return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
+
+
+def columns(layers: int) -> tuple[int, int, int]:
+    """The numbers of samples of a break, of those of its stack, and of layers on each side; see `Found`."""
+    return (6, 0, 0) if layers == 1 else (layers + 3, layers + 1, layers)

@@ -1,0 +1,201 @@
+"""Outlines of a sampled scene, and the samples beside them: where values are traced, by one call to the host."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.checks import CheckedPart
+from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
+from rts.contracts.surface import TriangleSurface
+from rts.outlines.found import Found, columns
+from rts.outlines.points import Points, at_centres, entry_of, found_in_views, host_value, on_host, proxy_inputs
+from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.tables import in_one_table, taken_rows
+from rts.sampling.triangle_sampler import TriangleSampler
+
+
+def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
+    """Samples at cells' centres with `Sampled.outlines` and the samples beside breaks.
+
+    Where light passes through, the outlines are those of all layers that it reaches; else those of the first layer.
+
+    Args:
+        sampled: the samples at centres.
+        scene: the scene.
+        grid: the cells.
+        capacity: `Request.capacity`. Where values are traced, there is room for a quarter as many breaks, or for 8 a
+            row and a column of the grid, if that is more, or for fewer if a shared table has no room for their samples.
+            `overflow` counts those beyond.
+
+    Warns:
+        InputWarning: a sampler cannot sample single points.
+    """
+    cells, known = sampled.cells, []
+    if all(scene.opaque):
+        sampled = replace(sampled, cells=cells.first(1))
+    for part, read, entry in zip(scene.parts, scene.read, scene.entries, strict=True):
+        # Functions of surfaces want the arrays that they are given.
+        known.append((part.transform, read, proxy_inputs(part) if entry is None else None))
+    inputs = stopped((known, scene.camera, grid.camera, sampled.cells))
+    traced = any(map(is_traced, leaves(inputs)))
+    if traced or all(map(has_sheets, scene.parts, scene.samplers)) or any(map(_batched, leaves(inputs))):
+        most = max(8 * sum(grid.size), (capacity or 0) // 4) if traced else None
+        found, more = _found_on_host(sampled, scene, grid, most, capacity, inputs)
+    else:
+        entered = [map_leaves(host_value, x) for *_, x in inputs[0]]
+        centres = at_centres(map_leaves(host_value, inputs[3]), sampled.samples)
+        (here,), more = found_in_views([Points.of(scene, grid, entered)], [centres])
+        specs = Found.specs(0, grid.size, real_of(scene), len(sampled.row))
+        arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
+        # Engines that compile eager operations anew for each shape pad them.
+        found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
+    xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
+    for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
+        count = own.ids.shape[-2]
+        rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
+        whole = in_one_table([own, extra])
+        if engine_of(whole.ids).padded(whole.ids):
+            whole = _without_gaps(whole, own, xp.where(found.parts == part, found.rows, -1))
+        samples.append(whole)
+        first += whole.ids.shape[-2]
+    outlines = found.outlines(rows)
+    overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
+    return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
+
+
+def _without_gaps(whole: Samples, own: Samples, beside: Array) -> Samples:
+    """Samples, those `own` of cells and then further ones, in which unused rows repeat one in use.
+
+    `beside` (B, R) holds the numbers of the further ones in use, or −1.
+    """
+    xp, count, constant = namespace(whole.ids), own.ids.shape[-2], engine_of(whole.ids).constant
+    rows = constant(np.arange(whole.ids.shape[-2], dtype=np.int32), whole.ids)
+    used, last = (xp.max(xp.concat([xp.reshape(x, (-1,)), 0 * rows[:1] - 1])) + 1 for x in (own.row, beside))
+    there = (rows < used) | ((rows >= count) & (rows < count + last))
+    return taken_rows(whole, xp.where(there, rows, xp.where(used > 0, 0, count)))
+
+
+def with_entries(scene: Scene, grid: Grid) -> Scene:
+    """The scene with prepared entries of parts whose triangles are not cheap, so that outlines make none anew.
+
+    The scene itself where values are traced, or several at once.
+    """
+    if not any(map(_is_dear, scene.parts)):
+        return scene
+    inputs = stopped((scene.read, [part.transform for part in scene.parts], grid.camera))
+    if any(is_traced(x) or _batched(x) for x in leaves(inputs)):
+        return scene
+    entries = []
+    for part, sampler, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
+        if entry is None and isinstance(sampler, TriangleSampler) and _is_dear(part):
+            camera = on_host(grid.camera.within(part.transform).for_size(grid.size))
+            entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), camera, grid.size)
+        entries.append(entry)
+    return scene._replace(entries=entries)
+
+
+def _found_on_host(
+    sampled: Sampled, scene: Scene, grid: Grid, most: int | None, capacity: int | None, inputs: Tree
+) -> tuple[Found, list[Samples]]:
+    """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
+    owners, layers = [_tables(own) for own in sampled.samples], sampled.row.shape[0]
+    # Where a break has a pair, its last sample is there once more.
+    rows = (columns(layers)[0] + 1) * (most or 0)
+    room = [_rooms(*own, rows, capacity) for own in zip(scene.parts, sampled.samples, strict=True)]
+
+    def host(*arrays: np.ndarray) -> list[np.ndarray]:
+        given = iter(arrays)
+        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
+        of_parts, whole, camera, cells = known
+        own_parts = zip(scene.parts, of_parts, strict=True)
+        parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
+        entered = [x for *_, x in of_parts]
+        points = Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
+        centres, count = at_centres(cells, sampled.samples), most
+        (found,), more = found_in_views([points], [centres], count)
+        while count and not all(map(_has_room, more, room)):
+            count //= 2
+            (found,), more = found_in_views([points], [centres], count)
+        arrays_of = []
+        for part, samples, tables in zip(parts, more, owners, strict=True):
+            known_of, kinds = _tables(samples), {kind for kind, _ in tables}
+            gbuffer = part.surface.evaluate(part.theta, replace(samples, asked=None)) if "gbuffer" in kinds else {}
+            arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
+        return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
+
+    operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
+    specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
+    for own, rooms in zip(owners, room, strict=True):
+        for (kind, name), x in own.items():
+            dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
+            count = rooms.get(name, rows) if kind == "tables" else rows
+            specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
+    results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
+    found = Found(*(next(results) for _ in Found._fields))
+    return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
+
+
+def real_of(scene: Scene) -> Any:
+    """The dtype of a scene's floating arrays."""
+    like = scene.context.like
+    return np.float32 if like is not None and floating_bits(like) == 32 else np.float64
+
+
+def _rooms(part: CheckedPart, samples: Samples, rows: int, capacity: int | None) -> dict[str, int]:
+    """The numbers of rows, by name, of tables that so many further samples of a part share."""
+    surface, names = part.surface, set(samples.tables) - set(samples.by_sample)
+    if not names or not isinstance(surface, TriangleSurface):
+        return {}
+    specs = surface.table_specs(rows, None if capacity is None else rows)
+    return {name: specs[name].shape[0] for name in names}
+
+
+def _has_room(samples: Samples, room: Mapping[str, int]) -> bool:
+    """True if tables have no more rows than there is room for."""
+    return all(samples.tables[name].shape[0] <= count for name, count in room.items())
+
+
+def _tables(samples: Samples) -> dict[tuple[str, str], Array]:
+    """The arrays of samples that have a row for each, by kind and name."""
+    return {
+        ("", "ids"): samples.ids,
+        ("", "params"): samples.params,
+        **{("tables", name): x for name, x in samples.tables.items()},
+        **{("gbuffer", name): x for name, x in (samples.gbuffer or {}).items()},
+    }
+
+
+def _with_tables(samples: Samples, arrays: dict[tuple[str, str], Array]) -> Samples:
+    """Samples with other arrays of `_tables`."""
+    of = {kind: {name: x for (own, name), x in arrays.items() if own == kind} for kind in ("", "tables", "gbuffer")}
+    gbuffer = None if samples.gbuffer is None else of["gbuffer"]
+    return replace(samples, **of[""], tables=of["tables"], gbuffer=gbuffer)
+
+
+def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
+    """The cells of a scene whose parts have got further rows behind their own."""
+    if sampled.one_part:
+        return replace(sampled.cells, triangle=None)
+    row, counts = sampled.row, [own.ids.shape[-2] for own in sampled.samples]
+    more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
+    shift = engine_of(row).constant(np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), row)
+    xp = namespace(row)
+    moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
+    return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)
+
+
+def _is_dear(part: CheckedPart) -> bool:
+    """True if making a part's triangles costs more than to compare their inputs."""
+    return isinstance(part.surface, TriangleSurface) and not part.surface.proxy_is_cheap
+
+
+def _batched(x: Array) -> bool:
+    """True for an array of which a transform maps over several values."""
+    value = value_of(x)
+    return value is not None and value.ndim != x.ndim

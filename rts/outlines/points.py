@@ -1,0 +1,317 @@
+"""A scene sampled at single points: its fronts there, the breaks between them, and the samples beside breaks."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, exemplar, stopped, value_of
+from rts.arrays.trees import Array, Tree, map_leaves
+from rts.compiling.threads import each
+from rts.contracts.checks import CheckedPart
+from rts.contracts.records import Cells, Fragments, Request, Samples
+from rts.contracts.surface import TriangleSurface
+from rts.errors import InputWarning, warn
+from rts.outlines.found import Found
+from rts.outlines.gaps import Breaks, Fronts, Oracle, find_breaks
+from rts.outlines.segments import joined
+from rts.outlines.sheets import Sheets
+from rts.outlines.spans import breaks_of_triangles
+from rts.outlines.stacks import breaks_of_stacks
+from rts.plugin_base import overrides
+from rts.registry import name_of
+from rts.sampling.points import pixel_widths
+from rts.sampling.sample_checks import check_samples
+from rts.sampling.scene import Grid, Scene, has_sheets
+from rts.sampling.tables import in_one_table, taken_rows
+from rts.sampling.triangle_sampler import TriangleSampler
+from rts.scene.camera import Camera
+
+
+def found_in_views(
+    views: Sequence[Points], layers: Sequence[Fronts], most: int | None = None
+) -> tuple[list[Found], list[Samples]]:
+    """Outlines of each view between what is seen at centres (K, H, W), of at most `most` breaks; samples of each part.
+
+    Samples of several views lie on triangles. They are one table for each part, view after view.
+    """
+    broken = each(lambda b: views[b].broken(layers[b], most), range(len(views)))
+    rows, samples = [np.full(own.parts.shape, -1, np.int32) for own in broken], []
+    for part in range(len(views[0].entries)):
+        asked = [own.parts == part for own in broken]
+        points = [own.points[here] for own, here in zip(broken, asked, strict=True)]
+        known = [own.triangles[here] for own, here in zip(broken, asked, strict=True)]
+        fragments = [view.on_sheets(part, *own) for view, *own in zip(views, points, known, strict=True)]
+        together = None
+        if None not in fragments:
+            together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
+        numbers = np.concatenate([own.numbers[here] for own, here in zip(broken, asked, strict=True)])
+        own, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
+        ends = np.cumsum([len(x) for x in points])
+        samples.append(own)
+        for own, here, number in zip(rows, asked, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
+            own[here] = number
+    return [view.found(own, at, samples) for view, own, at in zip(views, broken, rows, strict=True)], samples
+
+
+class _Broken(NamedTuple):
+    """Breaks, and the samples that they need. Host arrays.
+
+    Attributes:
+        breaks: the breaks.
+        parts: (B, R), the parts of samples, or −1.
+        points: (B, R, 2), where they are.
+        triangles: (B, R), on which they are; −1 where none is known.
+        numbers: (B, R), how many layers of the same part are in front; 0 where triangles are known.
+        sides: see `Found.sides`.
+        left: number of breaks left out.
+    """
+
+    breaks: Breaks
+    parts: np.ndarray
+    points: np.ndarray
+    triangles: np.ndarray
+    numbers: np.ndarray
+    sides: np.ndarray
+    left: int
+
+
+class Points:
+    """A scene that can be sampled at any point of a grid, part by part."""
+
+    def __init__(self, scene: Scene, grid: Grid, parts: list[tuple]):
+        """Take for each part its sampler, camera, entry and, where triangles tell all, sheets."""
+        self._scene, self._grid, self._parts = scene, grid, parts
+        self._width = pixel_widths(on_host(grid.camera).for_size(grid.size), grid.size)
+
+    @classmethod
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> Points:
+        """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
+        parts = []
+        for part, sampler, entry, own in zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True):
+            camera, sheets = grid.camera.within(part.transform), None
+            if isinstance(sampler, TriangleSampler):
+                host = on_host(camera.for_size(grid.size))
+                entry = entry or entry_of(part, sampler, own, host, grid.size)
+                if has_sheets(part, sampler):
+                    sheets = Sheets.of(entry.proxy, host, grid.size, part.cull)
+            parts.append((sampler, camera, entry, sheets))
+        return cls(scene, grid, parts)
+
+    @property
+    def entries(self) -> list[Any]:
+        """The prepared entry of each part."""
+        return [entry for _, _, entry, _ in self._parts]
+
+    def found(self, broken: _Broken, rows: np.ndarray, samples: list[Samples]) -> Found:
+        """Outlines from breaks, whose `_Broken.parts` are sampled in `rows` of `samples`; pairs are added to these."""
+        breaks, parts, points, _, _, sides, left = broken
+        layered = sides.shape[-1] > 0
+        if not layered:
+            pairs, of_pairs = self._pairs(breaks, samples)
+            rows, parts = np.concatenate([rows, pairs], axis=1), np.concatenate([parts, of_pairs], axis=1)
+        along = np.stack([breaks.gap[:, 2], 1 - breaks.gap[:, 2]], axis=1)
+        first = breaks.gap[:, 1::-1] + 0.5
+        place = ((breaks.place - first) * along).sum(-1)
+        places = ((points - first[:, None]) * along[:, None]).sum(-1)
+        entries = places[:, 2:] if layered else places[:, :0]
+        own = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
+        segments = joined(breaks, layered)
+        return Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
+
+    def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
+
+        They are added to the samples of parts. Triangles that stand for no field have no pairs.
+        """
+        part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
+        rows = np.full((len(part), 2), -1, np.int32)
+        for own, known in enumerate(self._parts):
+            at = np.flatnonzero(part == own)
+            surface, points, triangles = self._scene.parts[own].surface, breaks.points, breaks.triangles
+            drawn = isinstance(known[0], TriangleSampler)
+            if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
+                continue
+            chosen = at, breaks.near[at]
+            fragments = self.on_sheets(own, points[chosen], triangles[chosen]) if drawn else None
+            more = self.sample(own, points[chosen], fragments, pairs=True)
+            if more.pair is not None:
+                found = host_value(more.pair).T
+                rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
+            samples[own] = in_one_table([samples[own], more])
+        return rows, np.column_stack([part, part]).astype(np.int32)
+
+    def broken(self, layers: Fronts, most: int | None) -> _Broken:
+        """The breaks, at most so many, between what is seen at centres (K, H, W), and the samples that they need."""
+        breaks, *others = self._breaks(layers)
+        left = 0 if most is None else max(0, len(breaks.gap) - most)
+        if left:
+            breaks = Breaks(*(x if name == "joined" else x[:most] for name, x in breaks._asdict().items()))
+            others = [x[:most] for x in others]
+        return _Broken(breaks, *others, left)
+
+    def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """All breaks, and the other arrays of `_Broken`."""
+        sheets, opaque = [own for *_, own in self._parts if own is not None], np.array(self._scene.opaque)
+        known, count = len(sheets) == len(self._parts), len(layers.part)
+        if count == 1 and known:
+            breaks, stacks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width), None
+        elif known:
+            breaks, stacks = breaks_of_stacks(_lit(layers, opaque), opaque, sheets, self._width)
+        else:
+            oracle = Oracle(functools.partial(self._layers, count=count), self._width)
+            breaks, stacks = find_breaks(_lit(layers, opaque), oracle)
+        if count == 1 or stacks is None:
+            # For each break the two last samples, and the two that tell colours.
+            parts = np.concatenate([breaks.parts, breaks.parts], 1)
+            points = np.concatenate([breaks.points, breaks.inner], 1)
+            return breaks, parts, points, breaks.triangles, 0 * parts, np.empty((len(parts), 2, 0), np.int32)
+        parts = np.concatenate([stacks.last, stacks.parts], 1)
+        points = np.concatenate([breaks.points, stacks.points], 1)
+        triangles = np.concatenate([breaks.triangles[:, :2], stacks.triangles], 1)
+        return breaks, parts, points, triangles, stacks.numbers, stacks.sides
+
+    def on_sheets(self, part: int, points: np.ndarray, triangles: np.ndarray) -> Fragments | None:
+        """Fragments (1, 1, M) of a part at points (M, 2) on its triangles (M,); None if some are not known (−1)."""
+        sheets = self._parts[part][-1]
+        return sheets.at(triangles, points)[0] if sheets is not None and (triangles >= 0).all() else None
+
+    def of_layers(
+        self, part: int, points: np.ndarray, numbers: np.ndarray, fragments: Fragments | None
+    ) -> tuple[Samples, np.ndarray]:
+        """Samples of one layer of a part at each point (M, 2), given their `numbers` (M,); and their rows (M,)."""
+        most, count = numbers.max(initial=0), len(points)
+        samples = self.sample(part, points, fragments, layers=1 + most)
+        row = host_value(samples.row)[:, 0]
+        if not most:
+            return samples, row[0, :count]
+        row = row[numbers, np.arange(count)]
+        used, own = np.unique(row, return_inverse=True)
+        none = int(used[0] < 0)
+        used = used[none:].astype(np.int32) if len(used) > none else np.zeros(1, np.int32)
+        return taken_rows(samples, engine_of(samples.row).constant(used, samples.row)), own.reshape(-1) - none
+
+    def sample(
+        self,
+        part: int,
+        points: np.ndarray,
+        fragments: Fragments | None = None,
+        pairs: bool = False,
+        layers: int = 1,
+    ) -> Samples:
+        """Samples of a part at points (M, 2), with `fragments` (1, 1, M) if they are known."""
+        sampler, camera, entry, sheets = self._parts[part]
+        if not len(points) and (sheets is None or _refines(self._scene.parts[part])):
+            # Surfaces may want a ray at least; nothing names its sample.
+            points, fragments = np.full((1, 2), 0.5), None
+        if fragments is not None:
+            sampler = _OnTriangles(fragments)
+        request = Request(points=points, pairs=pairs, entry=entry)
+        samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, layers, request)
+        if "points" in samples.followed:
+            return samples
+        warn(
+            f"the sampler {name_of('rts.samplers', sampler)} does not sample single points, so that outlines lie midway"
+            f" between centres of pixels; use sampler='raster' or 'rays', or more samples a pixel",
+            InputWarning,
+        )
+        height, width = self._grid.size
+        x, y = (np.clip(np.floor(points[:, axis]), 0, count - 1) for axis, count in ((0, width), (1, height)))
+        at = (y * width + x).astype(np.int64)
+        check_samples(samples, (height, width), sampler)
+        found, depth = (host_value(z).reshape(len(z), -1)[:, at] for z in (samples.row, samples.depth))
+        constant = engine_of(samples.row).constant
+        number = np.where(found >= 0, np.arange(found.size).reshape(found.shape), -1)
+        taken = taken_rows(samples, constant(np.maximum(found, 0).reshape(-1).astype(np.int32), samples.row))
+        row = constant(number.astype(np.int32)[:, None], samples.row)
+        return taken.replace(row=row, depth=constant(depth[:, None], samples.depth))
+
+    def _layers(self, points: np.ndarray, count: int) -> Fronts:
+        """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
+        scene, none = self._scene, (count, len(points))
+        given = [part.theta for part in scene.parts], self._grid.camera
+        more = engine_of(*given).room(len(points), exemplar(*given)) - len(points)
+        asked = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
+        part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
+        for index, opaque in enumerate(scene.opaque):
+            samples = self.sample(index, asked, layers=1 if opaque else count)
+            row, z = (host_value(x)[:, 0, : len(points)] for x in (samples.row, samples.depth))
+            part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
+            depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])
+            order = np.argsort(depth, axis=0, kind="stable")[:count]
+            part, depth = (np.take_along_axis(x, order, 0) for x in (part, depth))
+        return _lit(Fronts(part, np.full(none, -1, np.int32), depth), np.array(scene.opaque))
+
+
+def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
+    """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
+    part = np.minimum(cells.row, np.int32(0))
+    for first in np.cumsum([own.ids.shape[-2] for own in samples])[:-1]:
+        part += cells.row >= first
+    triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
+    assert cells.depth is not None
+    return Fronts(part, triangle, cells.depth.astype(np.float64))
+
+
+def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
+    """The surfaces seen at points (K, ...), without what lies behind an opaque layer."""
+    part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
+    for own in part:
+        own[hidden] = -1
+        hidden |= (own >= 0) & opaque[own]
+    return layers._replace(part=part, depth=np.where(part >= 0, layers.depth, 0.0))
+
+
+def _refines(part: CheckedPart) -> bool:
+    """True if samples on a part's triangles pass through its surface."""
+    return isinstance(part.surface, TriangleSurface) and part.surface.refines
+
+
+class _OnTriangles(TriangleSampler):
+    """A sampler of points whose triangles are known."""
+
+    def __init__(self, fragments: Fragments):
+        """Take the fragments (1, 1, M) at all points to come."""
+        self._fragments = fragments
+
+    def rasterize(self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
+        """Nothing but points is asked for."""
+        raise NotImplementedError
+
+    def rasterize_points(
+        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
+    ) -> Fragments:
+        """The fragments."""
+        return self._fragments
+
+
+def host_value(x: Array) -> np.ndarray:
+    """The value of an array, which is not traced."""
+    value = value_of(x)
+    assert value is not None
+    return value
+
+
+def on_host(camera: Camera) -> Camera:
+    """A camera that is not traced, with matrices on the host."""
+    return camera.map(lambda m: np.asarray(host_value(m), np.float64))
+
+
+def inputs_of(scene: Scene) -> list[Tree]:
+    """The inputs of the proxies of all parts, on the host; none of them is traced."""
+    return [map_leaves(host_value, proxy_inputs(part)) for part in scene.parts]
+
+
+def proxy_inputs(part: CheckedPart) -> Tree:
+    """The inputs of a part's proxy, without derivatives; None if it has no triangles."""
+    surface = part.surface
+    return stopped(surface.proxy_inputs(stopped(part.theta))) if isinstance(surface, TriangleSurface) else None
+
+
+def entry_of(part: CheckedPart, sampler: TriangleSampler, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Any:
+    """The part's prepared entry, with the inputs of its proxy, on the host."""
+    surface: Any = part.surface
+    return sampler.working_on(surface, inputs, camera, size, None, lambda known: known._replace(inputs=inputs))

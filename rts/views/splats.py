@@ -1,0 +1,150 @@
+"""From samples to splats, for several views: each part evaluated once, at the samples of all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rts.arrays.engines import Context, context_of, engine_of, namespace
+from rts.arrays.trees import Array
+from rts.compiling.threads import each
+from rts.contracts.checks import CheckedPart, check_splats
+from rts.contracts.records import Sampled, Splats
+from rts.operations.projection import projective_map_of_views
+from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
+from rts.rendering.splats import all_in_use, of_inputs, on_rays, owned, splats_of, together
+from rts.sampling.scene import Grid
+from rts.sampling.tables import in_one_table
+from rts.scene.camera import Camera
+from rts.scene.row_cameras import RowCameras
+from rts.views.sampled_views import Views
+
+
+def views_to_splats(
+    pictures: Sequence[Views],
+    parts: Sequence[CheckedPart],
+    cameras: Sequence[Camera],
+    context: Context,
+) -> list[Splats]:
+    """The splats of pictures of several views. They have no border: each view keeps its apron.
+
+    A surface is evaluated once, at the samples of all views, so that results for the whole of θ serve all. Shaders that
+    take views are called once, too; others are called view by view.
+
+    Args:
+        pictures: the samples of the views; pictures are of one size.
+        parts: checked parts.
+        cameras: the camera of each view, in order, which shaders see.
+        context: as in `to_splats`.
+    """
+    sampled = [picture.sampled for picture in pictures]
+    sampled = owned(sampled, sampled[0].row, context)
+    (height, width), border = pictures[0].picture.view, sampled[0].apron
+    grids = [Grid.around(camera, (height - 2 * border, width - 2 * border), border) for camera in cameras]
+    shown = [
+        _shown_in_views(index, part, pictures, sampled, cameras, grids, context) for index, part in enumerate(parts)
+    ]
+    splats, start = [], 0
+    for picture, whole in zip(pictures, sampled, strict=True):
+        here = slice(start, start := start + picture.picture.views)
+        of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
+        positions, rgba = together(*zip(*of_parts, strict=True))
+        splats.append(splats_of(whole, parts, positions, rgba, context))
+    return splats
+
+
+def _shown_in_views(
+    index: int,
+    part: CheckedPart,
+    pictures: Sequence[Views],
+    sampled: Sequence[Sampled],
+    cameras: Sequence[Camera],
+    grids: Sequence[Grid],
+    context: Context,
+) -> tuple[Array, Array]:
+    """Positions (N, 3) in their pictures and colours (N, C + 1) of the samples of a part in several views.
+
+    Args:
+        index: the index of the part.
+        part: the part; it must be `shaded_at_once` if the number of samples in each view is unknown.
+        pictures: the views.
+        sampled: their samples, in arrays of the engine.
+        cameras: the camera of the whole image of each view.
+        grids: the cells of each view, and their camera.
+        context: as in `_shown`.
+    """
+    inputs, engine = of_inputs(context), context.engine
+    whole = in_one_table([own.samples[index] for own in sampled])
+    used, outlines = whole, sampled[0].outlines
+    if outlines is not None and engine.padded(whole.row):
+        before = sum(own.ids.shape[-2] for own in sampled[0].samples[:index])
+        # Engines that pad rows have all views in one picture.
+        used = all_in_use(whole, inputs, outlines.rows if len(sampled) == 1 else None, before)
+    counts, size = _counts_of(pictures, index), grids[0].size
+    theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
+    gbuffer = evaluate(part, whole, inputs)
+    view, first = [], 0
+    for picture in pictures:
+        view.append(picture.view[index] + first if first else picture.view[index])
+        first += picture.picture.views
+    (view,) = together([inputs.constants(own) for own in view])
+    seen = [g.camera.replace(view=inputs.constants(g.camera.view)).within(transform) for g in grids]
+    rows = namespace(seen[0].view).stack([own.pixel_rows(size) for own in seen])
+    points = on_rays(whole, gbuffer["position"])
+    rows, points = context_of(rows, points).constants((rows, points))
+    places = _places_of(pictures, Context(engine_of(points), points))
+    positions = context.constants(projective_map_of_views(rows, points, view, places))
+    cameras = context.constants(cameras)
+    if shaded_at_once(part):
+        camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
+        rgba = shade(part, theta, transform, used, gbuffer, camera, engine)[1]
+    else:
+        assert counts is not None
+        shaded = []
+        for own, (samples, local) in zip(seen, apart(whole, gbuffer, counts.tolist(), engine), strict=True):
+            add_footprint(part, samples, local, own, size, inputs)
+            shaded.append((samples, local))
+
+        def colored(pair: tuple) -> Array:
+            camera, (samples, local) = pair
+            if not local["position"].shape[0]:
+                # Shaders may expect a row at least.
+                none = namespace(local["position"]).broadcast_to(
+                    local["position"][:, :1], (0, part.shader.channels + 1)
+                )
+                return context.constants(none)
+            return context.constants(shade(part, theta, transform, samples, local, camera, engine)[1])
+
+        views = list(zip(cameras, shaded, strict=True))
+        colors = [colored(views[0])]
+        colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray else map(colored, views[1:])
+        (rgba,) = together(colors)
+    rgba = context.constants(rgba)
+    if engine_of(rgba) is not engine:
+        positions, rgba = context_of(rgba).constants((positions, rgba))
+    # Values in unused rows are not checked.
+    every = np.arange(gbuffer["position"].shape[0], dtype=np.int32)[None, None] if counts is not None else whole.row
+    check_splats(index, part, gbuffer, positions, rgba, every, 0)
+    return positions, rgba
+
+
+def _of_views(tables: Sequence[Array], pictures: Sequence[Views], part: int, views: slice) -> Sequence[Array]:
+    """The rows of some views, in tables of a part for all pictures."""
+    if len(pictures) == 1:
+        return tables
+    counts = _counts_of(pictures, part)
+    assert counts is not None
+    first, rows = int(counts[: views.start].sum()), int(counts[views].sum())
+    return [x[first : first + rows, ...] for x in tables]
+
+
+def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
+    """(B,) number of samples of a part in each view of all pictures; None if unknown."""
+    counts = [picture.counts[part] for picture in pictures if picture.counts is not None]
+    return np.concatenate(counts) if len(counts) == len(pictures) else None
+
+
+def _places_of(pictures: Sequence[Views], context: Context) -> Array:
+    """(B, 2) for each view its offsets along x and y in its picture, in cells."""
+    return context.constants(np.concatenate([own.picture.corners() for own in pictures]).astype(np.float32))
