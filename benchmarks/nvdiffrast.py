@@ -1,9 +1,10 @@
 """nvdiffrast's interface on rts beside its own antialiasing, and beside rts used directly.
 
 The experiments are those of nvdiffrast's samples, written anew: a cube with unknown corners and colours in images of
-few pixels, and the pose of a cube whose sides have colours of their own. Three methods: `rts_nvdiffrast`; its
-rasterization with nvdiffrast's analytic antialiasing (`analytic_antialias`); and `rts.render` with 3 × 3 samples a
-pixel at outlines. Each method makes its own targets. Fits that results/nvdiffrast.json has are not repeated.
+few pixels, and the pose of a cube whose sides have colours of their own. Four methods: `rts_nvdiffrast`, with one and
+with 3 × 3 samples a pixel; its rasterization with nvdiffrast's analytic antialiasing (`analytic_antialias`); and
+`rts.render` with one sample a pixel. Each method makes its own targets. Fits that results/nvdiffrast.json has are not
+repeated.
 
     python -m benchmarks.nvdiffrast
     python -m benchmarks.nvdiffrast --only pose --seeds 20
@@ -54,7 +55,7 @@ def clip(vertices: torch.Tensor, modelview: torch.Tensor) -> torch.Tensor:
     return (torch.cat([vertices, torch.ones_like(vertices[:, :1])], dim=1) @ (PROJECTION @ modelview).T)[None]
 
 
-def by_module(samples: int = 3, faces: torch.Tensor = FACES, twice: bool = False) -> Render:
+def by_module(samples: int = 1, faces: torch.Tensor = FACES, twice: bool = False) -> Render:
     """`rts_nvdiffrast`; with `twice`, `antialias` cannot take off the share of u and v, since it does not see them."""
     import rts_nvdiffrast.torch as dr
 
@@ -102,7 +103,12 @@ def by_rts(samples: int = 1, splatter: str = "auto", faces: torch.Tensor = FACES
     return render
 
 
-METHODS: dict[str, Callable[[], Render]] = {"rts_nvdiffrast": by_module, "analytic": by_pairs, "rts": by_rts}
+METHODS: dict[str, Callable[[], Render]] = {
+    "rts_nvdiffrast": by_module,
+    "rts_nvdiffrast, 3 × 3": lambda: by_module(3),
+    "analytic": by_pairs,
+    "rts": by_rts,
+}
 ALL = {**METHODS, "twice": lambda: by_module(twice=True)}
 
 
@@ -205,8 +211,9 @@ def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
     Shares of pixels are in percent. Differences are means over pixels where two images differ by 0.001 in a channel.
     """
     rng, colors = np.random.default_rng(1), torch.tensor(np.random.default_rng(0).uniform(0.1, 1, (24, 3))).float()
-    sums, corners = dict.fromkeys(("pixels", "apart", "rts_nvdiffrast", "analytic", "none"), 0.0), torch.tensor(CORNERS)
-    methods = {"rts_nvdiffrast": by_module(), "analytic": by_pairs(), "truth": by_rts(16, "none")}
+    compared = ("rts_nvdiffrast", "rts_nvdiffrast, 3 × 3", "analytic", "none")
+    sums, corners = dict.fromkeys(("pixels", "apart", *compared), 0.0), torch.tensor(CORNERS)
+    methods = {name: METHODS[name]() for name in compared[:3]} | {"truth": by_rts(16, "none")}
     for _ in range(count):
         view = modelview(torch.tensor(Rotation.random(random_state=rng).as_matrix(), dtype=torch.float32))
         images = {name: render(corners, colors, SIDES, view, size) for name, render in methods.items()}
@@ -216,7 +223,7 @@ def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
         off = (images["none"] - images["truth"]).abs().amax(dim=2) > 1e-3
         sums["pixels"] += 100 * (apart > 1e-3).float().mean().item() / count
         sums["apart"] += apart[apart > 1e-3].mean().item() / count
-        for name in ("rts_nvdiffrast", "analytic", "none"):
+        for name in compared:
             sums[name] += (images[name] - images["truth"]).abs().amax(dim=2)[off].mean().item() / count
     return sums
 
@@ -239,14 +246,16 @@ def pose_table(results: dict) -> str:
     for method in METHODS:
         found = [v for k, v in results["pose"].items() if k.startswith(f"{method} ")]
         near = [v for v in found if v < CLOSE]
-        rows.append([method, f"{len(near)} of {len(found)}", f"{statistics.median(near):.3f}°" if near else "–"])
+        if found:
+            rows.append([method, f"{len(near)} of {len(found)}", f"{statistics.median(near):.3f}°" if near else "–"])
     return table(["method", f"within {CLOSE:g}°", "median of these"], rows)
 
 
 def outline_table(results: dict) -> str:
     """Distances from the truth at outlines."""
     found = results["outlines"]
-    names = {"none": "no antialiasing", "analytic": "analytic", "rts_nvdiffrast": "rts_nvdiffrast"}
+    methods = [name for name in METHODS if name in found]
+    names = {"none": "no antialiasing"} | dict(zip(methods, methods, strict=True))
     return table(["method", "mean distance from the truth"], [[t, f"{found[n]:.3f}"] for n, t in names.items()])
 
 
@@ -264,7 +273,7 @@ def keep(kind: str, name: str, value: float) -> None:
     """Add a result to the file."""
     results = kept()
     results.setdefault(kind, {})[name] = value
-    FILE.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
+    FILE.write_text(json.dumps(results, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
 
 
 def main() -> None:

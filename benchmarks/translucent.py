@@ -1,4 +1,4 @@
-"""Translucent layers: errors of derivatives, fits, and the time of the splat alone.
+"""Translucent layers: errors of derivatives, fits, and how long glass takes beside what is opaque.
 
 Derivatives are low-passed and compared with differences of area-sampled renders; relative L2 error / gain:
 
@@ -9,10 +9,13 @@ Derivatives are low-passed and compared with differences of area-sampled renders
 from __future__ import annotations
 
 import argparse
+import statistics
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +34,8 @@ SIZE, LAYERS, AREA = (128, 128), 6, 16
 """AREA² samples a pixel make the truth."""
 PIXEL = 3.2 / SIZE[0]
 UNLIT = rts.plugin("shaders", "unlit")
-METHODS = tuple((name, s) for name in ("edges", "multi", "none") for s in (1, 2))
+METHODS = {"`edges`": ("edges", 1), "`edges`, 2 × 2": ("edges", 2), "`multi`": ("multi", 1), "`none`": ("none", 1)}
+"""Name → splatter, and samples a pixel along each axis."""
 MODES = "position", "colour", "alpha"
 
 
@@ -143,7 +147,7 @@ def derivative_rows() -> Iterator[list[str]]:
         for mode in MODES if translucent else MODES[:2]:
             change = Change(parts(), index, mode)
             true = change.truth()
-            yield [name, mode, *(score(change.derivative(*method), true) for method in METHODS)]
+            yield [name, mode, *(score(change.derivative(*method), true) for method in METHODS.values())]
 
 
 def edges_rows() -> Iterator[list[str]]:
@@ -203,6 +207,50 @@ def peer_rows(samples: int = 64) -> Iterator[list[str]]:
             yield [name, score(by_mitsuba(change, samples, 0), change.truth())]
 
 
+# --------------------------------------------------------------------------------------------------------- time
+
+
+def panes(layers: int, alpha: float) -> list[rts.Part]:
+    """Panes of random sizes, one fewer than layers, before a backdrop."""
+    rng, parts = np.random.default_rng(0), [backdrop(-1)]
+    for i in range(layers - 1):
+        color, sides = rng.random(3), (np.sort(rng.uniform(-1.3, 1.3, 2)) + [-0.3, 0.3] for _ in range(2))
+        (left, right), (bottom, top) = sides
+        parts.append(card(0.8 - 0.2 * i, color, alpha, left, right, bottom, top))
+    return parts
+
+
+def drawing(layers: int, alpha: float, backward: bool) -> Callable[[], object]:
+    """The image of panes at 256², and the gradient of a sum of squares in all vertices and colours."""
+    parts = panes(layers, alpha)
+    leaves = [{name: torch.tensor(x, requires_grad=backward) for name, x in part.theta.items()} for part in parts]
+    parts = [part.replace(theta=theta) for part, theta in zip(parts, leaves, strict=True)]
+    # What is opaque needs one layer, which is the default.
+    options: dict[str, Any] = {"layers": layers} if alpha < 1 else {}
+
+    def call() -> None:
+        image = rts.render(parts, CAMERA, (256, 256), **options)
+        if backward:
+            torch.autograd.grad(image.square().sum(), [x for theta in leaves for x in theta.values()])
+
+    return call
+
+
+def time_rows(rounds: int = 30) -> Iterator[list[str]]:
+    """Medians of processor time, in milliseconds, of calls that take turns; for runs on one thread."""
+    for layers in (4, 8):
+        calls = {key: drawing(layers, *key) for key in product((1.0, 0.5), (False, True))}
+        times: dict[tuple[float, bool], list[float]] = {key: [] for key in calls}
+        for key, call in [*calls.items()] * (rounds + 2):
+            begun = time.process_time()
+            call()
+            times[key].append(1e3 * (time.process_time() - begun))
+        for backward, what in ((False, "image"), (True, "image and gradient")):
+            # The first two calls compile and warm up.
+            opaque, translucent = (statistics.median(times[alpha, backward][2:]) for alpha in (1.0, 0.5))
+            yield [str(layers), what, f"{opaque:.1f}", f"{translucent:.1f}", f"{translucent / opaque:.2f}"]
+
+
 # --------------------------------------------------------------------------------------------------------- fits
 
 
@@ -244,8 +292,9 @@ def leaves(places: Any) -> list[rts.Part]:
     return parts
 
 
-def fitted(scene: Callable, cameras: list[rts.Camera], goal: Any, start: Any, splatter: str, steps: int) -> np.ndarray:
+def fitted(scene: Callable, cameras: list[rts.Camera], goal: Any, start: Any, method: str, steps: int) -> np.ndarray:
     """The numbers found by Adam from area-sampled pictures of the goal."""
+    splatter, supersample = METHODS[method]
     size, background = (64, 64), np.float32([1, 1, 1])
     with torch.no_grad():
         area = {"splatter": "none", "supersample": 8, "layers": LAYERS, "background": background}
@@ -253,8 +302,8 @@ def fitted(scene: Callable, cameras: list[rts.Camera], goal: Any, start: Any, sp
 
     def residuals(numbers: Any) -> Any:
         parts = scene(numbers)
-        options = {"splatter": splatter, "layers": LAYERS, "background": background}
-        images = [rts.render(parts, camera, size, **options)[..., :3] for camera in cameras]
+        options = {"layers": LAYERS, "supersample": supersample, "background": background}
+        images = [rts.render(parts, camera, size, splatter=splatter, **options)[..., :3] for camera in cameras]
         return torch.stack([image - target for image, target in zip(images, targets, strict=True)])
 
     found = rts.fit(residuals, start, steps=steps, learning_rate=0.01, progress=False, patience=steps)
@@ -276,8 +325,9 @@ class Task(NamedTuple):
     goal: torch.Tensor
     start: torch.Tensor
 
-    def found(self, splatter: str, steps: int) -> torch.Tensor:
-        return torch.tensor(fitted(self.scene, self.cameras, self.goal, self.start, splatter, steps))
+    def found(self, method: str, steps: int) -> torch.Tensor:
+        """The numbers that a fit by one of METHODS ends with."""
+        return torch.tensor(fitted(self.scene, self.cameras, self.goal, self.start, method, steps))
 
 
 def tasks() -> dict[str, Task]:
@@ -303,8 +353,8 @@ def off(task: Task, numbers: torch.Tensor) -> str:
 def fit_rows(steps: int) -> Iterator[list[str]]:
     for name, task in tasks().items():
         yield [name, "at first", off(task, task.start)]
-        for splatter in ("edges", "multi", "none"):
-            yield [name, splatter, off(task, task.found(splatter, steps))]
+        for method in METHODS:
+            yield [name, method, off(task, task.found(method, steps))]
 
 
 # ----------------------------------------------------------------------------------------------------- pictures
@@ -336,7 +386,7 @@ def fit_pictures(folder: Path, steps: int) -> None:
     figure = Figure(figsize=(2.6 * 4, 2.6 * 2 + 0.3), layout="constrained")
     for n, (axes, (name, task)) in enumerate(zip(figure.subplots(2, 4), tasks().items(), strict=True)):
         shown = {"picture": task.goal, "start": task.start}
-        shown |= {f"'{splatter}'": task.found(splatter, steps) for splatter in ("edges", "none")}
+        shown |= {method.replace("`", "'"): task.found(method, steps) for method in ("`edges`", "`none`")}
         options: dict[str, Any] = {"layers": LAYERS, "supersample": 2, "background": np.float32([1, 1, 1])}
         for axis, (title, numbers) in zip(axes, shown.items(), strict=True):
             picture = rts.render(task.scene(numbers), task.cameras[0], SIZE, **options)[..., :3]
@@ -348,16 +398,17 @@ def fit_pictures(folder: Path, steps: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=["derivatives", "edges", "peers", "fits", "pictures"])
+    parser.add_argument("--only", nargs="+", choices=["derivatives", "edges", "peers", "time", "fits", "pictures"])
     parser.add_argument("--steps", type=int, default=300, help="of each fit")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/translucent"))
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore", rts.errors.LayersWarning)  # Of `multi`, which is measured on purpose.
     sections = {
-        "derivatives": (["scene", "changes", *(f"{name}, {s} × {s}" for name, s in METHODS)], derivative_rows()),
+        "derivatives": (["scene", "changes", *METHODS], derivative_rows()),
         "edges": (["what moves", "multi", "edges"], edges_rows()),
         "peers": (["scene", "Mitsuba, prb_projective, 64 spp"], peer_rows()),
+        "time": (["K", "", "opaque, ms", "translucent, ms", "ratio"], time_rows()),
         "fits": (["fit", "splatter", "result"], fit_rows(args.steps)),
     }
     chosen = args.only or [name for name in (*sections, "pictures") if name != "peers" or find_spec("mitsuba")]

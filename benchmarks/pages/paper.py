@@ -100,7 +100,10 @@ def lego_on_page() -> dict[str, Any]:
     times = re.search(r"([\d.]+) s by volume,.* (\d+) times less", (PAGES / "radiance-field.md").read_text())
     assert times is not None
     volume, ratio = float(times[1]), float(times[2])
-    return {"sizes": [coarse, fine], "seconds": {"volume": volume, "surface": volume / ratio}}
+    columns, lines = written("radiance-field", "lego at 100², 25 views")
+    used = lines["surface, fixed, by `edges`, K = 1"][columns.index("fine evaluations a covered pixel")]
+    seconds = {"volume": volume, "surface": volume / ratio}
+    return {"sizes": [coarse, fine], "seconds": seconds, "edges": number(used)}
 
 
 def fern_on_page() -> dict[str, Any]:

@@ -27,7 +27,7 @@ PIECE = np.array([0.80, 0.85, 0.30, 0.26, 0.22, 0.62, 0.55, 0.02])
 CYLINDER = 0.45
 HEIGHTS = np.linspace(-1, 1, len(PIECE))
 CAMERA = rts.Camera.look_at((0, 0.7, 4.2), (0, -0.08, 0), fov_y=36)
-STEPS = {"adam": 200, "lm": 40}
+STEPS = {"adam": 200, "lm": 200}
 RATE = 0.02
 WRONG, MISSING, RIGHT = (0.85, 0.15, 0.1), (0.1, 0.6, 0.2), (0.01, 0.01, 0.012)
 

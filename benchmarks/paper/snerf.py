@@ -49,7 +49,8 @@ TITLES = {
     "finetuned": "surface fixed, network finetuned",
     "joint": "surface and network, joint",
 }
-LAYERS = 2
+LAYERS = {"edges": 1, "multi": 2}
+"""Splatter → layers."""
 FINE = 128
 """Evaluations of the fine network for a ray of volume rendering."""
 
@@ -83,7 +84,7 @@ def rendered(scene: Scene, values: Any, weights: Any, shot: Shot, shader: Any = 
 
 
 def _image(part: Any, scene: Scene, camera: rts.Camera, size: Any, engine: str = "torch", supersample: int = 1) -> Any:
-    options = {"splatter": "multi", "layers": LAYERS, "supersample": supersample}
+    options = {"splatter": scene.splatter, "layers": LAYERS[scene.splatter], "supersample": supersample}
     return rts.render(part, camera, size, background=scene.behind(), engine=engine, **options)[..., :3]
 
 
@@ -317,8 +318,8 @@ def drawn(
         begun = time.perf_counter()
         images.append(np.asarray(_image(part, scene, shot.camera, shot.size, supersample=supersample)))
         seconds.append(time.perf_counter() - begun)
-        splatter = rts.plugin("splatters", "multi")()
-        found = rts.sample(part, shot.camera, shot.size, splatter=splatter, layers=LAYERS, supersample=supersample)
+        options = {"splatter": scene.splatter, "layers": LAYERS[scene.splatter], "supersample": supersample}
+        found = rts.sample(part, shot.camera, shot.size, **options)
         evaluations.append(int(found.samples[0].ids.shape[0]))
         apron, fine = found.apron, supersample
         row = found.row[0, apron:-apron, apron:-apron] >= 0
@@ -484,6 +485,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/snerf"))
     parser.add_argument("--scene", choices=("lego", "fern"), default="lego")
+    parser.add_argument("--splatter", choices=LAYERS, default="edges")
     parser.add_argument("--sides", nargs="+", type=int, choices=(100, 200, 400), default=[100, 400], help="of lego")
     parser.add_argument("--factor", type=int, default=3, help="of fern: 378 × 504 pixels over this")
     parser.add_argument("--fineness", type=float, default=1.0, help="of the lattice")
@@ -502,6 +504,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.quick:
         args.steps, args.views, args.fineness, args.every, args.sides = 100, 2, 0.5, 50, [100]
     scene = lego(args.sides, args.fineness, args.finest) if args.scene == "lego" else fern(args.factor, args.fineness)
+    scene = scene._replace(splatter=args.splatter)
     if not run(scene, args.output, args.stages, args):
         raise SystemExit(130)
     if args.times or args.quick:

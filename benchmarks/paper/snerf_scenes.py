@@ -49,6 +49,7 @@ class Scene(NamedTuple):
         shape: of the lattice.
         ndc: the map from the world to the field's space, or None.
         background: what is behind.
+        splatter: the splatter of its images.
     """
 
     field: Any
@@ -58,6 +59,7 @@ class Scene(NamedTuple):
     shape: tuple[int, int, int]
     ndc: rts.Ndc | None
     background: str
+    splatter: str = "edges"
 
     def surface(self) -> Any:
         """The isosurface of a grid, in the world."""

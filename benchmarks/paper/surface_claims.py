@@ -28,7 +28,7 @@ def bspline(numbers: list[dict[str, Any]]) -> list[Row]:
             "200 iterations",
             f"IoU {told}",
             verdict(*(r["iou"] > 0.99 for r in adam)),
-            f"by the former default, 2 × 2 samples, at most 200 steps; images of {numbers[0]['side']}²; the paper's "
+            f"by `edges`, 2 × 2 samples, at most 200 steps; images of {numbers[0]['side']}²; the paper's "
             "piece and camera are not given, ours are chosen",
         )
     ]
@@ -73,7 +73,7 @@ def swept(numbers: list[dict[str, Any]]) -> list[Row]:
             "400 iterations",
             told(aside),
             verdict(*(found(r) for r in aside)),
-            "by the former default; on 50³ points by the mean absolute error, as there; the camera is ours",
+            "by `edges`; on 50³ points by the mean absolute error, as there; the camera is ours",
         )
     ]
     if front:
@@ -95,7 +95,7 @@ def spheres(numbers: list[dict[str, Any]]) -> list[Row]:
             "400 iterations",
             f"IoU {between([r['iou'] for r in numbers])} in {numbers[0]['steps']} ({fits(numbers)})",
             verdict(*(r["iou"] > 0.95 for r in numbers)),
-            "by the former default; spheres smaller than a cell of the lattice remain as specks: nothing shows them",
+            "by `edges`; spheres smaller than a cell of the lattice remain as specks: nothing shows them",
         )
     ]
 
@@ -170,6 +170,8 @@ def lego(numbers: dict[str, Any]) -> list[Row]:
     if "seconds" in numbers:
         ratio = numbers["seconds"]["volume"] / numbers["seconds"]["surface"]
         told += f"; a frame takes {ratio:.0f} times less"
+    if "edges" in numbers:
+        told += f"; `edges`: {numbers['edges']:.2f} of one layer, on the surface as it is found"
     rows.append(
         Row(
             "One evaluation a pixel instead of 128",
