@@ -18,7 +18,8 @@ import importlib
 from rts import errors as errors
 from rts import registry
 from rts import regularizers as regularizers
-from rts.arrays.engines import Engine, engine_of, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, namespace
 from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.residuals import Residuals

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rts import registry as registry
-from rts.arrays.engines import Engine, engine_of, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array, Tree
 from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer

@@ -66,8 +66,7 @@ class Rays(Sampler):
         else:
             ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
-        followed = () if request.points is None else ("points",)
-        samples = Samples(ids, params, Cells(row, depth), overflow, followed=followed)
+        samples = Samples(ids, params, Cells(row, depth), overflow, at_points=request.points is not None)
         entering, asked = hits.entering, request.pairs and request.points is not None
         if entering is None or not asked or type(surface).deepest is RaySurface.deepest:
             return samples

@@ -121,14 +121,14 @@ LOOPS = [
 ARRAYS = [
     Defect(
         "a photograph's principal point is off by half a pixel",
-        "rts/scene/camera.py",
+        "rts/scene/camera_converters.py",
         "cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)",
         "cx, cy = K[0, 2] + pixel_center, K[1, 2] + pixel_center",
         "camera pose_files",
     ),
     Defect(
         "the y axis of a photograph points up",
-        "rts/scene/camera.py",
+        "rts/scene/camera_converters.py",
         "xp.reshape(t, (3,))), (1, -1, -1, 1))",
         "xp.reshape(t, (3,))), (1, 1, -1, 1))",
         "camera",

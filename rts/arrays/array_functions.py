@@ -200,10 +200,10 @@ def _is_finite(x: Array, below: float) -> bool:
     values = engine.known(x)
     if values is None or not values.size:
         return True
-    from rts.arrays.extremes import largest
+    from rts.arrays.value_ranges import largest_absolute
 
     # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
-    return largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below
+    return largest_absolute(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below
 
 
 def averaged(image: Array, side: int) -> Array:

@@ -308,6 +308,7 @@ def plugins(
 def render(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
+    *,
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
     surface: Surface = "mesh",
     size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
@@ -330,7 +331,7 @@ def render(
     """Render a model to a picture."""
     import rts
     from rts.cli.pose_file import posed, read_pose
-    from rts.diagnostics.command_tools import supersample_of
+    from rts.diagnostics.measuring_api import supersample_of
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
 
@@ -385,6 +386,7 @@ def fit_pose(
         Path,
         typer.Argument(help="The picture: its alpha is the silhouette, or its brightness where it is opaque."),
     ],
+    *,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("pose"),
     surface: Surface = "mesh",
     engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",

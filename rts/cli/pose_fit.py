@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.arrays.engines import Engine, engine_named, engine_of, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_named, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.cli.pose_file import Pose, posed
 from rts.errors import InputError, PluginError

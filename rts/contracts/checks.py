@@ -81,9 +81,9 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
 
     Shaders are looked up by name, and lists of numbers become arrays. Arrays of several engines are not detected here.
     """
-    listed: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
-    if not listed or not all(isinstance(p, Part) for p in listed):
-        kinds = ", ".join(sorted({type(p).__name__ for p in listed})) or "nothing"
+    part_list: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
+    if not part_list or not all(isinstance(p, Part) for p in part_list):
+        kinds = ", ".join(sorted({type(p).__name__ for p in part_list})) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     if not isinstance(camera, Camera):
         several = isinstance(camera, (list, tuple)) and any(isinstance(c, Camera) for c in camera)
@@ -95,7 +95,7 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
             f"takes several, and camera.unstack() gives them one by one"
         )
     camera = _check_camera(camera)
-    checked = [_check_part(index, part) for index, part in enumerate(listed)]
+    checked = [_check_part(index, part) for index, part in enumerate(part_list)]
     check_channels(checked)
     return checked, camera
 
@@ -105,14 +105,14 @@ def check_cameras(cameras: Any) -> list[Camera]:
     if isinstance(cameras, Camera):
         if not cameras.is_stacked:
             raise InputError("cameras is the camera of one view; expected several, or what Camera.stack made of them")
-        listed = cameras.unstack()
+        camera_list = cameras.unstack()
     else:
-        listed = list(cameras) if isinstance(cameras, (list, tuple)) else []
-        if not listed or not all(isinstance(camera, Camera) for camera in listed):
+        camera_list = list(cameras) if isinstance(cameras, (list, tuple)) else []
+        if not camera_list or not all(isinstance(camera, Camera) for camera in camera_list):
             raise InputError(f"cameras is {quoted(cameras)}; expected a list of rts.Camera, or what Camera.stack made")
-        if any(camera.is_stacked for camera in listed):
+        if any(camera.is_stacked for camera in camera_list):
             raise InputError("cameras holds a stack; expected cameras of one view each, or one stack")
-    return [_check_camera(camera) for camera in listed]
+    return [_check_camera(camera) for camera in camera_list]
 
 
 def _check_camera(camera: Camera) -> Camera:
@@ -194,36 +194,36 @@ def changed_part(index: int, part: CheckedPart, changes: Mapping[str, Any]) -> C
     return CheckedPart(part.surface, part.theta, part.shader, transform, part.cull)
 
 
-def check_sampler(chosen: Any) -> Sampler:
+def check_sampler(sampler: Any) -> Sampler:
     """A usable sampler from a name, a class or an object."""
-    return checked_plugin(registry.instance("rts.samplers", chosen), "the sampler", Sampler)
+    return checked_plugin(registry.instance("rts.samplers", sampler), "the sampler", Sampler)
 
 
-def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sampler:
-    """The sampler that `chosen` selects for a part: `chosen` itself or another."""
-    selected = chosen.suited(part, camera)
-    return selected if selected is chosen else check_sampler(selected)
+def sampler_for_part(sampler: Sampler, part: Part, camera: Camera | None) -> Sampler:
+    """The sampler that `sampler` selects for a part: `sampler` itself or another."""
+    selected = sampler.sampler_for(part, camera)
+    return selected if selected is sampler else check_sampler(selected)
 
 
-def check_splatter(chosen: Any) -> Splatter:
+def check_splatter(splatter: Any) -> Splatter:
     """A usable splatter from a name, a class or an object."""
-    if isinstance(chosen, str) and chosen == "visible":
+    if isinstance(splatter, str) and splatter == "visible":
         warn_deprecated("splatter 'visible'", "'edges', which it now is", until="0.4")
-        chosen = "edges"
-    splatter = checked_plugin(registry.instance("rts.splatters", chosen), "the splatter", Splatter)
+        splatter = "edges"
+    splatter = checked_plugin(registry.instance("rts.splatters", splatter), "the splatter", Splatter)
     if not is_count(splatter.reach):
         raise InputError(f"reach of {splatter!r} is {splatter.reach!r}; expected cells, an integer of at least 1")
     return splatter
 
 
-def is_auto(chosen: Any) -> bool:
+def is_auto(value: Any) -> bool:
     """True for the name "auto"."""
-    return isinstance(chosen, str) and chosen == "auto"
+    return isinstance(value, str) and value == "auto"
 
 
-def check_shader(chosen: Any, what: str) -> Shader:
+def check_shader(shader: Any, what: str) -> Shader:
     """A usable shader from a name, a class, an object or a function; `what` names it."""
-    shader = registry.instance("rts.shaders", chosen)
+    shader = registry.instance("rts.shaders", shader)
     shader = FunctionShader(shader) if callable(shader) and not isinstance(shader, Shader) else shader
     return checked_plugin(shader, what, Shader, "a function, ")
 
@@ -236,11 +236,11 @@ def _check_surface(surface: Any, what: str) -> Surface:
     return surface
 
 
-def checked_plugin(given: Any, what: str, base: type, others: str = "a name, ") -> Any:
+def checked_plugin(plugin: Any, what: str, base: type, others: str = "a name, ") -> Any:
     """The given plugin, after a check of its class and of the spelling of its members.
 
     Args:
-        given: the plugin.
+        plugin: the plugin.
         what: its name in error messages, such as "the sampler".
         base: the base class of its kind.
         others: alternatives to an object, for error messages.
@@ -249,11 +249,11 @@ def checked_plugin(given: Any, what: str, base: type, others: str = "a name, ") 
         InputError: its class does not subclass `base`.
         PluginError: its class overrides a final method, or has a function named almost like an optional one.
     """
-    if not isinstance(given, base):
+    if not isinstance(plugin, base):
         bases = "rts.TriangleSurface or rts.RaySurface" if base is Surface else f"rts.{base.__name__}"
-        raise InputError(f"{what} is {quoted(given)}; expected {others}or an object whose class subclasses {bases}")
-    check_members(type(given))
-    return given
+        raise InputError(f"{what} is {quoted(plugin)}; expected {others}or an object whose class subclasses {bases}")
+    check_members(type(plugin))
+    return plugin
 
 
 def check_matrix(name: str, matrix: Any) -> Array:

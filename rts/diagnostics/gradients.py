@@ -13,7 +13,8 @@ import numpy as np
 
 from rts.arrays.argument_checks import check_flag, quoted
 from rts.arrays.array_functions import from_numbers, kind_of
-from rts.arrays.engines import Engine, engine_of, is_constant, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import check_size, is_count, is_real
 from rts.diagnostics.explanation.reasons import Reason, legend, marked

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine, engine_of, is_constant
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, is_constant
 from rts.arrays.trees import Array, Tree, leaves
 from rts.errors import EngineError, InputError
 from rts.fitting.parameter_names import listed

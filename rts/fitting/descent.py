@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import is_real
 from rts.errors import InputError

@@ -12,7 +12,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import check_flag, quoted
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import checked_plugin, is_count, is_real
 from rts.contracts.residuals import Residuals

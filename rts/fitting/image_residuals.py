@@ -9,7 +9,8 @@ from typing import Any, TypeGuard
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
-from rts.arrays.engines import Engine, constants, context_of, engine_of, exemplar, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checks import (
     CheckedPart,

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import Engine, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.errors import InputError
 from rts.fitting.checkpoint import arrays_in, is_like

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from typing import Any
 
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Tree
 from rts.errors import EngineError, InputError, RtsError
 from rts.fitting.interrupts import interrupts_held_back

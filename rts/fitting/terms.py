@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Array, Tree
 from rts.contracts.residuals import Residuals
 from rts.errors import InputError

@@ -211,7 +211,7 @@ class Points:
             sampler = _OnTriangles(fragments)
         request = Request(points=points, pairs=pairs, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, layers, request)
-        if "points" in samples.followed:
+        if samples.at_points:
             return samples
         warn(
             f"the sampler {name_of('rts.samplers', sampler)} does not sample single points, so that outlines lie midway"

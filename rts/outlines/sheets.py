@@ -10,7 +10,7 @@ import numpy as np
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments, Proxy
 from rts.outlines.gaps import Fronts
-from rts.sampling.points import kept_sign, near_and_far, pixel_rows
+from rts.sampling.points import near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
 
@@ -76,7 +76,7 @@ class Sheets(NamedTuple):
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
         beyond, sides = _beyond(proxy.faces), np.zeros(len(faces) + 1, np.int8)
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
-        return cls(vertices, faces, beyond, rows, near_and_far(camera), kept_sign(camera, cull), seen, sides)
+        return cls(vertices, faces, beyond, rows, near_and_far(camera), camera.kept_sign(cull), seen, sides)
 
     def meet(self, fronts: Fronts, width: np.ndarray, met: np.ndarray) -> None:
         """Mark, in `met` (2, H, W) uint8, the gaps where a sheet may end or turn away; see `silhouettes_loops.meet`.

@@ -18,9 +18,9 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, PluginError
 from rts.plugin_base import overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
-from rts.sampling.host_call import HostCall, Shape
+from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.layer_order import on_surface, refined
-from rts.sampling.packing import lift, repack
+from rts.sampling.packing import pack_fragments, repack
 from rts.sampling.pairs import with_pairs
 from rts.sampling.points import at_points
 from rts.sampling.sample_checks import check_faces, check_fragments, checked_proxy
@@ -119,7 +119,7 @@ class TriangleSampler(Sampler):
         """
         return None
 
-    def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
+    def prepare_part(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """The proxy of a part, and the result of `prepare` for it; see `Sampler`.
 
         Raises:
@@ -183,23 +183,23 @@ class TriangleSampler(Sampler):
         refines, moves = surface.refines, surface.refines and surface.refine_moves
         pairs = request.pairs and points is not None and refines and not moves
         pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
-        shape = Shape(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
-        tables = shape.tables(surface) if refines else {}
+        bounds = SampleBounds(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
+        tables = bounds.tables(surface) if refines else {}
         beside = {
-            **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
+            **({"incomplete_cells": ArraySpec((), np.int32)} if moves else {}),
             **({"pair": ArraySpec((2, cells[1]), np.int32)} if pairs else {}),
             **({"triangle": ArraySpec((layers, *cells), np.int32)} if request.triangles and not moves else {}),
         }
 
-        def find(cameras: Sequence[Camera], inputs: Tree, *given: np.ndarray) -> tuple[Samples, dict[str, Any]]:
-            own = np.asarray(given[0], np.float64) if given else None
-            search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, entry, own)
+        def find(cameras: Sequence[Camera], inputs: Tree, *further: np.ndarray) -> tuple[Samples, dict[str, Any]]:
+            host_points = np.asarray(further[0], np.float64) if further else None
+            search = _Search(self, surface, part.cull, inputs, cameras[0], bounds, tables, entry, host_points)
             samples = search.moved() if moves else search.in_place(request.uniform, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
-        call = HostCall(part, surface, [camera], shape, entry)
+        call = HostCall(part, surface, [camera], bounds, entry)
         samples, more = call.samples(find, beside, tables, [] if points is None else [points[None, ...]])
-        return samples.replace(**more, followed=() if points is None else ("points",))
+        return samples.replace(**more, at_points=points is not None)
 
     def working_on(
         self,
@@ -221,10 +221,10 @@ class TriangleSampler(Sampler):
             work: a function of the entry. Several threads may call it at once if `draws_at_once`.
         """
         with self._keeper.lock:
-            known = entry or self._entry(surface, inputs, camera, view)
+            ready = entry or self._entry(surface, inputs, camera, view)
             if not self.draws_at_once:
-                return work(known)
-        return work(known)
+                return work(ready)
+        return work(ready)
 
     @property
     def draws_at_once(self) -> bool:
@@ -247,7 +247,7 @@ class _Search:
         cull: the part's `cull`.
         inputs: the result of the surface's `proxy_inputs`, on the host.
         camera: host matrices.
-        shape: bounds on the number of samples.
+        bounds: bounds on the number of samples.
         tables: the result of the surface's `table_specs`.
         entry: the surface's prepared entry; None to look it up, or to build it.
         points: (1, M, 2), the points to sample; None for the centres of all cells.
@@ -258,55 +258,57 @@ class _Search:
     cull: str
     inputs: Tree
     camera: Camera
-    shape: Shape
+    bounds: SampleBounds
     tables: Mapping[str, ArraySpec]
     entry: Entry | None
     points: np.ndarray | None
 
     def in_place(self, uniform: bool, pairs: bool) -> Samples:
         """Samples on the triangles, or refined by a surface that does not move them; arguments as in `Request`."""
-        known, fragments, covered = self._drawn(self.shape.layers)
-        ids, capacity = fragments.triangle_ids, self.shape.capacity
+        entry, fragments, covered = self._drawn(self.bounds.layers)
+        ids, capacity = fragments.triangle_ids, self.bounds.capacity
         if not self.surface.refines:
             if uniform:
-                return _of_one_row(lift(fragments, known.proxy, capacity, _first_of(covered)), covered, fragments)
-            packed = lift(fragments, known.proxy, capacity, covered)
+                return _of_one_row(
+                    pack_fragments(fragments, entry.proxy, capacity, _first_of(covered)), covered, fragments
+                )
+            packed = pack_fragments(fragments, entry.proxy, capacity, covered)
             return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
-        lifted = lift(fragments, known.proxy, None, covered)
-        surface, inputs, camera, view, points = self.surface, self.inputs, self.camera, self.shape.view, self.points
-        samples, _ = refined(surface, inputs, lifted, camera, self.tables, view, points)
+        unrefined = pack_fragments(fragments, entry.proxy, None, covered)
+        surface, inputs, camera, view, points = self.surface, self.inputs, self.camera, self.bounds.view, self.points
+        samples, _ = refined(surface, inputs, unrefined, camera, self.tables, view, points)
         packed = repack(samples, samples.row >= 0, capacity)
         if pairs and points is not None:
             packed = with_pairs(packed, surface, inputs, camera, view, points, self.tables)
         return packed.replace(triangle=np.where(packed.row >= 0, ids, np.int32(-1)))
 
     def moved(self) -> Samples:
-        """Samples that the surface moves off its triangles, with `ran_out`."""
-        layers = self.shape.layers
+        """Samples that the surface moves off its triangles, with `incomplete_cells`."""
+        layers = self.bounds.layers
         # There is only one set of tables, so that no samples can be added later.
-        known, fragments, covered = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS))
-        given = self.surface, self.inputs, fragments, known.proxy, self.camera, layers, self.tables, self.shape.view
-        samples = on_surface(*given, self.points)
+        entry, fragments, covered = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS))
+        arguments = self.surface, self.inputs, fragments, entry.proxy, self.camera, layers, self.tables
+        samples = on_surface(*arguments, size=self.bounds.view, cells=self.points)
         covers = samples.row >= 0
-        ran_out = np.count_nonzero(covered[-1] & ~covers[-1])
-        return repack(samples, covers, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
+        incomplete = np.count_nonzero(covered[-1] & ~covers[-1])
+        return repack(samples, covers, self.bounds.capacity).replace(incomplete_cells=np.asarray(incomplete, np.int32))
 
     def _drawn(self, layers: int) -> tuple[Entry, Fragments, np.ndarray]:
         """The entry, the triangles drawn into `layers` layers, and the covered cells of these."""
-        sampler, camera, view, points = self.sampler, self.camera, self.shape.view, self.points
-        grid = layers, *self.shape.size
+        sampler, camera, view, points = self.sampler, self.camera, self.bounds.view, self.points
+        grid = layers, *self.bounds.size
 
-        def draw(known: Entry) -> tuple[Entry, Fragments, np.ndarray]:
-            if not (count := len(known.proxy.faces)):
-                return known, _no_fragments(grid), np.zeros(grid, np.bool_)
-            arguments = known.prepared, camera, view, layers, self.cull
+        def draw(entry: Entry) -> tuple[Entry, Fragments, np.ndarray]:
+            if not (count := len(entry.proxy.faces)):
+                return entry, _no_fragments(grid), np.zeros(grid, np.bool_)
+            arguments = entry.prepared, camera, view, layers, self.cull
             if points is None:
                 fragments = sampler.rasterize(*arguments)
             else:
                 fragments = sampler.rasterize_points(*arguments, points[0])
                 if fragments is None:
-                    fragments = at_points(known.proxy, camera, view, layers, self.cull, points[0])
-            return known, fragments, check_fragments(fragments, grid, count, sampler)
+                    fragments = at_points(entry.proxy, camera, view, layers, self.cull, points[0])
+            return entry, fragments, check_fragments(fragments, grid, count, sampler)
 
         return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
 

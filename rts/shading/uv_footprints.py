@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import Engine, constants, namespace, stopped
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface

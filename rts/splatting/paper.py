@@ -144,8 +144,8 @@ class Multi(Kernel):
         for splat, depth in sources:
             s = _pairing(depth, target)
             for k in range(depth.shape[0]):
-                for i, chosen in enumerate((k < s, k == s, k > s)):
-                    buffers[i] = buffers[i] + xp.where(chosen, splat[k, ...], 0.0)
+                for i, mask in enumerate((k < s, k == s, k > s)):
+                    buffers[i] = buffers[i] + xp.where(mask, splat[k, ...], 0.0)
         front, surface, behind = map(_normalised, buffers)
         return over(front, over(surface, behind))
 

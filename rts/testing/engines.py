@@ -10,7 +10,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from rts.arrays.engines import OWNERS, Engine, engine_named
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import OWNERS, engine_named
 from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.records import ArraySpec, Cells, Samples
 from rts.errors import EngineError

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.arrays.engines import Engine, floating_bits
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import floating_bits
 from rts.compiling.threads import read_only
 from rts.operations.operation import Operation
 from rts.testing import derivatives

@@ -10,7 +10,7 @@ from rts.contracts.records import Proxy
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
 from rts.sampling.layer_order import refined
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
@@ -60,9 +60,9 @@ def _off_rays(part: Part, surface: TriangleSurface, inputs: Tree, proxy: Proxy, 
         view: the name of the view, for messages.
     """
     sampler = registry.instance("rts.samplers", "reference")
-    lifted = lift(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
+    unrefined = pack_fragments(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
     try:
-        samples, rays = refined(surface, inputs, lifted, local, surface.table_specs(len(lifted.ids), None))
+        samples, rays = refined(surface, inputs, unrefined, local, surface.table_specs(len(unrefined.ids), None))
     except InputError as error:
         raise AssertionError(f"{view}: {error}") from error
     cells = samples.row >= 0

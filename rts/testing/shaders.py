@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.arrays.engines import Engine, constants, engine_of
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, engine_of
 from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.checks import check_shader
 from rts.contracts.gbuffer import GBuffer

@@ -25,7 +25,7 @@ from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster.clusters import SIZE, Clusters
 from rts_backends.raster.drawing import BAND_ROWS, LISTED, draw
-from rts_backends.triangles import facing, pixel_matrix, to_corner
+from rts_backends.triangles import pixel_matrix, to_corner
 
 LONG_BLOCK = SIZE
 """Triangles, or vertices, of a block in loops that keep few numbers of each."""
@@ -91,7 +91,7 @@ class Raster(TriangleSampler):
             memory = scratch[1].pop()
         except IndexError:
             memory = np.empty(key[0], np.int32), np.empty((key[1], LISTED), np.int32)
-        fragments = _drawn(prepared, camera, size, layers, facing(camera, cull), *memory)
+        fragments = _drawn(prepared, camera, size, layers, camera.kept_sign(cull), *memory)
         scratch[1].append(memory)
         return fragments
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import Engine, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.diagnostics.explanation.subject import DEEP, Subject
 from rts.diagnostics.smoothing import low_pass

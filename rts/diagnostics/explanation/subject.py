@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine, is_constant, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import CheckedPart, check_colors, check_scene, check_splatter
 from rts.diagnostics.finite_difference_steps import pixel_step
