@@ -17,7 +17,7 @@ from rts.plugin_api.records import Samples
 from rts.sampling import layer_order
 from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON
-from rts_surfaces import bicubic, tiles
+from rts_surfaces.patches import bicubic, tiles
 
 pytestmark = pytest.mark.sampling
 

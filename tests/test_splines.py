@@ -9,8 +9,8 @@ from rts import Camera, InputError, Part
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
 from rts.testing.compatibility import APRON
-from rts_surfaces import tiles
-from rts_surfaces.bspline import extraction
+from rts_surfaces.patches import tiles
+from rts_surfaces.patches.bspline import extraction
 
 pytestmark = pytest.mark.sampling
 

@@ -103,7 +103,7 @@ LOOPS = [
     ),
     Defect(
         "a ray crosses a patch's flipped border without the flip",
-        "rts_surfaces/ray_patch_loops.py",
+        "rts_surfaces/patches/ray_patch_loops.py",
         "        t = 1 - t\n",
         "        t = t + 0\n",
         "patches bezier subdivision",

@@ -89,7 +89,7 @@ class Engine(Plugin):
         raise self._no_derivatives()
 
     def optimizer(
-        self, method: Any, learning_rate: float | Sequence[float], parameters: Tree, given: Tree = None
+        self, method: Any, learning_rate: float | Sequence[float], parameters: Tree, original: Tree = None
     ) -> Callable[[Tree, Tree], Tree]:
         """A function `(parameters, gradient) -> new parameters`, a step of a first-order optimiser.
 
@@ -101,7 +101,7 @@ class Engine(Plugin):
             method: "adam", "sgd", or an optimiser object of the framework.
             learning_rate: the rate, or a list of one for each array of the parameters; for a method by name.
             parameters: where to start; never changed in place.
-            given: a tree like `parameters` whose arrays an optimiser object may hold; None for `parameters`.
+            original: a tree like `parameters` whose arrays an optimiser object may hold; None for `parameters`.
 
         Raises:
             InputError: another method.

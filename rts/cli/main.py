@@ -41,8 +41,8 @@ class _Group(TyperGroup):
     """Commands, those of installed distributions too, whose expected errors are one line on standard error."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        own = super().list_commands(ctx)
-        return [*own, *(name for name in registry.plugins("rts.commands") if name not in own)]
+        commands = super().list_commands(ctx)
+        return [*commands, *(name for name in registry.plugins("rts.commands") if name not in commands)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         found = super().get_command(ctx, cmd_name)
@@ -337,14 +337,14 @@ def render(
 
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
-    chosen = registry.plugin("rts.engines", engine)()
+    engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
         parts = rts.load(model, surface=surface)
         seen = orbit(bounds_of(parts), shape, *view, fov=fov, up=up)
     else:
         _refuse_beside("--pose", context, ("camera", "fov", "up"))
-        matrix, seen, own = read_pose(pose)
-        shape = shape if _given(context, "size") else own
+        matrix, seen, pose_size = read_pose(pose)
+        shape = shape if _given(context, "size") else pose_size
         parts = posed(rts.load(model, surface=surface), matrix)
     bounds = bounds_of(parts)
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
@@ -353,7 +353,7 @@ def render(
     def prepared(part: Part) -> Part:
         theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
         return part.replace(
-            theta=map_leaves(chosen.constant, theta),
+            theta=map_leaves(engine_object.constant, theta),
             cull=cull,
             shader=part.shader if shader == "auto" else shader,
         )
@@ -431,9 +431,9 @@ def fit_pose(
     mask = silhouette_of(picture)
     bounds = bounds_of(parts)
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
-    chosen = None if engine == "auto" else engine
+    engine_name = None if engine == "auto" else engine
     options: dict[str, Any] = {"method": method, "steps": steps, "fit_fov": fit_fov, "loss": loss, "f_scale": f_scale}
-    result = fit(parts, mask, seen, bounds, engine=chosen, **options)
+    result = fit(parts, mask, seen, bounds, engine=engine_name, **options)
     verdict = judged(result.pose, parts, mask, picture, robust=loss != "linear")
     files = write_report(output, result, verdict, parts, mask)
     _say(

@@ -215,7 +215,7 @@ def check_gradient(
     known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size")]
     if unknown := [name for name in options if name not in known]:
         raise InputError(f"there is no option {unknown[0]!r}; expected {', '.join(known)}")
-    own = loss is not None
+    own_loss = loss is not None
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
     subject = Subject(engine, scene, map_leaves(engine.stop_gradient, parameters), size, options, loss)
     with _traceable(engine), phases(progress) as phase, warnings.catch_warnings():
@@ -229,17 +229,17 @@ def check_gradient(
         second = curvatures(subject, numbers, tolerance, clock.going, phase) if hessian else None
         check = GradientCheck([n.slope for n in numbers], tolerance, hessian=second)
         plain = [n for n in numbers if n.forward]
-        reasons, left = explained(subject, plain, check.agrees, own, clock.turn, phase)
-        picture = marked(subject.seen, reasons)
+        reasons, left = explained(subject, plain, check.agrees, own_loss, clock.turn, phase)
+        picture = marked(subject.rendered, reasons)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
     notes += [f"the differences of {rough} are of fewer samples than asked for"] if rough else []
     if second is not None and len(second.names) < len(numbers):
         notes.append(f"second derivatives are of {len(second.names)} numbers")
     notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
-    told = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
+    remarks = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
     if len(plain) < len(numbers):
-        told.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
-    return check._replace(reasons=reasons, picture=picture, note=" ".join(told))
+        remarks.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
+    return check._replace(reasons=reasons, picture=picture, note=" ".join(remarks))
 
 
 # --------------------------------------------------------------------------------------------------- parameters
@@ -251,10 +251,10 @@ def _traceable(engine: Engine) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        told = untraceable(error, engine)
-        if told is None:
+        refusal = untraceable(error, engine)
+        if refusal is None:
             raise
-        raise told from error
+        raise refusal from error
 
 
 def _differentiable(parameters: Tree, caller: str) -> tuple[Engine, Tree]:
@@ -265,16 +265,16 @@ def _differentiable(parameters: Tree, caller: str) -> tuple[Engine, Tree]:
     return engine, map_leaves(lambda p: p, parameters)
 
 
-def _check_function(name: str, given: Any, expected: str) -> None:
-    if not callable(given):
-        raise InputError(f"{name} is {quoted(given)}; expected {expected}")
+def _check_function(name: str, function: Any, expected: str) -> None:
+    if not callable(function):
+        raise InputError(f"{name} is {quoted(function)}; expected {expected}")
 
 
 def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
     """The direction as arrays of the engine and of the parameters' dtypes; other names or shapes are refused."""
-    given, wanted = ([(name, tuple(np.shape(x))) for name, x in named_leaves(t)] for t in (direction, parameters))
-    if given != wanted:
-        raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")
+    shapes, expected = ([(name, tuple(np.shape(x))) for name, x in named_leaves(t)] for t in (direction, parameters))
+    if shapes != expected:
+        raise InputError(f"direction has arrays of shapes {shapes}; expected those of the parameters, {expected}")
     if engine_of(direction, parameters) is not engine:  # Arrays of two engines are refused by `engine_of`.
         raise InputError(f"direction holds arrays of another engine; expected {engine.name}")
     values = iter(leaves(direction))

@@ -22,7 +22,7 @@ from rts.fitting.dependence import differentiable
 from rts.fitting.descent import Method, Validation, checked_rates, descend
 from rts.fitting.least_squares import levenberg_marquardt
 from rts.fitting.losses import SQUARE, Loss
-from rts.fitting.parameter_names import listed, named_leaves, one_line
+from rts.fitting.parameter_names import named_leaves, names_in_words, one_line
 from rts.fitting.processes import Processes
 from rts.fitting.run import LONGEST_REASON, Astray, Report, Run, progress_bar
 from rts.fitting.saving import Saving
@@ -77,7 +77,7 @@ class Fit(NamedTuple):
         held = [f"{name} {tuple(x.shape)}" for name, x in named_leaves(self.parameters)]
         return (
             f"loss {first}{self.loss:.4g} in {steps} and {self.seconds:.3g} s\n"
-            f"{one_line(self.reason, LONGEST_REASON)}\nparameters: {listed(held, 6)}"
+            f"{one_line(self.reason, LONGEST_REASON)}\nparameters: {names_in_words(held, 6)}"
         )
 
 
@@ -187,10 +187,18 @@ def fit(
                 run.validates = judge is not None
                 run.patience = patience or max(PATIENCE, 3 * judge.every if judge else 0)
                 if isinstance(reduced, Loss) and title == "lm":
-                    own = fits and overrides(stage, "normal_equations", Residuals)
+                    own_equations = fits and overrides(stage, "normal_equations", Residuals)
                     supersample = getattr(stage, "supersample", None)
                     levenberg_marquardt(
-                        terms, parameters, engine, run, saving, jit=jit, loss=reduced, own=own, supersample=supersample
+                        terms,
+                        parameters,
+                        engine,
+                        run,
+                        saving,
+                        jit=jit,
+                        loss=reduced,
+                        own_equations=own_equations,
+                        supersample=supersample,
                     )
                 else:
                     descend(terms, reduced, parameters, engine, optimizer, run, saving, jit=jit, validation=judge)
@@ -200,9 +208,9 @@ def fit(
         runs.append(run)
         if run.best is not None:
             parameters = run.best
-        if run.asked:
+        if run.stop_requested:
             break
-    return _outcome(parameters, runs, runs[-1].told(names), time.perf_counter() - start)
+    return _outcome(parameters, runs, runs[-1].summary(names), time.perf_counter() - start)
 
 
 def _outcome(parameters: Tree, runs: Sequence[Run], reason: str, seconds: float) -> Fit:
@@ -304,9 +312,9 @@ def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[C
     """The loss at a stage of the residuals `whole`, and True if the stage's `normal_equations` are for it."""
     if loss is not None and not overrides(stage, "normal_equations", Residuals):
         return loss, False
-    own = _own_loss(stage)
-    taken = (own or _own_loss(whole) or SQUARE) if loss is None else loss
-    return taken, (own or SQUARE) == taken
+    stage_loss = _own_loss(stage)
+    taken = (stage_loss or _own_loss(whole) or SQUARE) if loss is None else loss
+    return taken, (stage_loss or SQUARE) == taken
 
 
 def _own_loss(residuals: Residuals) -> Loss | None:

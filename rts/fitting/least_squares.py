@@ -91,11 +91,11 @@ class _Model:
             damping: positive number, added to the eigenvalues of the scaled JᵀSJ.
         """
         along = self._downhill / (self._values + damping)
-        step = self._directions @ along
+        change = self._directions @ along
         if self._open is not None:
-            step = step * self.units
-            step = (step - self._open @ (self._open.T @ step)) / self.units
-        return step, float(along @ (damping * along + self._downhill))
+            change = change * self.units
+            change = (change - self._open @ (self._open.T @ change)) / self.units
+        return change, float(along @ (damping * along + self._downhill))
 
 
 class _Control:
@@ -123,12 +123,12 @@ class _Control:
         Raises:
             InputError: the bytes are no such state, or the vector is not like the other one.
         """
-        known, own = arrays_in(packed) or {}, {"vector": like, **vars(self)}
-        sound = all(name in known and is_like(known[name], np.asarray(value)) for name, value in own.items())
-        if not sound or not (known["damping"] > 0 and known["growth"] > 0):
+        arrays, expected = arrays_in(packed) or {}, {"vector": like, **vars(self)}
+        sound = all(name in arrays and is_like(arrays[name], np.asarray(value)) for name, value in expected.items())
+        if not sound or not (arrays["damping"] > 0 and arrays["growth"] > 0):
             raise InputError("the state of its method is damaged")
-        self.__dict__.update({name: known[name].item() for name in vars(self)})
-        return known["vector"]
+        self.__dict__.update({name: arrays[name].item() for name in vars(self)})
+        return arrays["vector"]
 
 
 def _split(x: np.ndarray, sizes: Sequence[int]) -> list[np.ndarray]:
@@ -144,7 +144,7 @@ def levenberg_marquardt(
     *,
     jit: bool,
     loss: Loss,
-    own: bool,
+    own_equations: bool,
     supersample: int | None,
 ) -> None:
     """Minimise a loss of residuals by normal equations; `run` records the steps and keeps the result.
@@ -164,7 +164,7 @@ def levenberg_marquardt(
         saving: keeps checkpoints, and gives the state to go on from.
         jit: True to compile.
         loss: the loss of the residuals.
-        own: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
+        own_equations: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
         supersample: samples a pixel along each axis, for words on why the fit stopped; None if no images are fitted.
 
     Raises:
@@ -175,7 +175,7 @@ def levenberg_marquardt(
         raise InputError('method "lm" needs all terms at every step; leave out batch and window, or use "adam"')
     vector, unflatten = flatten(parameters)
     sizes = [math.prod(x.shape) for x in leaves(parameters)]
-    linearize, loss_at = _least_squares(terms, loss, own, parameters, engine, run, jit)
+    linearize, loss_at = _least_squares(terms, loss, own_equations, parameters, engine, run, jit)
     control = _Control()
 
     def taken(linear: _Linear, start: bool) -> tuple[_Linear, _Model]:
@@ -310,7 +310,7 @@ def normal_equations(
 
 
 def _least_squares(
-    terms: Terms, loss: Loss, own: bool, parameters: Tree, engine: Engine, run: Run, jit: bool
+    terms: Terms, loss: Loss, own_equations: bool, parameters: Tree, engine: Engine, run: Run, jit: bool
 ) -> tuple[Callable, Callable]:
     """Two functions of a vector (U,) of parameters: to a `_Linear`, on the host; and to the loss alone, a float.
 
@@ -319,8 +319,8 @@ def _least_squares(
     vector, unflatten = flatten(parameters)
 
     def equations(v: Array, data: Tree) -> tuple[Array, Array, Array]:
-        if own:
-            return _checked_equations(terms.own(data).normal_equations(unflatten(v)), v.shape[0], engine)
+        if own_equations:
+            return _checked_equations(terms.unchecked(data).normal_equations(unflatten(v)), v.shape[0], engine)
         return normal_equations(terms.of(data), unflatten(v), engine, loss)
 
     def value_at(v: Array, data: Tree) -> tuple[Array]:

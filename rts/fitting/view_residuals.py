@@ -142,8 +142,8 @@ class ViewResiduals(Residuals):
     @property
     def supersample(self) -> int:
         """Samples a pixel along each axis."""
-        own = None if self._stage is None else self._stage.supersample
-        return self._like.supersample if own is None else own
+        of_stage = None if self._stage is None else self._stage.supersample
+        return self._like.supersample if of_stage is None else of_stage
 
     def __repr__(self) -> str:
         return f"ViewResiduals({len(self.views)} views)"
@@ -293,10 +293,10 @@ class ViewResiduals(Residuals):
 
 
 def _checked_views(views: Any) -> list[View]:
-    listed = list(views) if isinstance(views, (list, tuple)) else []
-    if not listed or not all(isinstance(view, View) for view in listed):
+    checked = list(views) if isinstance(views, (list, tuple)) else []
+    if not checked or not all(isinstance(view, View) for view in checked):
         raise InputError(f"views is {quoted(views)}; expected a list of at least one view, such as of rts.load_views")
-    return listed
+    return checked
 
 
 def _check_functions(scene: Any, cameras: Any, exposure: Any, target: Any) -> None:
@@ -328,6 +328,6 @@ def _checked_draws(batch: Any, window: Any, views: Sequence[View]) -> tuple[int 
     height, width = check_pixels(window)
     for view in views:
         if height > view.size[0] or width > view.size[1]:
-            given = f"window is {quoted(window)}, and the view {view.name} has {view.size} pixels"
-            raise InputError(f"{given}; expected a window within every view")
+            problem = f"window is {quoted(window)}, and the view {view.name} has {view.size} pixels"
+            raise InputError(f"{problem}; expected a window within every view")
     return None if batch is None else int(batch), (height, width)

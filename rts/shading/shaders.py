@@ -249,12 +249,12 @@ def _lit(
             _check(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
     colors = [DEFAULT_DIFFUSE]
     if "color" in light:
-        colors = _listed(light["color"])
+        colors = _separate_vectors(light["color"])
     if "direction" in light:
         vectors = value_of(light["direction"])
         if vectors is not None and not vectors.any(axis=-1).all():
             raise InputError("theta['light']['direction'] is zero; expected vectors towards the lights, of any length")
-        directions = _listed(unit(light["direction"]))
+        directions = _separate_vectors(unit(light["direction"]))
     else:
         directions = [camera.to_world(DEFAULT_LIGHT)]
     if len(colors) not in (1, len(directions)):
@@ -264,7 +264,7 @@ def _lit(
     return light.get("ambient", DEFAULT_AMBIENT), list(zip(directions, colors, strict=True))
 
 
-def _listed(vectors: Array) -> list[Array]:
+def _separate_vectors(vectors: Array) -> list[Array]:
     """The vectors (3,) of an array (3,) or (L, 3)."""
     vectors = namespace(vectors).reshape(vectors, (-1, 3))
     return [vectors[i, :] for i in range(vectors.shape[0])]

@@ -50,11 +50,11 @@ class Plain(Splatter):
         check_rows(row, rgba.shape[0])
         xp = namespace(rgba)
         # Zero, but connected to the positions, so that their derivative exists and is zero.
-        image = 0 * xp.sum(positions)
+        composite = 0 * xp.sum(positions)
         for k in reversed(range(row.shape[0])):
             layer = xp.where((row[k] >= 0)[..., None], unpack(rgba, row[k]), 0.0)
-            image = over(layer, image)
-        return image
+            composite = over(layer, composite)
+        return composite
 
 
 @dataclass(frozen=True)

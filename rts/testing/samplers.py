@@ -114,12 +114,12 @@ class SamplerConformance(Conformance):
 
     def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
         """Two calls agree to the last bit; parts with new θ on the same surfaces, sampled in between, are right."""
-        between = [_scaled(part, 0.9) for part in parts]
-        expected = [right(part, scenes.AXES[2], sampler) for part in between]
+        scaled_parts = [_scaled(part, 0.9) for part in parts]
+        expected = [right(part, scenes.AXES[2], sampler) for part in scaled_parts]
         silhouettes = Silhouettes()
         for view, camera, part in _scenes(parts):
             first = scenes.find(part, camera, sampler)
-            for i, (other, like) in enumerate(zip(between, expected, strict=True)):
+            for i, (other, like) in enumerate(zip(scaled_parts, expected, strict=True)):
                 sampled = scenes.find(other, scenes.AXES[2], sampler)
                 silhouettes += claim_like(sampled, like, f"part {i} with new arrays in θ, after {view}")
             _claim_same(scenes.find(part, camera, sampler), first, view)
@@ -132,8 +132,11 @@ class SamplerConformance(Conformance):
         for index, part in enumerate(parts):
             held = prepare(part, sampler, camera=scenes.CAMERA, size=scenes.SIZE)
             for moved in (part, part.replace(transform=turn)):
-                own, whole = held.replace(transform=moved.transform), {"splatter": None, "layers": scenes.LAYERS}
-                sampled = sample(own, scenes.CAMERA, scenes.SIZE, **whole)
+                moved_parts, whole = (
+                    held.replace(transform=moved.transform),
+                    {"splatter": None, "layers": scenes.LAYERS},
+                )
+                sampled = sample(moved_parts, scenes.CAMERA, scenes.SIZE, **whole)
                 silhouettes += claim_like(sampled, right(moved, scenes.CAMERA, sampler), f"part {index}, prepared")
         silhouettes.claim_few("prepared, ")
 
@@ -189,10 +192,10 @@ class SamplerConformance(Conformance):
         y, x = np.append(y, y[:1]), np.append(x, x[:1])  # One of them twice.
         for index, part in enumerate(map(scenes.checked, parts)):
             for move, layers in (((0.0, 0.0), 3), ((0.3, -0.21), 2)):
-                own = scenes.CAMERA.for_size(scenes.SIZE).within(part.transform)
-                centred = scenes.shifted(scenes.shifted(own, -move[0], 0), move[1], 1)
+                camera = scenes.CAMERA.for_size(scenes.SIZE).within(part.transform)
+                centred = scenes.shifted(scenes.shifted(camera, -move[0], 0), move[1], 1)
                 request = Request(points=np.column_stack([x, y]) + 0.5 + move, triangles=True)
-                found = chosen.sample(part, own, scenes.SIZE, layers, request)
+                found = chosen.sample(part, camera, scenes.SIZE, layers, request)
                 if not found.at_points:
                     pytest.skip("the sampler samples whole grids")
                 whole = chosen.sample(part, centred, scenes.SIZE, layers, Request(triangles=True))

@@ -96,7 +96,7 @@ class Raster(TriangleSampler):
         return fragments
 
 
-class _List(NamedTuple):
+class _TriangleList(NamedTuple):
     """Triangles that may cover a pixel's centre, in the form that `draw` takes.
 
     Attributes:
@@ -150,18 +150,18 @@ def _drawn(
     chunks, bands = -(-len(blocks) // PER_CHUNK), -(-height // BAND_ROWS)
     # Threads should not write to neighbouring memory.
     spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, bands), np.int64)
-    given = blocks, faces, vertices, screen, matrix, height, width, step, keep
-    parallel(_select, chunks, *given, (rows, spans, counts), work=10 * SIZE * len(blocks))
-    listed = _sorted(keep, order, rows, spans, counts)
+    geometry = blocks, faces, vertices, screen, matrix, height, width, step, keep
+    parallel(_select, chunks, *geometry, (rows, spans, counts), work=10 * SIZE * len(blocks))
+    triangles = _sorted(keep, order, rows, spans, counts)
 
     numbers = np.empty((4, layers, height * width), np.float32)  # One array, not three: the system clears fewer pages.
     ids, barycentrics, depth = numbers[0].view(np.int32), numbers[1:3].reshape(layers, -1, 2), numbers[3]
-    parallel(draw, bands, listed, vertices, matrix, -camera.view[2], size, (ids, barycentrics, depth))
+    parallel(draw, bands, triangles, vertices, matrix, -camera.view[2], size, (ids, barycentrics, depth))
     shape = layers, height, width
     return Fragments(ids.reshape(shape), barycentrics.reshape(*shape, 2), depth.reshape(shape))
 
 
-def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
+def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _TriangleList:
     """The list that `_select` wrote to `rows`, `spans` and `counts`, sorted by bands of rows of pixels.
 
     In `rows`, indices of triangles are replaced by those in the proxy, in place.
@@ -171,7 +171,7 @@ def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray,
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
         parallel(_sort, len(spans), order, rows, spans, places, items, work=8 * len(items))
-    return _List(keep, np.argsort(-sums), offsets, items, rows)
+    return _TriangleList(keep, np.argsort(-sums), offsets, items, rows)
 
 
 @loop
@@ -215,8 +215,8 @@ def _select(first, last, blocks, faces, vertices, screen, matrix, height, width,
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
-    chosen, step = np.empty(LONG_BLOCK, np.uint32), np.float32(step)
-    given, place = (vertices, matrix, height, width, step), first * CHUNK
+    near_ones, step = np.empty(LONG_BLOCK, np.uint32), np.float32(step)
+    geometry, place = (vertices, matrix, height, width, step), first * CHUNK
     for chunk in range(first, last):
         made[1][chunk, 0] = place
         for n in range(chunk * PER_CHUNK, min(len(blocks), (chunk + 1) * PER_CHUNK)):
@@ -225,7 +225,7 @@ def _select(first, last, blocks, faces, vertices, screen, matrix, height, width,
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
             _look(len(block), xy, height, width, step, np.float32(keep), box, clips, near)
-            place = _list(chunk, start, block, near, box, clips, chosen, given, place, made)
+            place = _append(chunk, start, block, near, box, clips, near_ones, geometry, place, made)
         made[1][chunk, 1] = place
 
 
@@ -262,18 +262,18 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 
 
 @compiled(inline="always")
-def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
+def _append(chunk, start, block, near, box, clips, near_ones, geometry, place, made):
     """Write the triangles of a block that are marked `near` to the list `made`, from row `place` on; count their bands.
 
     Left out are clipped ones that cover no centre. Returns the next free row.
     """
-    vertices, matrix, height, width, step = given
-    listed, _, counts = made
+    vertices, matrix, height, width, step = geometry
+    rows, _, counts = made
     count = 0
     for b in range(len(block)):
-        chosen[count] = b
+        near_ones[count] = b
         count += near[b]
-    for b in chosen[:count]:
+    for b in near_ones[:count]:
         i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
         if clips[b]:
             corners = np.empty((3, 4))
@@ -283,9 +283,9 @@ def _list(chunk, start, block, near, box, clips, chosen, given, place, made):
             i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
             if i0 > i1 or j0 > j1:
                 continue
-        listed[place, 0] = start + b
-        listed[place, 1], listed[place, 2], listed[place, 3] = block[b, 0], block[b, 1], block[b, 2]
-        listed[place, 4], listed[place, 5], listed[place, 6], listed[place, 7] = i0, i1, j0, j1
+        rows[place, 0] = start + b
+        rows[place, 1], rows[place, 2], rows[place, 3] = block[b, 0], block[b, 1], block[b, 2]
+        rows[place, 4], rows[place, 5], rows[place, 6], rows[place, 7] = i0, i1, j0, j1
         place += 1
         for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
             counts[chunk, band] += 1
@@ -329,7 +329,7 @@ def _clipped_box(corners, width, height):
 
 
 @loop
-def _sort(first, last, order, listed, spans, places, items):
+def _sort(first, last, order, rows, spans, places, items):
     """Sort a list by bands: write the rows of each band's triangles to `items`, from `places` (chunks, bands) on.
 
     Only chunks [first, last) are sorted; `places` move on. In the list, `order` replaces triangles' indices by those of
@@ -338,8 +338,8 @@ def _sort(first, last, order, listed, spans, places, items):
     for chunk in range(first, last):
         if len(order) > 0:
             for n in range(spans[chunk, 0], spans[chunk, 1]):
-                listed[n, 0] = order[listed[n, 0]]
+                rows[n, 0] = order[rows[n, 0]]
         for n in range(spans[chunk, 0], spans[chunk, 1]):
-            for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
+            for band in range(rows[n, 6] // BAND_ROWS, rows[n, 7] // BAND_ROWS + 1):
                 items[places[chunk, band]] = n
                 places[chunk, band] += 1

@@ -303,7 +303,7 @@ class TorchEngine(Engine):
 
         return call
 
-    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
+    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, original: Tree = None) -> Any:
         """See `Engine.optimizer`: torch's `Adam` or `SGD`, or a `torch.optim.Optimizer`, on copies of parameters."""
         from rts_backends.torch_engine.optimizer import Optimizer
 
@@ -312,4 +312,4 @@ class TorchEngine(Engine):
                 f"method is {quoted(method)}; expected one of adam, sgd, lm, or a torch.optim.Optimizer, such as "
                 f"torch.optim.Adam([parameters], lr=0.01), for torch tensors"
             )
-        return Optimizer(method, learning_rate, parameters, parameters if given is None else given)
+        return Optimizer(method, learning_rate, parameters, parameters if original is None else original)

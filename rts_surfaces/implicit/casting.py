@@ -79,9 +79,9 @@ def box(low: np.ndarray, high: np.ndarray) -> Region:
             (engine.constant(corner, origins) - origins) / xp.where(along, 1.0, directions) for corner in (low, high)
         ]
         # Rays along a plane are between it and the opposite one for ever, or never.
-        between = (ends[0] <= 0) & (ends[1] >= 0)
+        inside = (ends[0] <= 0) & (ends[1] >= 0)
         far = xp.full_like(directions, xp.inf)
-        never = xp.where(between, -far, far)
+        never = xp.where(inside, -far, far)
         first = xp.where(along, never, xp.minimum(*ends))
         last = xp.where(along, -never, xp.maximum(*ends))
         return _ahead(xp.max(first, axis=-1), xp.min(last, axis=-1))
@@ -231,8 +231,8 @@ def deepest(
     passed = state["high"] > 0
     state = {"low": state["low"], "high": state["high"]}
     state = engine.repeat(halve, lambda state: xp.any(state["high"] > state["low"]), state, HALVINGS)
-    apart = APART * reach + 4 * xp.finfo(points.dtype).eps * xp.max(xp.abs(points), axis=-1)
-    sides = xp.maximum(state["low"] - apart, begin), state["high"] + apart
+    margin = APART * reach + 4 * xp.finfo(points.dtype).eps * xp.max(xp.abs(points), axis=-1)
+    sides = xp.maximum(state["low"] - margin, begin), state["high"] + margin
     slopes, levels = [slope_at(t) for t in sides], [value_at(at(t)) for t in sides]
     # Squares of small slopes are no numbers of single precision.
     largest = xp.max(xp.abs(xp.concat(slopes, axis=-1)), axis=-1)

@@ -163,12 +163,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """The surface on coarser lattices, and, if it is of a function, on a finer one."""
-        count, rates = self.field.lattice(theta).count, []
+        count, offered = self.field.lattice(theta).count, []
         for shape, field, change in self.field.resampled(theta):
             other = copy.copy(self)
             other.field, other._usual = field, {}
-            rates.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
-        return rates
+            offered.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
+        return offered
 
     # ----------------------------------------------------------------------------------- triangles and samples
 
@@ -273,9 +273,9 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         if "corners" in inputs:
             corners = np.concatenate([inputs["corners"], inputs["inner"]])
             band = corners, *rows_by_place(inputs["numbers"][corners[:, 0]], lattice.shape)
-        given = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
-        given = *given, *rays[:2], *beside[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
-        parallel(lattice_outlines_loops.outlines, count, *given, *results, work=4000 * count)
+        arguments = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
+        arguments = *arguments, *rays[:2], *beside[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
+        parallel(lattice_outlines_loops.outlines, count, *arguments, *results, work=4000 * count)
         points, params, there = results
         ids, tables = self.field.in_tables(points, tables)
         return ids, params, there, tables
@@ -302,8 +302,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return cast(
             partial(self._capped if self.closed else self.field.level, theta),
             partial(self._moving, theta),
-            self.field.suited(theta, origins),
-            self.field.suited(theta, directions),
+            self.field.in_theta_dtype(theta, origins),
+            self.field.in_theta_dtype(theta, directions),
             layers,
             within=box(low - margin, high + margin),
             lipschitz=self.lipschitz,
@@ -312,7 +312,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; caps do not move."""
-        points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
+        points, directions, reach = (self.field.in_theta_dtype(theta, x) for x in (points, directions, reach))
         level = partial(self._capped if self.closed else self.field.level, theta)
         return deepest(level, lambda x: level(x) <= self.field.level(theta, x), points, directions, reach)
 

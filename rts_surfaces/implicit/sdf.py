@@ -86,8 +86,8 @@ class Sdf(Implicit, RaySurface):
         return cast(
             level,
             partial(moving, level),
-            self.field.suited(theta, origins),
-            self.field.suited(theta, directions),
+            self.field.in_theta_dtype(theta, origins),
+            self.field.in_theta_dtype(theta, directions),
             layers,
             within=ball(self.center, self.radius),
             lipschitz=self.lipschitz,
@@ -100,6 +100,6 @@ class Sdf(Implicit, RaySurface):
 
     def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; in θ's dtype."""
-        points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
+        points, directions, reach = (self.field.in_theta_dtype(theta, x) for x in (points, directions, reach))
         level, xp = partial(self.field.level, theta), namespace(points)
         return deepest(level, lambda x: xp.ones_like(x[:, 0], dtype=xp.bool), points, directions, reach)

@@ -220,11 +220,11 @@ def _check_pairs(cage: Cage) -> None:
     outer = np.zeros(len(valence), bool)
     for ends in _ends(cage):
         outer[ends[~inner]] = True
-    between = cage.indices[(owner == f) & (valence[cage.indices] == 2) & ~outer[cage.indices]]
-    if len(between):
+    inner_vertices = cage.indices[(owner == f) & (valence[cage.indices] == 2) & ~outer[cage.indices]]
+    if len(inner_vertices):
         raise InputError(
-            f"only faces {f} and {g} meet at vertex {between[0]}, which is inside the cage; expected 3 faces or more "
-            f"there: leave the vertex out"
+            f"only faces {f} and {g} meet at vertex {inner_vertices[0]}, which is inside the cage; expected 3 faces or "
+            f"more there: leave the vertex out"
         )
     raise InputError(f"faces {f} and {g} share {count[twice[0]]} edges; expected at most one: divide one of them")
 

@@ -1,6 +1,6 @@
 """The triangles of tiles that are cut, compiled.
 
-Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
+Tiles, their tables and their local coordinates are those of `rts_surfaces.patches.tiles.Tiles`. It imports numba.
 """
 
 from __future__ import annotations

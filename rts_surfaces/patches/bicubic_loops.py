@@ -107,8 +107,8 @@ def normals(
 
     A normal that does not exist is zero.
     """
-    given = _nets(rows, table), patch, params, rows.dtype.type(collapsed)
-    parallel(_fill_normals, len(out), *given, out, work=60 * len(out))
+    arguments = _nets(rows, table), patch, params, rows.dtype.type(collapsed)
+    parallel(_fill_normals, len(out), *arguments, out, work=60 * len(out))
 
 
 def push_normals(
@@ -116,8 +116,8 @@ def push_normals(
 ) -> None:
     """Fill the second of `moved`, (N, 3), with the derivatives of normals along the first, (V, 3), tangents of rows."""
     tangents, out = moved
-    given = _nets(rows, table), _nets(tangents, table), patch, params, rows.dtype.type(collapsed)
-    parallel(_move_normals, len(out), *given, out, work=120 * len(out))
+    arguments = _nets(rows, table), _nets(tangents, table), patch, params, rows.dtype.type(collapsed)
+    parallel(_move_normals, len(out), *arguments, out, work=120 * len(out))
 
 
 def pull_normals(
@@ -132,8 +132,8 @@ def pull_normals(
     """Add to `result` (V, 3), the gradient of the rows, from g (N, 3), the gradient of the normals."""
     nets = _nets(rows, table)
     found = np.zeros((SHARES, *nets.shape), nets.dtype)
-    given = nets, patch, params, rows.dtype.type(collapsed), g, found
-    parallel(_pull_normal_shares, SHARES, *given, work=80 * len(g))
+    arguments = nets, patch, params, rows.dtype.type(collapsed), g, found
+    parallel(_pull_normal_shares, SHARES, *arguments, work=80 * len(g))
     _scatter(table, found, result)
 
 
@@ -257,14 +257,14 @@ def _tangents(net, u, v, collapsed, work):
         uu += along_u * along_u
         vv += along_v * along_v
     # Along a side v = 0 that is a point, the derivative in u is zero; along u = 0, that in v.
-    first, second = zero, zero
+    sign_u, sign_v = zero, zero
     if uu < collapsed * collapsed * vv:
-        first = one if v < half else -one
-        work[4] = first * work[6]
+        sign_u = one if v < half else -one
+        work[4] = sign_u * work[6]
     if vv < collapsed * collapsed * uu:
-        second = one if u < half else -one
-        work[5] = second * work[6]
-    return first, second
+        sign_v = one if u < half else -one
+        work[5] = sign_v * work[6]
+    return sign_u, sign_v
 
 
 @compiled
@@ -299,13 +299,13 @@ def _move_normals(start, stop, nets, tangents, patch, params, collapsed, out):
     work, moved, normal = np.zeros((7, 4), nets.dtype), np.zeros((7, 4), nets.dtype), np.empty(3, nets.dtype)
     for n in range(start, stop):
         u, v = params[n, 0], params[n, 1]
-        first, second = _tangents(nets[patch[n]], u, v, collapsed, work)
+        sign_u, sign_v = _tangents(nets[patch[n]], u, v, collapsed, work)
         # The same choice of tangents as at the points themselves.
         _tangents(tangents[patch[n]], u, v, nets.dtype.type(0), moved)
-        if first != 0:
-            moved[4] = first * moved[6]
-        if second != 0:
-            moved[5] = second * moved[6]
+        if sign_u != 0:
+            moved[4] = sign_u * moved[6]
+        if sign_v != 0:
+            moved[5] = sign_v * moved[6]
         length = _unit_product(work, normal)
         along = nets.dtype.type(0)
         for c in range(3):
@@ -335,7 +335,7 @@ def _pull_normals(start, stop, nets, patch, params, collapsed, g, found):
     for n in range(start, stop):
         if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
             continue
-        first, second = _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)
+        sign_u, sign_v = _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)
         length = _unit_product(work, normal)
         along = g[n, 0] * normal[0] + g[n, 1] * normal[1] + g[n, 2] * normal[2]
         for c in range(3):
@@ -348,7 +348,7 @@ def _pull_normals(start, stop, nets, patch, params, collapsed, g, found):
         for i in range(4):
             for j in range(4):
                 mixed = da[i] * db[j]
-                w = da[i] * b[j] if first == 0 else first * mixed
-                x = a[i] * db[j] if second == 0 else second * mixed
+                w = da[i] * b[j] if sign_u == 0 else sign_u * mixed
+                x = a[i] * db[j] if sign_v == 0 else sign_v * mixed
                 for c in range(3):
                     to[4 * i + j, c] += w * to_first[c] + x * to_second[c]

@@ -16,7 +16,7 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_surfaces.view_cells import View
+from rts_surfaces.patches.view_cells import View
 
 MOST = 256
 """The largest rate: the number of pieces into which a side of a tile is cut."""
@@ -168,7 +168,7 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
         points: the function that evaluates the surface.
         beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
-    from rts_surfaces import tile_rates_loops
+    from rts_surfaces.patches import tile_rates_loops
 
     (count, width), edges = tiles.corners.shape, len(tiles.edge_tiles)
     grid = GRID[width]
@@ -237,7 +237,7 @@ def allowed_in(view: View, tile_shapes: Shapes, fine: float, coarse: float) -> A
         fine: distance in pixels where a tile or an edge may have an outline.
         coarse: distance in pixels elsewhere.
     """
-    from rts_surfaces import tile_rates_loops
+    from rts_surfaces.patches import tile_rates_loops
 
     count, angle = len(tile_shapes.bends), min(view.angle, math.pi / 2)
     allowed = Allowed(np.empty(count), np.empty(count), np.empty(count, np.int8))
@@ -253,7 +253,7 @@ def by_error(tiles: Tiles, tile_shapes: Shapes, allowed: Allowed) -> tuple[np.nd
 
     No rate is above `MOST`, even if distances are then exceeded.
     """
-    from rts_surfaces import tile_rates_loops
+    from rts_surfaces.patches import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
     tile_rates_loops.rates(
@@ -292,7 +292,7 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
     Raises:
         InputError: more than `MOST_TRIANGLES` triangles.
     """
-    from rts_surfaces import tiles_loops
+    from rts_surfaces.patches import tiles_loops
 
     count, width = tiles.corners.shape
     total = int(tiles_loops.counted(inner, tiles.sides, edges))
@@ -319,7 +319,7 @@ def _places(
     `edges` (E,) and `inner` (n, 2) are rates. `edge_first` (E + 1,) and `inner_first` (n + 1,) are the first vertex
     within each edge and each tile, and one after the last.
     """
-    from rts_surfaces import tiles_loops
+    from rts_surfaces.patches import tiles_loops
 
     shape = _CORNERS[tiles.corners.shape[1]]
     total = int(inner_first[-1])
