@@ -376,6 +376,7 @@ class Sdf(_BuiltInRays):
         center: ArrayLike = (0.0, 0.0, 0.0),
         isovalue: float = 0.0,
         inside: str = "below",
+        *,
         lipschitz: float | None = 1.0,
         reads: Sequence[str] | None = None,
         attributes: Mapping[str, _Function] | None = None,
