@@ -28,7 +28,8 @@ from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
-from rts.diagnostics.gradients import check_gradient, gradient_image
+from rts.diagnostics.gradient_images import gradient_image
+from rts.diagnostics.gradients import check_gradient
 from rts.errors import InputError, PluginError, RtsError, RtsWarning
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load

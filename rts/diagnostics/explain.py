@@ -10,7 +10,7 @@ import numpy as np
 from rts.advice.unread_entries import Observed, likely_name, shaded_by, unread
 from rts.advice.winding import INSIDE_OUT, is_inside_out
 from rts.arrays.engines import engine_of
-from rts.contracts.checks import CheckedPart, check_scene
+from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.records import Samples
 from rts.contracts.shader import FunctionShader
 from rts.registry import name_of

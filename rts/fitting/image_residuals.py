@@ -12,22 +12,14 @@ from rts.arrays.array_functions import described, from_numbers, is_finite, kind_
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import (
-    CheckedPart,
-    check_background,
-    check_cameras,
-    check_floating,
-    check_ratio,
-    check_sampler,
-    check_scene,
-    is_count,
-)
+from rts.contracts.checked_parts import CheckedPart, check_cameras, check_scene
+from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count
 from rts.contracts.records import Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
 from rts.errors import InputError
-from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
+from rts.fitting.normal_equations import flatten, normal_equations
 from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients

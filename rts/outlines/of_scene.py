@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns

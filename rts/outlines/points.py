@@ -11,7 +11,7 @@ import numpy as np
 from rts.arrays.engines import engine_of, exemplar, stopped, value_of
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.compiling.threads import each
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn

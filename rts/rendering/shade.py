@@ -13,9 +13,10 @@ from rts.arrays.array_functions import described, kind_of, shape_of
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import Context, is_constant, namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import CheckedPart, check_shaded
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
+from rts.contracts.result_checks import check_shaded
 from rts.errors import InputError
 from rts.operations.linear import affine_map
 from rts.scene.camera import Camera

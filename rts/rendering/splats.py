@@ -9,8 +9,9 @@ import numpy as np
 
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import CheckedPart, check_splats
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats
+from rts.contracts.result_checks import check_splats
 from rts.errors import InputError
 from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
 from rts.sampling.scene import Grid

@@ -10,12 +10,12 @@ import numpy as np
 
 from rts.arrays.engines import context_of, floating_bits, is_constant, stopped
 from rts.arrays.trees import Array, leaves, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
+from rts.sampling.camera_checks import check_camera
 from rts.sampling.layer_order import rays_of
-from rts.sampling.sample_checks import check_camera
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

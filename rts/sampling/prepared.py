@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from rts.arrays.argument_checks import check_pixels
-from rts.contracts.checks import check_changes, check_sampler, check_scene, sampler_for_part
+from rts.contracts.checked_parts import check_changes, check_scene
+from rts.contracts.checks import check_sampler, sampler_for_part
 from rts.sampling.cache import Entry
 from rts.scene.camera import Camera
 from rts.scene.parts import Part

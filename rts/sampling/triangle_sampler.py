@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -19,11 +18,8 @@ from rts.errors import InputError, PluginError
 from rts.plugin_base import overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.host_call import HostCall, SampleBounds
-from rts.sampling.layer_order import on_surface, refined
-from rts.sampling.packing import pack_fragments, repack
-from rts.sampling.pairs import with_pairs
-from rts.sampling.points import at_points
-from rts.sampling.sample_checks import check_faces, check_fragments, checked_proxy
+from rts.sampling.sample_checks import check_faces, checked_proxy
+from rts.sampling.triangle_search import TriangleSearch
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
@@ -31,10 +27,6 @@ _T = TypeVar("_T")
 
 NOTHING_ELSE = Request()
 """A request for all samples, and nothing else."""
-
-LEAST_LAYERS = 3
-"""Fewest layers of triangles to draw for a surface that moves its samples; for K layers, K + 1 if that is more. At an
-outline both sides of a fold of triangles may lie beside the surface."""
 
 
 class TriangleSampler(Sampler):
@@ -193,7 +185,7 @@ class TriangleSampler(Sampler):
 
         def find(cameras: Sequence[Camera], inputs: Tree, *further: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             host_points = np.asarray(further[0], np.float64) if further else None
-            search = _Search(self, surface, part.cull, inputs, cameras[0], bounds, tables, entry, host_points)
+            search = TriangleSearch(self, surface, part.cull, inputs, cameras[0], bounds, tables, entry, host_points)
             samples = search.moved() if moves else search.in_place(request.uniform, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
@@ -237,96 +229,6 @@ class TriangleSampler(Sampler):
         return overrides(self, "update", TriangleSampler)
 
 
-@dataclass(frozen=True)
-class _Search:
-    """The search for the samples of one view, on the host.
-
-    Attributes:
-        sampler: draws the triangles.
-        surface: the surface.
-        cull: the part's `cull`.
-        inputs: the result of the surface's `proxy_inputs`, on the host.
-        camera: host matrices.
-        bounds: bounds on the number of samples.
-        tables: the result of the surface's `table_specs`.
-        entry: the surface's prepared entry; None to look it up, or to build it.
-        points: (1, M, 2), the points to sample; None for the centres of all cells.
-    """
-
-    sampler: TriangleSampler
-    surface: TriangleSurface
-    cull: str
-    inputs: Tree
-    camera: Camera
-    bounds: SampleBounds
-    tables: Mapping[str, ArraySpec]
-    entry: Entry | None
-    points: np.ndarray | None
-
-    def in_place(self, uniform: bool, pairs: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them; arguments as in `Request`."""
-        entry, fragments, covered = self._drawn(self.bounds.layers)
-        ids, capacity = fragments.triangle_ids, self.bounds.capacity
-        if not self.surface.refines:
-            if uniform:
-                return _of_one_row(
-                    pack_fragments(fragments, entry.proxy, capacity, _first_of(covered)), covered, fragments
-                )
-            packed = pack_fragments(fragments, entry.proxy, capacity, covered)
-            return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
-        unrefined = pack_fragments(fragments, entry.proxy, None, covered)
-        surface, inputs, camera, view, points = self.surface, self.inputs, self.camera, self.bounds.view, self.points
-        samples, _ = refined(surface, inputs, unrefined, camera, self.tables, view, points)
-        packed = repack(samples, samples.row >= 0, capacity)
-        if pairs and points is not None:
-            packed = with_pairs(packed, surface, inputs, camera, view, points, self.tables)
-        return packed.replace(triangle=np.where(packed.row >= 0, ids, np.int32(-1)))
-
-    def moved(self) -> Samples:
-        """Samples that the surface moves off its triangles, with `incomplete_cells`."""
-        layers = self.bounds.layers
-        # There is only one set of tables, so that no samples can be added later.
-        entry, fragments, covered = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS))
-        arguments = self.surface, self.inputs, fragments, entry.proxy, self.camera, layers, self.tables
-        samples = on_surface(*arguments, size=self.bounds.view, cells=self.points)
-        covers = samples.row >= 0
-        incomplete = np.count_nonzero(covered[-1] & ~covers[-1])
-        return repack(samples, covers, self.bounds.capacity).replace(incomplete_cells=np.asarray(incomplete, np.int32))
-
-    def _drawn(self, layers: int) -> tuple[Entry, Fragments, np.ndarray]:
-        """The entry, the triangles drawn into `layers` layers, and the covered cells of these."""
-        sampler, camera, view, points = self.sampler, self.camera, self.bounds.view, self.points
-        grid = layers, *self.bounds.size
-
-        def draw(entry: Entry) -> tuple[Entry, Fragments, np.ndarray]:
-            if not (count := len(entry.proxy.faces)):
-                return entry, _no_fragments(grid), np.zeros(grid, np.bool_)
-            arguments = entry.prepared, camera, view, layers, self.cull
-            if points is None:
-                fragments = sampler.rasterize(*arguments)
-            else:
-                fragments = sampler.rasterize_points(*arguments, points[0])
-                if fragments is None:
-                    fragments = at_points(entry.proxy, camera, view, layers, self.cull, points[0])
-            return entry, fragments, check_fragments(fragments, grid, count, sampler)
-
-        return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
-
-
-def _first_of(covered: np.ndarray) -> np.ndarray:
-    """The mask `covered` with only its first cell; none if there is none."""
-    first = np.zeros_like(covered)
-    at = covered.argmax()
-    first.reshape(-1)[at] = covered.reshape(-1)[at]
-    return first
-
-
-def _of_one_row(samples: Samples, covered: np.ndarray, fragments: Fragments) -> Samples:
-    """Samples of one row, which all covered cells name."""
-    row = covered.view(np.int8).astype(np.int32) - np.int32(1)
-    return samples.replace(row=row, depth=fragments.depth, triangle=fragments.triangle_ids)
-
-
 def _of_triangles(surface: Any) -> TriangleSurface:
     """The surface; an InputError refuses one without triangles."""
     if not isinstance(surface, TriangleSurface):
@@ -334,10 +236,6 @@ def _of_triangles(surface: Any) -> TriangleSurface:
             f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
-
-
-def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
-    return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
 
 
 def _held(x: Array) -> np.ndarray:

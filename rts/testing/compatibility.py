@@ -14,7 +14,8 @@ from rts import registry
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import constants, engine_named, is_constant
 from rts.arrays.trees import leaves, map_leaves
-from rts.contracts.checks import check_sampler, check_scene
+from rts.contracts.checked_parts import check_scene
+from rts.contracts.checks import check_sampler
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import EmptyImageWarning, InputError, RtsError
 from rts.rendering.image import render

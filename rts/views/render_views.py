@@ -12,7 +12,8 @@ from rts.arrays.array_functions import averaged, described, shape_of
 from rts.arrays.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.checks import check_background, check_cameras
+from rts.contracts.checked_parts import check_cameras
+from rts.contracts.checks import check_background
 from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike

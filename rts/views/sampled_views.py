@@ -16,7 +16,8 @@ import numpy as np
 from rts.arrays.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.checks import CheckedPart, check_memory
+from rts.contracts.checked_parts import CheckedPart
+from rts.contracts.checks import check_memory
 from rts.contracts.records import ArraySpec, Cells, Fragments, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides

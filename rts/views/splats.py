@@ -9,8 +9,9 @@ import numpy as np
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.checks import CheckedPart, check_splats
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Sampled, Splats
+from rts.contracts.result_checks import check_splats
 from rts.operations.projection import projective_map_of_views
 from rts.rendering.shade import add_footprint, evaluate, shade, shaded_at_once, split_by_view, theta_of
 from rts.rendering.splats import all_in_use, concatenated, of_inputs, on_rays, owned, splats_of

@@ -28,7 +28,7 @@ corners; the corners' w + z of clip space; and their w − z."""
 def draw(first, last, triangles, vertices, matrix, view_depth, size, fragments):
     """Fill the fragment arrays, ids and depths (K, H · W) and barycentrics (K, H · W, 2), in bands `turns[first:last]`.
 
-    `triangles` holds the fields of the sampler's `_TriangleList`; `size` is (H, W).
+    `triangles` holds the fields of a `TriangleList` of `selection`; `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
     layers, (height, width) = len(triangle_ids), size
@@ -58,8 +58,8 @@ def _draw(items, geometry, top, end, width, layered):
 
     Args:
         items: indices of the triangles in `rows`.
-        geometry: `_TriangleList.rows`, vertices (V, 3), the matrix (4, 4) to homogeneous pixels, coefficients (4,) of
-            depth, and `_TriangleList.keep`.
+        geometry: `TriangleList.rows`, vertices (V, 3), the matrix (4, 4) to homogeneous pixels, coefficients (4,) of
+            depth, and `TriangleList.keep`.
         top: first row.
         end: end of the rows.
         width: columns of the image.

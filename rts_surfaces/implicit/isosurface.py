@@ -22,7 +22,8 @@ from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import ArraySpec, Proxy, Rate, RayHits, Rays, Samples
 from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import marching_cubes
-from rts_surfaces.implicit.casting import box, cast, deepest, per_level
+from rts_surfaces.implicit.casting import cast, per_level
+from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.field import SIDES, Implicit, check_isovalue, known_number
 from rts_surfaces.implicit.function_on_lattice import FunctionOnLattice
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
@@ -30,6 +31,7 @@ from rts_surfaces.implicit.lattice_field import LatticeField
 from rts_surfaces.implicit.marching_cubes import Triangles
 from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
 from rts_surfaces.implicit.narrow_band import Band, NarrowBand, rows_by_place
+from rts_surfaces.implicit.regions import box
 
 NEAR_SINGULAR = 1e-3
 """An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""

@@ -12,9 +12,11 @@ from rts import GBuffer, InputError, Part, RaySurface, namespace
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_numbers, check_positive, is_count, quoted
 from rts.plugin_api.records import RayHits, Samples
-from rts_surfaces.implicit.casting import ball, cast, deepest, moving
+from rts_surfaces.implicit.casting import cast, moving
+from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.field import Field, Function, Implicit, known_number
 from rts_surfaces.implicit.fields import swept_sphere
+from rts_surfaces.implicit.regions import ball
 
 
 class Sdf(Implicit, RaySurface):

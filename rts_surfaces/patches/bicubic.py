@@ -97,7 +97,7 @@ def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int,
 
 
 def _normal_loops() -> tuple[Callable, Callable, Callable]:
-    from rts_surfaces.patches import bicubic_loops as loops
+    from rts_surfaces.patches import bicubic_normals_loops as loops
 
     forward, push, pull = loops.normals, loops.push_normals, loops.pull_normals
     return partial(forward, COLLAPSED), partial(push, COLLAPSED), partial(pull, COLLAPSED)

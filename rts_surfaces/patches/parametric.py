@@ -16,18 +16,8 @@ from rts import Camera, InputError, TriangleSurface, engine_of
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_positive, is_count
 from rts.plugin_api.records import Proxy, Rate, Rays, Samples
-from rts_surfaces.patches.tiles import (
-    MOST,
-    Allowed,
-    Shapes,
-    Tiles,
-    allowed_in,
-    by_error,
-    shapes,
-    split,
-    triangles,
-    uniform,
-)
+from rts_surfaces.patches.tile_triangles import Allowed, Shapes, allowed_in, by_error, shapes, triangles, uniform
+from rts_surfaces.patches.tiles import MOST, Tiles, split
 from rts_surfaces.patches.view_cells import view_key, view_of
 
 TOLERANCE = 0.1

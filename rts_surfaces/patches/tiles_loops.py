@@ -84,7 +84,7 @@ def _count(rates, sides, edges):
 def counted(inner, sides, edges):
     """The total number of triangles of n tiles with k sides.
 
-    `inner` (n, 2) and `edges` (E,) are rates as in `tiles.triangles`; `sides` (n, k) are indices into `edges`.
+    `inner` (n, 2) and `edges` (E,) are rates as in `tile_triangles.triangles`; `sides` (n, k) are indices into `edges`.
     """
     total = 0
     for n in range(len(inner)):

@@ -33,7 +33,7 @@ from rts_surfaces.patches.parametric import (
 )
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
-from rts_surfaces.subdivision.cage import checked_cage, checked_lists
+from rts_surfaces.subdivision.cage_checks import checked_cage, checked_lists
 from rts_surfaces.subdivision.face_tiles import tiles_of
 
 library.find()  # Without OpenSubdiv there is no such plugin.

@@ -14,7 +14,8 @@ from rts.arrays.array_functions import kind_of
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import CheckedPart, check_colors, check_scene, check_splatter
+from rts.contracts.checked_parts import CheckedPart, check_colors, check_scene
+from rts.contracts.checks import check_splatter
 from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.advice.empty_images import out_of_view
 from rts.arrays.trees import leaves, map_leaves
-from rts.contracts.checks import check_scene
+from rts.contracts.checked_parts import check_scene
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
