@@ -14,7 +14,7 @@ import rts
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import CONSECUTIVE, RATE, START, WARM_UP
 from rts.plugin_api.records import Splats
-from rts.sampling import packing, triangle_sampler
+from rts.sampling import packing, triangle_search
 
 STAGES = (
     "pose matrix",
@@ -138,7 +138,7 @@ def stages(task: Task, mode: str, sampler: str, rounds: int) -> dict[str, float]
         with clock.stage("Adam"):
             optimizer.step()
 
-    with mock.patch.object(triangle_sampler, "pack_fragments", clock.timed("pack", packing.pack_fragments)):
+    with mock.patch.object(triangle_search, "pack_fragments", clock.timed("pack", packing.pack_fragments)):
         found = [_one(clock, iteration) for _ in range(rounds * CONSECUTIVE + WARM_UP)][WARM_UP:]
     medians = {name: 1e3 * float(np.median([f.get(name, 0.0) for f in found])) for name in (*STAGES, "total")}
     return {"prepare": prepare, **medians}

@@ -230,8 +230,8 @@ def _is_other_order(matrix: np.ndarray) -> bool:
     columns = matrix[:, [0, 1, 3]]
     products = columns[:3].T @ columns[:3]
     lengths = np.sqrt(np.diag(products))
-    apart = np.abs(products - np.diag(lengths**2)) <= ROUNDING * np.outer(lengths, lengths)
-    return bool((np.abs(columns[3]) <= ROUNDING * np.abs(matrix[3, 2])).all() and apart.all())
+    orthogonal = np.abs(products - np.diag(lengths**2)) <= ROUNDING * np.outer(lengths, lengths)
+    return bool((np.abs(columns[3]) <= ROUNDING * np.abs(matrix[3, 2])).all() and orthogonal.all())
 
 
 def is_affine(matrix: np.ndarray) -> bool:

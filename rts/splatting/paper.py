@@ -179,8 +179,8 @@ def exact_calibration(sigma: float, reach: int = 1) -> float:
 def _bordered(cells: Array) -> Array:
     """Cells (K, H, W) with a border of empty ones, one cell wide."""
     xp = namespace(cells)
-    side = xp.full_like(cells[:, :, :1], -1)
-    cells = xp.concat([side, cells, side], axis=2)
+    margin = xp.full_like(cells[:, :, :1], -1)
+    cells = xp.concat([margin, cells, margin], axis=2)
     end = xp.full_like(cells[:, :1, :], -1)
     return xp.concat([end, cells, end], axis=1)
 

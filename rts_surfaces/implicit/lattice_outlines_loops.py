@@ -247,8 +247,8 @@ def outlines(
         if np.isnan(t):
             continue
         # A kink of the field spreads over a cell; where cells are wider than pixels it is a face.
-        apart = max(APART * reach, min(0.5 * min(step), reach / 6))
-        ends[0], ends[1] = max(t - apart, 0.0), t + apart
+        margin = max(APART * reach, min(0.5 * min(step), reach / 6))
+        ends[0], ends[1] = max(t - margin, 0.0), t + margin
         share, square = _mixed(field, first, unit, ends, at, near, slopes, levels, slope)
         step_along(first, unit, t, place)
         z = depth[n] + t / length
