@@ -201,7 +201,7 @@ def mesh(kind: str, scene: Scene, rate: int) -> Contender:
 
 def meshed(scene: Scene, rate: int) -> Proxy:
     """All patches cut alike."""
-    from rts_surfaces.tiles import triangles
+    from rts_surfaces.patches.tile_triangles import triangles
 
     surface = scene.surface(1.0)
     points = surface.geometry(scene.points.astype(np.float64)).points

@@ -18,7 +18,8 @@ import importlib
 from rts import errors as errors
 from rts import registry
 from rts import regularizers as regularizers
-from rts.arrays.engines import Engine, engine_of, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, namespace
 from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.residuals import Residuals
@@ -27,7 +28,8 @@ from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
-from rts.diagnostics.gradients import check_gradient, gradient_image
+from rts.diagnostics.gradient_images import gradient_image
+from rts.diagnostics.gradients import check_gradient
 from rts.errors import InputError, PluginError, RtsError, RtsWarning
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rts import registry as registry
-from rts.arrays.engines import Engine, engine_of, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array, Tree
 from rts.compiling.warmup import warmup
 from rts.contracts.gbuffer import GBuffer
@@ -33,7 +34,8 @@ from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
-from rts.diagnostics.gradients import check_gradient, gradient_image
+from rts.diagnostics.gradient_images import gradient_image
+from rts.diagnostics.gradients import check_gradient
 from rts.errors import InputError, PluginError, RtsError, RtsWarning
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
@@ -375,6 +377,7 @@ class Sdf(_BuiltInRays):
         center: ArrayLike = (0.0, 0.0, 0.0),
         isovalue: float = 0.0,
         inside: str = "below",
+        *,
         lipschitz: float | None = 1.0,
         reads: Sequence[str] | None = None,
         attributes: Mapping[str, _Function] | None = None,

@@ -50,9 +50,9 @@ def promised(plugin: Any, name: str) -> Any:
 def _holds(kind: type, name: str) -> tuple[bool, Any]:
     """True if a promise `name` holds for a class; also the default value, that of the base class."""
     stated = [c for c in kind.__mro__ if name in vars(c)]
-    own, base = stated[0], stated[-1]
-    there = {m for c in own.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}
-    return not any(overrides(kind, m, own) for m in there), vars(base)[name]
+    stating, base = stated[0], stated[-1]
+    there = {m for c in stating.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}
+    return not any(overrides(kind, m, stating) for m in there), vars(base)[name]
 
 
 @functools.lru_cache(maxsize=1024)

@@ -100,11 +100,11 @@ def _keep_own(found: dict[str, dict[str, list[EntryPoint]]]) -> list[str]:
     problems = []
     for group, claims in found.items():
         for name, entries in claims.items():
-            own = [entry for entry in entries if _is_own(entry)] if len(entries) > 1 else []
-            if own:
+            own_entries = [entry for entry in entries if _is_own(entry)] if len(entries) > 1 else []
+            if own_entries:
                 others = " and ".join(sorted(_distribution(entry) for entry in entries if not _is_own(entry)))
                 problems.append(f"the {_kind(group)} {name!r} is the library's; the claim of {others} is passed over")
-                claims[name] = own
+                claims[name] = own_entries
     return problems
 
 
@@ -279,7 +279,7 @@ def attribute(name: str, known: Iterable[str]) -> Any:
         raise AttributeError(f"rts.{name} cannot be loaded: {error}") from error
 
 
-def instance(group: str, chosen: Any) -> Any:
+def instance(group: str, value: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
     A name or a class gives one instance with default settings, shared by all calls. An object is returned as it is; so
@@ -289,18 +289,18 @@ def instance(group: str, chosen: Any) -> Any:
         InputError: no such group or name.
         PluginError: the plugin cannot be loaded.
     """
-    if not isinstance(chosen, (str, type)):
-        return chosen
-    if (group, chosen) not in _defaults:
-        loaded = plugin(group, chosen) if isinstance(chosen, str) else chosen()
-        _defaults[group, chosen] = instance(group, loaded)
-    return _defaults[group, chosen]
+    if not isinstance(value, (str, type)):
+        return value
+    if (group, value) not in _defaults:
+        loaded = plugin(group, value) if isinstance(value, str) else value()
+        _defaults[group, value] = instance(group, loaded)
+    return _defaults[group, value]
 
 
-def name_of(group: str, plugin: Any) -> str:
+def name_of(group: str, value: Any) -> str:
     """The name under which `instance` made a plugin, such as "raster"; the name of its class for any other object."""
-    names = (name for (own, name), made in _defaults.items() if own == group and made is plugin)
-    return next((name for name in names if isinstance(name, str)), type(plugin).__qualname__)
+    names = (name for (of_group, name), made in _defaults.items() if of_group == group and made is value)
+    return next((name for name in names if isinstance(name, str)), type(value).__qualname__)
 
 
 def survey() -> list[PluginInfo]:

@@ -69,7 +69,7 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Test triangle `t` at a pixel position: True if it covers it; least barycentric, depth, first two barycentrics.
 
     If the triangle is culled or has no area, or lies behind the eye or is clipped there, the least barycentric is −∞
-    and the rest is 0. `matrix` is that of `pixel_matrix`, `row` that of `depth_of`, `keep` the sign of `facing`;
+    and the rest is 0. `matrix` is that of `pixel_matrix`, `row` that of `depth_of`, `keep` that of `Camera.kept_sign`;
     `corners` (3, 4) is working memory.
     """
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]

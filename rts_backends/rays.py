@@ -66,10 +66,9 @@ class Rays(Sampler):
         else:
             ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
-        followed = () if request.points is None else ("points",)
-        samples = Samples(ids, params, Cells(row, depth), overflow, followed=followed)
-        entering, asked = hits.entering, request.pairs and request.points is not None
-        if entering is None or not asked or type(surface).deepest is RaySurface.deepest:
+        samples = Samples(ids, params, Cells(row, depth), overflow, at_points=request.points is not None)
+        entering, wants_pairs = hits.entering, request.pairs and request.points is not None
+        if entering is None or not wants_pairs or type(surface).deepest is RaySurface.deepest:
             return samples
         width = xp.reshape(rays.spread[0] + rays.spread[1] * depth[0, ...], (-1,))
         start = origins + xp.reshape(hits.distance[0, ...], (-1, 1)) * directions

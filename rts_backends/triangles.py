@@ -24,16 +24,6 @@ def pixel_matrix(camera: Camera, size: tuple[int, int]) -> np.ndarray:
     return to_pixels @ camera.projection @ camera.view
 
 
-def facing(camera: Camera, cull: str) -> float:
-    """Sign of `determinant` for the triangles that are kept, not culled; 0 keeps both orientations.
-
-    A y-flip of the projection, or a mirroring view, reverses the winding on screen.
-    """
-    p = camera.projection
-    winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return -float(winding) if cull == "back" else 0.0
-
-
 @loop
 def bounding_sphere(vertices, faces):
     """(4,) centre and radius, at least 1e-30, of the sphere around the bounding box of vertices that triangles use.

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rts.diagnostics.command_tools import supersample_of
+from rts.diagnostics.measuring_api import supersample_of
 
 if TYPE_CHECKING:
     from rts_compare.comparison import Comparison

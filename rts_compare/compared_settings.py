@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import Engine, plugin, plugins
-from rts.diagnostics.command_tools import engine_named
+from rts.diagnostics.measuring_api import engine_named
 from rts.errors import InputError, PluginError
 from rts.plugin_api.checks import quoted
 from rts_compare.pareto_front import LEVELS

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Engine
-from rts.diagnostics.command_tools import output_folder, writing
+from rts.diagnostics.measuring_api import output_folder, writing
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError, PluginError
 from rts.plugin_api.arrays import Tree

@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rts.diagnostics.command_tools import writing
+from rts.diagnostics.measuring_api import writing
 from rts.errors import InputError, PluginError
 from rts_compare.chart_style import (
     OTHER_COLORS,

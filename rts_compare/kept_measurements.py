@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rts.diagnostics.command_tools import writing
+from rts.diagnostics.measuring_api import writing
 from rts.errors import InputError
 
 

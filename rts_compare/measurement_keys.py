@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rts import Camera, Part, engine_of, plugin, render, sample
-from rts.diagnostics.command_tools import check_scene
+from rts.diagnostics.measuring_api import check_scene
 from rts.plugin_api.arrays import leaves
 from rts.plugin_api.checks import fingerprint
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rts.diagnostics.command_tools import writing
+from rts.diagnostics.measuring_api import writing
 from rts.errors import PluginError
 from rts_compare.chart_style import (
     PEER_SYMBOL,

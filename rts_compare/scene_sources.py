@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, namespace
-from rts.diagnostics.command_tools import check_scene, default_camera
+from rts.diagnostics.measuring_api import check_scene, default_camera
 from rts.errors import InputError, RtsError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import is_count, quoted

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rts import Camera, Engine, Part, engine_of, render_views
-from rts.diagnostics.command_tools import output_folder, writing
+from rts.diagnostics.measuring_api import output_folder, writing
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
 from rts.plugin_api.checks import fingerprint

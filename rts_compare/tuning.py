@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts import Camera, Part, engine_of
-from rts.diagnostics.command_tools import output_folder
+from rts.diagnostics.measuring_api import output_folder
 from rts.diagnostics.progress import Phase, phases
 from rts.errors import InputError
 from rts.plugin_api.arrays import Tree, map_leaves

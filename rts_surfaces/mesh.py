@@ -117,11 +117,11 @@ class Mesh(TriangleSurface):
         if not plain or exemplar(theta["vertices"]) is not None:
             return ()
         declared = dict.fromkeys(name for name in self._columns if name not in VERTEX_ATTRIBUTES)
-        rates = []
+        offered = []
         for faces, vertices, nearest in fewer_faces(np.asarray(theta["vertices"]), self.faces):
             change = partial(self._thinned, vertices, nearest)
-            rates.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces, declared), change))
-        return rates
+            offered.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces, declared), change))
+        return offered
 
     def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
         """θ with fewer `vertices` (V', 3); each has the attributes of an old vertex, whose index is in `nearest` (V',).

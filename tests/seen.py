@@ -4,7 +4,7 @@ import numpy as np
 
 import rts
 from rts.sampling import layer_order
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 
 SIZE = (24, 28)
 CAMERA = rts.Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=28 / 24)
@@ -23,7 +23,7 @@ def stages(part, camera, layers, size=SIZE):
     """Samples on the triangles, refined, and settled."""
     sampler, inputs = rts.plugin("samplers", "raster")(), part.theta["points"]
     proxy = part.surface.proxy(inputs, camera, size)
-    lifted = lift(sampler.rasterize(sampler.prepare(proxy), camera, size, layers, "none"), proxy)
+    lifted = pack_fragments(sampler.rasterize(sampler.prepare(proxy), camera, size, layers, "none"), proxy)
     moved, rays = layer_order.refined(part.surface, inputs, lifted, camera, {})
     return lifted, moved, layer_order.settle(moved, camera, rays.spread)
 

@@ -8,7 +8,7 @@ from helpers import rotation
 
 from rts import Camera
 from rts.scene.camera import orthographic, perspective
-from rts_backends.triangles import facing, pixel_matrix
+from rts_backends.triangles import pixel_matrix
 
 DOUBLE, SINGLE = np.finfo(np.float64).eps, np.finfo(np.float32).eps
 
@@ -191,7 +191,7 @@ def hits_of(soup):
         opened = doubtful & (inside | ~certain_sign) & (seen | ~np.isfinite(plane))
     flat = _flat(corners[..., [0, 1, 3]], error[..., [0, 1, 3]])
     if soup.cull == "back":
-        front = np.linalg.det(corners[..., [0, 1, 3]]) * facing(soup.camera, "back") > 0
+        front = np.linalg.det(corners[..., [0, 1, 3]]) * soup.camera.kept_sign("back") > 0
         opened = (opened & (front | flat)[:, None, None]) | (flat[:, None, None] & inside & seen)
     unsure = np.where(np.isfinite(unsure), unsure, np.inf)
     across = np.stack([np.hypot(*_slopes(corners, i, j)) for i, j in ((1, 2), (2, 0), (0, 1))], -1)

@@ -103,7 +103,7 @@ LOOPS = [
     ),
     Defect(
         "a ray crosses a patch's flipped border without the flip",
-        "rts_surfaces/ray_patch_loops.py",
+        "rts_surfaces/patches/ray_patch_loops.py",
         "        t = 1 - t\n",
         "        t = t + 0\n",
         "patches bezier subdivision",
@@ -247,14 +247,14 @@ LOOPS = [
 ARRAYS = [
     Defect(
         "a photograph's principal point is off by half a pixel",
-        "rts/scene/camera.py",
+        "rts/scene/camera_converters.py",
         "cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)",
         "cx, cy = K[0, 2] + pixel_center, K[1, 2] + pixel_center",
         "camera pose_files",
     ),
     Defect(
         "the y axis of a photograph points up",
-        "rts/scene/camera.py",
+        "rts/scene/camera_converters.py",
         "xp.reshape(t, (3,))), (1, -1, -1, 1))",
         "xp.reshape(t, (3,))), (1, 1, -1, 1))",
         "camera",

@@ -29,7 +29,7 @@ LINE = 64
 
 STAGES = {
     "rasterize": ("raster",),
-    "lift, find outlines": ("packing", "extremes", "merging", "sheets", "silhouettes", "spans", "segments"),
+    "pack, find outlines": ("packing", "value_ranges", "merging", "sheets", "silhouettes", "spans", "segments"),
     "splat": ("edges",),
 }
 """Loops by the beginnings of their modules' names; others are *the rest of the loops*."""

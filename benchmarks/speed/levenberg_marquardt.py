@@ -11,7 +11,7 @@ import rts
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import START, in_turn
 from rts.arrays.engines import engine_of, namespace
-from rts.fitting.least_squares import normal_equations
+from rts.fitting.normal_equations import normal_equations
 
 UNKNOWNS = (6, 12)
 

@@ -14,12 +14,12 @@ import rts
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import CONSECUTIVE, RATE, START, WARM_UP
 from rts.plugin_api.records import Splats
-from rts.sampling import packing, triangle_sampler
+from rts.sampling import packing, triangle_search
 
 STAGES = (
     "pose matrix",
     "rasterize",
-    "lift",
+    "pack",
     "rest of sample",
     "evaluate, project",
     "shade",
@@ -138,7 +138,7 @@ def stages(task: Task, mode: str, sampler: str, rounds: int) -> dict[str, float]
         with clock.stage("Adam"):
             optimizer.step()
 
-    with mock.patch.object(triangle_sampler, "lift", clock.timed("lift", packing.lift)):
+    with mock.patch.object(triangle_search, "pack_fragments", clock.timed("pack", packing.pack_fragments)):
         found = [_one(clock, iteration) for _ in range(rounds * CONSECUTIVE + WARM_UP)][WARM_UP:]
     medians = {name: 1e3 * float(np.median([f.get(name, 0.0) for f in found])) for name in (*STAGES, "total")}
     return {"prepare": prepare, **medians}
@@ -151,7 +151,7 @@ def _one(clock: Clock, iteration: Callable[[], None]) -> dict[str, float]:
     iteration()
     found = {**clock.seconds, "total": time.perf_counter() - start}
     for outer, inner in (
-        ("rest of sample", ("rasterize", "lift")),
+        ("rest of sample", ("rasterize", "pack")),
         ("evaluate, project", ("shade", "splat")),
         ("backward: rest", ("backward: splat",)),
     ):

@@ -8,7 +8,7 @@ import numpy as np
 
 from rts.arrays.engines import stopped, value_of
 from rts.arrays.trees import Tree, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Proxy
 from rts.contracts.surface import TriangleSurface
 from rts.scene.camera import Camera

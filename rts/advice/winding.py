@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.advice.empty_images import known_tree
 from rts.arrays.engines import stopped
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
 from rts.scene.camera import Camera

@@ -200,15 +200,15 @@ def _is_finite(x: Array, below: float) -> bool:
     values = engine.known(x)
     if values is None or not values.size:
         return True
-    from rts.arrays.extremes import largest
+    from rts.arrays.value_ranges import largest_absolute
 
     # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
-    return largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below
+    return largest_absolute(values[tuple([slice(None) if step else slice(1) for step in values.strides])]) < below
 
 
-def averaged(image: Array, side: int) -> Array:
-    """An image (h, w, C) of (h · side, w · side, C): each pixel is the mean of `side`² cells."""
+def averaged(image: Array, factor: int) -> Array:
+    """An image (h, w, C) of (h · side, w · side, C): each pixel is the mean of `factor`² cells."""
     # One axis after the other: over both at once, torch takes three times as long.
-    xp, (height, width), channels = namespace(image), (n // side for n in image.shape[:2]), image.shape[2]
-    rows = xp.mean(xp.reshape(image, (height, side, width * side * channels)), axis=1)
-    return xp.mean(xp.reshape(rows, (height, width, side, channels)), axis=2)
+    xp, (height, width), channels = namespace(image), (n // factor for n in image.shape[:2]), image.shape[2]
+    rows = xp.mean(xp.reshape(image, (height, factor, width * factor * channels)), axis=1)
+    return xp.mean(xp.reshape(rows, (height, width, factor, channels)), axis=2)

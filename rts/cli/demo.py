@@ -34,11 +34,11 @@ def knot(rings: int = 360, sides: int = 32) -> Part:
 
     step = 1e-3
     tangent = _unit(curve(t + step) - curve(t - step))
-    side = _unit(np.cross(tangent, [0.0, 0.0, 1.0]))
-    above = np.cross(side, tangent)
+    sideways = _unit(np.cross(tangent, [0.0, 0.0, 1.0]))
+    above = np.cross(sideways, tangent)
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
     radius = (0.5 + 0.2 * np.cos(t - 0.6))[:, None, None]
-    ring = np.cos(angle) * side[:, None] + np.sin(angle) * above[:, None]
+    ring = np.cos(angle) * sideways[:, None] + np.sin(angle) * above[:, None]
     vertices = (curve(t)[:, None] + radius * ring).reshape(-1, 3) * 0.5
     phase = 2 * np.pi * (t[:, None] / (2 * np.pi) + np.array([0.0, 0.36, 0.62]))
     colors = np.repeat((0.5 + 0.42 * np.cos(phase)) ** 1.6, sides, axis=0)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import copy
 import os
 import time
-import warnings
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,11 +11,23 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from typer.core import TyperGroup
 
 from rts import __version__, registry
 from rts.arrays.trees import map_leaves
-from rts.errors import PluginError, RtsError
+from rts.cli.command_group import CommandGroup
+from rts.cli.options import (
+    Debug,
+    FieldOfView,
+    OrbitAngles,
+    SurfaceName,
+    UpAxis,
+    color_of,
+    is_given,
+    layers_of,
+    refuse_beside,
+    size_of,
+    view_of,
+)
 from rts.scene.parts import Part
 
 EXAMPLES = """
@@ -33,133 +41,8 @@ Examples:
 """
 
 
-# The base of BadParameter is click's UsageError, wherever typer keeps click.
-UsageError: Any = typer.BadParameter.__base__
-
-
-class _Group(TyperGroup):
-    """Commands, those of installed distributions too, whose expected errors are one line on standard error."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        own = super().list_commands(ctx)
-        return [*own, *(name for name in registry.plugins("rts.commands") if name not in own)]
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        found = super().get_command(ctx, cmd_name)
-        if found is None and cmd_name in registry.plugins("rts.commands"):
-            return _installed_command(cmd_name)
-        return found
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Show installed commands by name, and where they come from: their modules are not imported."""
-        named = copy.copy(self)
-        named.commands = {name: self.commands.get(name) or _named_command(name) for name in self.list_commands(ctx)}
-        super(_Group, named).format_help(ctx, formatter)
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Let --debug stand anywhere before "--"; without arguments, show the help."""
-        end = args.index("--") if "--" in args else len(args)
-        if "--debug" in args[:end]:
-            args = ["--debug", *(a for a in args[:end] if a != "--debug"), *args[end:]]
-        with _one_line(ctx), _warnings_in_a_line():
-            return super().parse_args(ctx, args or ["--help"])
-
-    def invoke(self, ctx: Any) -> Any:
-        with _one_line(ctx), _warnings_in_a_line():
-            return super().invoke(ctx)
-
-
-def _installed_command(name: str) -> Any:
-    """The command of an entry point, imported now; where that fails, a command that says why."""
-    try:
-        return _as_command(name, registry.plugin("rts.commands", name))
-    except PluginError as error:
-        reason = error
-
-    def broken() -> None:
-        raise reason
-
-    broken.__doc__ = f"cannot be used: {_line(str(reason))}"
-    return _as_command(name, broken, {"ignore_unknown_options": True, "allow_extra_args": True})
-
-
-def _named_command(name: str) -> Any:
-    """A command that only stands for one of an installed distribution, in the help."""
-
-    def unread() -> None:
-        pass
-
-    unread.__doc__ = f"Of {registry.distributions_of('rts.commands', name)}: `rts {name} --help` tells more."
-    return _as_command(name, unread)
-
-
-def _as_command(name: str, found: Any, settings: dict[str, Any] | None = None) -> Any:
-    """A function, or a `typer.Typer`, as a command of this name; a PluginError if it is neither.
-
-    `settings` are those of the command's context; a `typer.Typer` has its own.
-    """
-    try:
-        if not isinstance(found, typer.Typer):
-            alone = typer.Typer(rich_markup_mode="markdown", add_completion=False)
-            alone.command(name, context_settings=settings)(found)
-            found = alone
-        command = typer.main.get_command(found)
-    except Exception as error:
-        raise PluginError(
-            f"the command {name!r} is neither a function of options nor a typer.Typer: {error}"
-        ) from error
-    command.name = name
-    return command
-
-
-@contextlib.contextmanager
-def _one_line(ctx: Any) -> Iterator[None]:
-    """Turn expected errors into a line on standard error and an exit code: 2 for wrong usage, else 1.
-
-    With --debug, errors other than wrong usage are raised as they are.
-    """
-    try:
-        yield
-    except UsageError as error:
-        command = error.ctx.info_name if error.ctx is not None and error.ctx.parent else ctx.invoked_subcommand
-        help_ = " ".join(filter(None, ("rts", command, "--help")))
-        _fail(error, f"{error.format_message().rstrip('.')}; try '{help_}'", 2)
-    except BrokenPipeError:  # The reader of the output has closed it; click handles that.
-        raise
-    except (RtsError, OSError, MemoryError) as error:
-        if ctx.params.get("debug"):
-            raise
-        _fail(error, str(error) or "there is not enough memory; choose a smaller size", 1)
-
-
-@contextlib.contextmanager
-def _warnings_in_a_line() -> Iterator[None]:
-    """Show each warning once, as a line on standard error, without the line of code that it came from."""
-    shown: set[str] = set()
-
-    def show(message: Warning | str, category: type, *_: Any) -> None:
-        text = _line(str(message))
-        if text not in shown:
-            shown.add(text)
-            typer.echo(f"rts: warning: {text}", err=True)
-
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
-
-
-def _line(text: str) -> str:
-    """The text in one line. Control characters, which a quoted file may contain, are escaped."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
-
-
-def _fail(error: Exception, message: str, code: int) -> None:
-    typer.echo(f"rts: {_line(message)}", err=True)
-    raise typer.Exit(code) from error
-
-
 app = typer.Typer(
-    cls=_Group,
+    cls=CommandGroup,
     help="Differentiable surface rendering by rasterize-then-splat.\n" + EXAMPLES,
     rich_markup_mode="markdown",
     add_completion=False,
@@ -184,76 +67,6 @@ def _say_written(files: list[Path]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------- options
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) of "256" or "480x640"."""
-    parts = text.lower().split("x")
-    if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
-        raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")
-    return int(parts[0]), int(parts[-1])
-
-
-def _layers(text: str) -> Any:
-    """The `layers` written as "4" or "auto"."""
-    if text != "auto" and not text.lstrip("-").isdecimal():
-        raise typer.BadParameter(
-            f"{text!r} is no number of layers; expected an integer, or auto", param_hint="'--layers'"
-        )
-    return text if text == "auto" else int(text)
-
-
-def _view(text: str) -> tuple[float, ...]:
-    """Azimuth, elevation and optional distance, from comma-separated numbers."""
-    try:
-        numbers = tuple(float(x) for x in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (2, 3):
-        raise typer.BadParameter(f'{text!r} is no camera; expected "azimuth,elevation" or "azimuth,elevation,distance"')
-    return numbers
-
-
-def _background(text: str) -> tuple[float, ...] | None:
-    """The linear colour (3,), 0 to 1, of a colour's name or "#rrggbb"; None for "none", which is transparent."""
-    from PIL import ImageColor
-
-    from rts.files.srgb import decode_srgb
-
-    if text == "none":
-        return None
-    try:
-        return tuple(decode_srgb(np.array(ImageColor.getrgb(text)[:3]) / 255))
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is no colour; expected a name, #rrggbb, or none") from None
-
-
-def _given(context: typer.Context, option: str) -> bool:
-    """True if an option was given, and not left at its default."""
-    source = context.get_parameter_source(option)
-    return source is not None and source.name != "DEFAULT"
-
-
-def _refuse_beside(option: str, context: typer.Context, others: Sequence[str]) -> None:
-    for other in others:
-        if _given(context, other):
-            raise typer.BadParameter(f"--{other} beside {option}, which says it already; leave one of them out")
-
-
-Surface = Annotated[
-    str, typer.Option(help="Name of the surface that reads the model: mesh, or such as bezier for patches.")
-]
-Camera_ = Annotated[
-    str,
-    typer.Option(
-        "--camera",
-        help="Azimuth,elevation[,distance] about the middle of the object: degrees, and world units. "
-        "Without a distance the whole object is in view.",
-    ),
-]
-Fov = Annotated[float, typer.Option(help="Vertical field of view in degrees.")]
-Up = Annotated[str, typer.Option(help="The axis that is upright: y or z.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; may stand anywhere.")]
 
 
 def _show_version(wanted: bool) -> None:
@@ -308,15 +121,16 @@ def plugins(
 def render(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
+    *,
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
-    surface: Surface = "mesh",
+    surface: SurfaceName = "mesh",
     size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
-    camera: Camera_ = "30,20",
-    fov: Fov = 40.0,
-    up: Up = "y",
+    camera: OrbitAngles = "30,20",
+    fov: FieldOfView = 40.0,
+    up: UpAxis = "y",
     sampler: Annotated[str, typer.Option(help="Name of a sampler, see `rts plugins`.")] = "auto",
     engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
-    layers: Annotated[str, typer.Option(help="Surface layers kept at each pixel, or auto.")] = "auto",
+    layers: Annotated[str, typer.Option(help="SurfaceName layers kept at each pixel, or auto.")] = "auto",
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
     splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, multi, single or none.")] = "auto",
     supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
@@ -330,20 +144,20 @@ def render(
     """Render a model to a picture."""
     import rts
     from rts.cli.pose_file import posed, read_pose
-    from rts.diagnostics.command_tools import supersample_of
+    from rts.diagnostics.measuring_api import supersample_of
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
 
-    shape, view, color = _size(size), _view(camera), _background(background)
+    shape, view, color = size_of(size), view_of(camera), color_of(background)
     output_file(output, "picture", (".png",))
-    chosen = registry.plugin("rts.engines", engine)()
+    engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
         parts = rts.load(model, surface=surface)
         seen = orbit(bounds_of(parts), shape, *view, fov=fov, up=up)
     else:
-        _refuse_beside("--pose", context, ("camera", "fov", "up"))
-        matrix, seen, own = read_pose(pose)
-        shape = shape if _given(context, "size") else own
+        refuse_beside("--pose", context, ("camera", "fov", "up"))
+        matrix, seen, pose_size = read_pose(pose)
+        shape = shape if is_given(context, "size") else pose_size
         parts = posed(rts.load(model, surface=surface), matrix)
     bounds = bounds_of(parts)
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
@@ -352,7 +166,7 @@ def render(
     def prepared(part: Part) -> Part:
         theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
         return part.replace(
-            theta=map_leaves(chosen.constant, theta),
+            theta=map_leaves(engine_object.constant, theta),
             cull=cull,
             shader=part.shader if shader == "auto" else shader,
         )
@@ -364,7 +178,7 @@ def render(
         shape,
         sampler=sampler,
         splatter=splatter,
-        layers=_layers(layers),
+        layers=layers_of(layers),
         supersample=supersample_of(supersample),
         background=color,
     )
@@ -385,14 +199,15 @@ def fit_pose(
         Path,
         typer.Argument(help="The picture: its alpha is the silhouette, or its brightness where it is opaque."),
     ],
+    *,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("pose"),
-    surface: Surface = "mesh",
+    surface: SurfaceName = "mesh",
     engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
     method: Annotated[str, typer.Option(help="lm (Levenberg–Marquardt), adam or sgd.")] = "lm",
     steps: Annotated[int | None, typer.Option(help="At most so many at each stage.")] = None,
-    camera: Camera_ = "30,20",
-    fov: Fov = 40.0,
-    up: Up = "y",
+    camera: OrbitAngles = "30,20",
+    fov: FieldOfView = 40.0,
+    up: UpAxis = "y",
     fit_fov: Annotated[bool, typer.Option("--fit-fov", help="Fit the field of view, too; --fov is the start.")] = False,
     loss: Annotated[
         str,
@@ -422,16 +237,16 @@ def fit_pose(
 
     if f_scale is not None and loss == "linear":
         raise typer.BadParameter("--f-scale is for a robust --loss: soft_l1, huber or cauchy")
-    view = _view(camera)
+    view = view_of(camera)
     output_folder(output)
     parts = rts.load(model, surface=surface)
     picture = rts.load_image(target)
     mask = silhouette_of(picture)
     bounds = bounds_of(parts)
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
-    chosen = None if engine == "auto" else engine
+    engine_name = None if engine == "auto" else engine
     options: dict[str, Any] = {"method": method, "steps": steps, "fit_fov": fit_fov, "loss": loss, "f_scale": f_scale}
-    result = fit(parts, mask, seen, bounds, engine=chosen, **options)
+    result = fit(parts, mask, seen, bounds, engine=engine_name, **options)
     verdict = judged(result.pose, parts, mask, picture, robust=loss != "linear")
     files = write_report(output, result, verdict, parts, mask)
     _say(
@@ -452,7 +267,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The mesh: .obj, .ply, .stl, .glb or .off.")] = Path(
         "mesh.obj"
     ),
-    surface: Surface = "mesh",
+    surface: SurfaceName = "mesh",
     tolerance: Annotated[
         float, typer.Option(help="How far triangles may be off the surface, as a share of the object's radius.")
     ] = 1e-3,

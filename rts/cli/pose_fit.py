@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.arrays.engines import Engine, engine_named, engine_of, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_named, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.cli.pose_file import Pose, posed
 from rts.errors import InputError, PluginError
@@ -124,15 +125,15 @@ def fit_pose(
         f_scale: as in `rts.ImageResiduals`.
         progress: see `rts.fit`.
     """
-    chosen = _engine(engine or available_engine())
+    engine_object = _engine(engine or available_engine())
     weights = np.concatenate([np.repeat([1.0, bounds.radius], 3), np.ones(int(fit_fov))])
     visited: list[np.ndarray] = []
 
     def note(step: int, unknowns: Array, loss: float) -> None:
-        visited.append(chosen.to_numpy(unknowns).astype(np.float64) * weights)
+        visited.append(engine_object.to_numpy(unknowns).astype(np.float64) * weights)
 
-    residuals = _residuals(parts, camera, target, bounds, weights, chosen, loss=loss, f_scale=f_scale)
-    start = chosen.constant(np.zeros(len(weights), np.float32))
+    residuals = _residuals(parts, camera, target, bounds, weights, engine_object, loss=loss, f_scale=f_scale)
+    start = engine_object.constant(np.zeros(len(weights), np.float32))
     schedule = pyramid(target.shape, largest=LARGEST_SIDE)
     result = fit(
         residuals,
@@ -143,7 +144,7 @@ def fit_pose(
         callback=note,
         progress=progress,
     )
-    solution = chosen.to_numpy(result.parameters).astype(np.float64) * weights
+    solution = engine_object.to_numpy(result.parameters).astype(np.float64) * weights
     trail = [_pose(unknowns, bounds, camera, target.shape) for unknowns in (*_best_so_far(visited, result), solution)]
     return PoseFit(
         solution[:3],

@@ -62,8 +62,8 @@ def write_report(
     save_image(folder / "after.png", picture(result.pose, large))
     save_image(folder / "target.png", large[..., None] * np.array([*MARKED, 1.0]))  # Its alpha is the mask.
     moved = [result.trail[0]] + [b for a, b in zip(result.trail, result.trail[1:], strict=False) if _moved(a, b)]
-    chosen = moved[:: -(-len(moved) // FRAMES)]
-    frames = [picture(p, small) for p in [chosen[0]] * 4 + chosen + [result.pose] * 10]
+    shown_poses = moved[:: -(-len(moved) // FRAMES)]
+    frames = [picture(p, small) for p in [shown_poses[0]] * 4 + shown_poses + [result.pose] * 10]
     save_animation(folder / "animation.gif", frames, fps=8)
     names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
     return [folder / name for name in names] + _plot(folder / "convergence.png", result.history, result.levels)

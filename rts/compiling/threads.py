@@ -50,8 +50,8 @@ class _Job:
         error: the error that the work raised, or None.
     """
 
-    def __init__(self, work: Callable[[], None], cores: set[int] | None, roams: bool):
-        self.work, self.cores, self.roams = work, cores, roams
+    def __init__(self, work: Callable[[], None], allowed: set[int] | None, roams: bool):
+        self.work, self.cores, self.roams = work, allowed, roams
         self.error: BaseException | None = None
         self._unclaimed, self._going = threading.Lock(), threading.Lock()
         self._going.acquire()
@@ -116,20 +116,20 @@ class _Helpers:
                     self._threads.append(thread.native_id)
                 self._placed = None
 
-    def keep_off(self, core: int, cores: set[int]) -> None:
-        """Have helpers run on `cores` without `core`, if they have another; nothing changes while a helper works.
+    def keep_off(self, core: int, allowed: set[int]) -> None:
+        """Have helpers run on `allowed` without `core`, if they have another; nothing changes while a helper works.
 
         On two cores Linux often wakes a thread on its waker's core, though the other is idle. The thread would
         wait there until the loop is over.
         """
-        cores = cores - {core} or cores
-        if self._under_way or cores == self._placed:
+        allowed = allowed - {core} or allowed
+        if self._under_way or allowed == self._placed:
             return
         with self._lock:
-            self._placed = cores
+            self._placed = allowed
             for thread in self._threads:
                 if thread not in self._roaming:
-                    _place(thread, cores)
+                    _place(thread, allowed)
 
     def ask(self, job: _Job) -> None:
         """Queue a job for the next idle helper."""
@@ -149,22 +149,22 @@ class _Helpers:
                 job.end()
             del job  # A thread that waits must not keep arrays alive.
 
-    def _run_anywhere(self, job: _Job, cores: set[int]) -> None:
+    def _run_anywhere(self, job: _Job, allowed: set[int]) -> None:
         """Run a job on any of some cores; the next caller chooses the helper's cores anew."""
-        own = threading.get_native_id()
+        thread = threading.get_native_id()
         with self._lock:
-            self._roaming.add(own)
-            _place(own, cores)
+            self._roaming.add(thread)
+            _place(thread, allowed)
         job.run()
         with self._lock:
-            self._roaming.discard(own)
+            self._roaming.discard(thread)
             self._placed = None
 
 
-def _place(thread: int, cores: set[int]) -> None:
+def _place(thread: int, allowed: set[int]) -> None:
     """Have a thread, by the system's number, run on some cores alone. Does nothing without permission."""
     with contextlib.suppress(OSError):  # Without permission, threads run anywhere.
-        os.sched_setaffinity(thread, cores)
+        os.sched_setaffinity(thread, allowed)
 
 
 _helpers = _Helpers()
@@ -198,7 +198,7 @@ def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
     return view
 
 
-def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
+def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, off_caller_core: bool = True) -> None:
     """Call `loop(start, stop, *args)` on all cores, in ranges that together cover [0, count); return when all are done.
 
     The caller's thread alone runs a loop of little `work`, as one range, and one for which no helper is free. An error
@@ -209,8 +209,8 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
         count: the end of the range.
         *args: passed on.
         work: rough time of all ranges on one thread, nanoseconds. The default is just enough for helpers to be asked.
-        apart: whether helpers must stay off the caller's core all the time. The loop must then start no threads, which
-            would have to stay off as well.
+        off_caller_core: whether helpers must stay off the caller's core all the time. The loop must then start no
+            threads, which would have to stay off as well.
     """
     # Inside a task of another loop no helper may be free, and asking takes time.
     if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
@@ -232,12 +232,12 @@ def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, ap
     # The caller works too. It does not wait for helpers that have not woken when the last range begins.
     jobs: list[_Job] = []
     _helpers.start(threads - 1)
-    own = cores() if _core else None
-    if _core and own:
-        _helpers.keep_off(_core(), own)
+    own_cores = cores() if _core else None
+    if _core and own_cores:
+        _helpers.keep_off(_core(), own_cores)
     try:
         for _ in range(free):
-            jobs.append(_Job(share, own, not apart))
+            jobs.append(_Job(share, own_cores, not off_caller_core))
             _helpers.ask(jobs[-1])
         share()
     finally:
@@ -274,7 +274,7 @@ def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
                 errors[i] = error
                 first = min(first, i)
 
-    parallel(some, len(items), apart=False)
+    parallel(some, len(items), off_caller_core=False)
     if errors:
         raise errors[min(errors)]
     return results

@@ -53,11 +53,13 @@ def warmup(processes: int | None = None) -> float:
 def _call(name: str) -> None:
     """Make one of the calls in a process of its own, which finds modules and kept loops where this process does."""
     path = [p or os.getcwd() for p in sys.path if isinstance(p, str)]  # An empty entry is the working directory.
-    own = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1"}
+    environment = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1"}
     if kept := getattr(getattr(sys.modules.get("numba"), "config", None), "CACHE_DIR", ""):
-        own["NUMBA_CACHE_DIR"] = str(kept)
+        environment["NUMBA_CACHE_DIR"] = str(kept)
     command = [sys.executable, "-P", "-m", "rts.compiling.warmup_calls", name]
-    done = subprocess.run(command, env=os.environ | own, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    done = subprocess.run(
+        command, env=os.environ | environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
     if done.returncode:
         errors = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         raise RtsError(f"could not compile loops: {errors[-1]}")

@@ -124,16 +124,16 @@ class _OnCells:
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed; fields of `cells` may be named directly."""
-        own: dict[str, Any] = {name: changes.pop(name) for name in _OF_CELLS & changes.keys()}
-        if own:
-            changes["cells"] = replace(changes.get("cells", self.cells), **own)
+        cell_changes: dict[str, Any] = {name: changes.pop(name) for name in _OF_CELLS & changes.keys()}
+        if cell_changes:
+            changes["cells"] = replace(changes.get("cells", self.cells), **cell_changes)
         return replace(self, **changes)  # pyright: ignore[reportArgumentType, reportReturnType, reportCallIssue]
 
 
 _OF_CELLS = {f.name for f in fields(Cells)}
 
 
-@record(static=("asked", "centered", "by_sample", "followed"))
+@record(static=("gbuffer_names", "centered", "by_sample", "at_points"))
 class Samples(_OnCells):
     """The points where rays meet the surface of one part: the paper's U, packed.
 
@@ -145,12 +145,12 @@ class Samples(_OnCells):
         tables: further arrays of the surface by name, filled by its `refine`. If samples share one (see `by_sample`),
             all `ids` are rows of it, so that samples can be joined.
         gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
-        asked: names of the entries requested when `gbuffer` was evaluated; None for all.
+        gbuffer_names: names of the entries requested when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
         by_sample: names of the tables that have a row for each sample; other tables are shared by all.
-        followed: ("points",) if the `Request` had points and the sampler obeyed.
-        ran_out: () int32, number of cells where triangles ran out before K samples of a refined surface were found;
-            None for a surface that is not refined.
+        at_points: whether the samples lie at `Request.points`, as requested, not at the centres of cells.
+        incomplete_cells: () int32, number of cells where triangles ran out before K samples of a refined surface were
+            found; None for a surface that is not refined.
         pair: (2, M) int32, of M points: the indices of two further samples, not in `row`, beside the deepest point of
             the point's ray, where the field that it crosses is least; −1 for none. The mean of their motions is that
             of the outline. None if not requested, or not known.
@@ -162,11 +162,11 @@ class Samples(_OnCells):
     overflow: Array
     tables: Mapping[str, Array] = field(default_factory=dict)
     gbuffer: Mapping[str, Array] | None = None
-    asked: tuple[str, ...] | None = None
+    gbuffer_names: tuple[str, ...] | None = None
     centered: bool = True
     by_sample: tuple[str, ...] = ()
-    followed: tuple[str, ...] = ()
-    ran_out: Array | None = None
+    at_points: bool = False
+    incomplete_cells: Array | None = None
     pair: Array | None = None
 
 
@@ -177,13 +177,13 @@ class Request:
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are samples.
         points: (M, 2) float64, M > 0, x and y in cells from the grid's upper left corner: the only points to sample, in
-            place of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.followed` says so. None
-            for centres.
+            place of the centres of cells. Cells of the samples are then (K, 1, M), and `Samples.at_points` is true.
+            None for centres.
         pairs: whether to compute `Samples.pair` of `points`, just inside of outlines, of surfaces that tell how these
             move.
         triangles: whether to record `Cells.triangle`.
         uniform: whether all samples look alike, so that one row may stand for all cells.
-        entry: the result of `Sampler.hold` for this part; None where nothing was prepared.
+        entry: the result of `Sampler.prepare_part` for this part; None where nothing was prepared.
     """
 
     capacity: int | None = None
@@ -287,11 +287,11 @@ class Sampled(_OnCells):
     def part(self) -> Array:
         """(K, H, W) int32, the part of the sample in each cell and layer, or −1."""
         xp, first = namespace(self.row), 0
-        part = xp.clip(self.row, None, 0)
+        part_of_cells = xp.clip(self.row, None, 0)
         for samples in self.samples[:-1]:
             first += samples.ids.shape[-2]
-            part = part + xp.astype(self.row >= first, self.row.dtype)
-        return part
+            part_of_cells = part_of_cells + xp.astype(self.row >= first, self.row.dtype)
+        return part_of_cells
 
 
 @record(static=("border", "opaque"))

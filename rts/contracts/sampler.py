@@ -40,7 +40,7 @@ class Sampler(Plugin):
             InputError: this sampler cannot sample the part.
         """
 
-    def suited(self, part: Part, camera: Camera | None) -> Sampler:
+    def sampler_for(self, part: Part, camera: Camera | None) -> Sampler:
         """The sampler for a part: this one, or another if this one only chooses among samplers, as "auto" does.
 
         Args:
@@ -49,7 +49,7 @@ class Sampler(Plugin):
         """
         return self
 
-    def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Any:
+    def prepare_part(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Any:
         """A structure that `rts.prepare` builds once for a part, such as a tree; None for nothing.
 
         `sample` receives it as `Request.entry`.

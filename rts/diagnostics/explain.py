@@ -10,7 +10,7 @@ import numpy as np
 from rts.advice.unread_entries import Observed, likely_name, shaded_by, unread
 from rts.advice.winding import INSIDE_OUT, is_inside_out
 from rts.arrays.engines import engine_of
-from rts.contracts.checks import CheckedPart, check_scene
+from rts.contracts.checked_parts import CheckedPart, check_scene
 from rts.contracts.records import Samples
 from rts.contracts.shader import FunctionShader
 from rts.registry import name_of
@@ -72,8 +72,8 @@ def explain(
         choices = [Choice(name_of("rts.samplers", sampler), PREPARED) for sampler in parts.samplers]
     else:
         choices = [choose(part, static=is_static(part, seen)) for part in checked]
-    remarks = [tuple(_remarks(part, seen, own)) for part, own in zip(checked, shaded, strict=True)]
-    choices = [choice._replace(remarks=own) for choice, own in zip(choices, remarks, strict=True)]
+    remarks = [tuple(_remarks(part, seen, entries)) for part, entries in zip(checked, shaded, strict=True)]
+    choices = [choice._replace(remarks=lines) for choice, lines in zip(choices, remarks, strict=True)]
     if sampled is None:
         return choices
     return [choice._replace(samples=n) for choice, n in zip(choices, map(_count, sampled.samples), strict=True)]
@@ -82,11 +82,11 @@ def explain(
 def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int]) -> list[set[str]]:
     """The entries of θ that the shader of each part reads, as it shades a few samples."""
     shaders = [Observed(part.shader) for part in parts]
-    watched = [part.replace(shader=own) for part, own in zip(parts, shaders, strict=True)]
+    watched = [part.replace(shader=shader) for part, shader in zip(parts, shaders, strict=True)]
     small = min(size[0], FEW), min(size[1], FEW)
     sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, splatter=None, layers=1)
     render_samples(sampled, watched, camera.for_size(size).replace(aspect=None), splatter="none")
-    return [own.read for own in shaders]
+    return [shader.read for shader in shaders]
 
 
 def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:

@@ -7,7 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from rts.arrays.engines import Engine, constants, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.arrays.argument_checks import check_flag, quoted
-from rts.arrays.array_functions import from_numbers, kind_of
-from rts.arrays.engines import Engine, engine_of, is_constant, namespace
+from rts.arrays.array_functions import kind_of
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import check_size, is_count, is_real
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
@@ -22,84 +22,13 @@ from rts.diagnostics.explanation.selection import explained
 from rts.diagnostics.explanation.shared_budget import Clock, looked_at
 from rts.diagnostics.explanation.slopes import NEGLIGIBLE, Slope
 from rts.diagnostics.explanation.subject import Scene, Subject
+from rts.diagnostics.gradient_images import check_callable, checked_parameters, traceable
 from rts.diagnostics.progress import phases
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
-from rts.files.srgb import decode_srgb
-from rts.fitting.dependence import differentiable
-from rts.fitting.parameter_names import named_leaves
-from rts.fitting.run import untraceable
 from rts.rendering.image import render
 
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
-
-
-class GradientImage(NamedTuple):
-    """The derivative of an image along a direction of its parameters.
-
-    Attributes:
-        derivative: (H, W, C) float, change of the image for a unit step along the direction.
-        scale: the change that the picture shows at full strength: as 1 in a channel, or, if negative, as 0.
-    """
-
-    derivative: np.ndarray
-    scale: float
-
-    @property
-    def picture(self) -> np.ndarray:
-        """(H, W, 3) linear RGB for `rts.save_image`: middle grey is zero, brighter positive, darker negative.
-
-        One channel becomes grey; of four channels the last is left out.
-
-        Raises:
-            InputError: the image has another number of channels than 1, 3 or 4.
-        """
-        if self.derivative.shape[2] not in (1, 3, 4):
-            raise InputError(f"the image has {self.derivative.shape[2]} channels; expected 1, 3 or 4 for a picture")
-        color = self.derivative if self.derivative.shape[2] in (1, 3) else self.derivative[..., :3]
-        signed = np.clip(0.5 + 0.5 * color / self.scale, 0, 1)
-        return decode_srgb(np.broadcast_to(signed, (*signed.shape[:2], 3)))
-
-
-def gradient_image(
-    image: Callable[[Tree], Array], parameters: Tree, direction: Tree = None, *, scale: float | None = None
-) -> GradientImage:
-    """The derivative of an image along a direction of its parameters, by forward mode, as a signed picture.
-
-    Args:
-        image: parameters → (H, W, C), such as a function that calls `rts.render`.
-        parameters: a torch or jax array, or nested dicts and lists of them.
-        direction: a tree of the parameters' structure; None stands for 1 if they are a single number.
-        scale: the change that is shown at full strength; None for the largest there is.
-
-    Raises:
-        InputError: parameters that have no derivative or are traced; a direction of another structure, or none for
-            several numbers; a scale that is not positive; an image that is no (H, W, C) array of the parameters'
-            engine, or whose derivative is not finite.
-        EngineError: arrays of two engines.
-    """
-    _check_function("image", image, "a function: parameters → (H, W, C)")
-    engine, parameters = _differentiable(parameters, "rts.gradient_image")
-    if direction is None:
-        if [math.prod(p.shape) for p in leaves(parameters)] != [1]:
-            raise InputError("parameters holds more than one number; give the direction along which to differentiate")
-        direction = map_leaves(lambda p: engine.namespace.ones_like(p), parameters)
-    direction = _like(from_numbers(direction, "direction"), parameters, engine)
-    if scale is not None and not (is_real(scale) and 0 < scale < math.inf):
-        raise InputError(f"scale is {quoted(scale)}; expected a positive number, or None for the largest change")
-
-    def checked(p: Tree) -> Array:
-        result = image(p)
-        if not engine.owns(result) or result.ndim != 3:
-            raise InputError(f"image gave {kind_of(result)}; expected a {engine.name} array (H, W, C)")
-        return result
-
-    with _traceable(engine):
-        derivative = engine.to_numpy(engine.jvp(checked, parameters, direction)[1])
-    if not np.isfinite(derivative).all():
-        raise InputError("the derivative of the image is not finite; check the parameters for NaN")
-    largest = float(np.abs(derivative).max(initial=0.0))
-    return GradientImage(derivative, float(scale) if scale is not None else largest or 1.0)
 
 
 class GradientCheck(NamedTuple):
@@ -198,10 +127,10 @@ def check_gradient(
         EngineError: arrays of two engines; with `hessian`, an engine without forward mode.
     """
     clock = Clock(budget_s)
-    _check_function("scene", scene, "a function: parameters → (parts, camera)")
+    check_callable("scene", scene, "a function: parameters → (parts, camera)")
     if loss is not None:
-        _check_function("loss", loss, "a function: image (H, W, 4) → scalar, or None")
-    engine, parameters = _differentiable(parameters, "rts.check_gradient")
+        check_callable("loss", loss, "a function: image (H, W, 4) → scalar, or None")
+    engine, parameters = checked_parameters(parameters, "rts.check_gradient")
     size = check_size(size, 1, None, 1)
     for name, count in (("samples", samples), ("entries", entries)):
         if not is_count(count):
@@ -214,10 +143,10 @@ def check_gradient(
     known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size")]
     if unknown := [name for name in options if name not in known]:
         raise InputError(f"there is no option {unknown[0]!r}; expected {', '.join(known)}")
-    own = loss is not None
+    own_loss = loss is not None
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
     subject = Subject(engine, scene, map_leaves(engine.stop_gradient, parameters), size, options, loss)
-    with _traceable(engine), phases(progress) as phase, warnings.catch_warnings():
+    with traceable(engine), phases(progress) as phase, warnings.catch_warnings():
         # The check itself tells why nothing is seen.
         warnings.simplefilter("ignore", EmptyImageWarning)
         warnings.simplefilter("ignore", LayersWarning)
@@ -228,61 +157,20 @@ def check_gradient(
         second = curvatures(subject, numbers, tolerance, clock.going, phase) if hessian else None
         check = GradientCheck([n.slope for n in numbers], tolerance, hessian=second)
         plain = [n for n in numbers if n.forward]
-        reasons, left = explained(subject, plain, check.agrees, own, clock.turn, phase)
-        picture = marked(subject.seen, reasons)
+        reasons, left = explained(subject, plain, check.agrees, own_loss, clock.turn, phase)
+        picture = marked(subject.rendered, reasons)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
     notes += [f"the differences of {rough} are of fewer samples than asked for"] if rough else []
     if second is not None and len(second.names) < len(numbers):
         notes.append(f"second derivatives are of {len(second.names)} numbers")
     notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
-    told = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
+    remarks = [f"In {clock.spent:.0f} s of a budget of {clock.budget:g}: {', and '.join(notes)}."] if notes else []
     if len(plain) < len(numbers):
-        told.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
-    return check._replace(reasons=reasons, picture=picture, note=" ".join(told))
+        remarks.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
+    return check._replace(reasons=reasons, picture=picture, note=" ".join(remarks))
 
 
 # --------------------------------------------------------------------------------------------------- parameters
-
-
-@contextlib.contextmanager
-def _traceable(engine: Engine) -> Iterator[None]:
-    """Turn errors of a framework that cannot trace the user's function into one line."""
-    try:
-        yield
-    except Exception as error:
-        told = untraceable(error, engine)
-        if told is None:
-            raise
-        raise told from error
-
-
-def _differentiable(parameters: Tree, caller: str) -> tuple[Engine, Tree]:
-    """The engine of a user's parameters, and these with dicts in the order of `leaves`; traced ones are refused."""
-    engine = differentiable(parameters)
-    if any(engine.traced(x) for x in leaves(parameters)):
-        raise InputError(f"parameters holds traced arrays; call {caller} outside jit and other transforms")
-    return engine, map_leaves(lambda p: p, parameters)
-
-
-def _check_function(name: str, given: Any, expected: str) -> None:
-    if not callable(given):
-        raise InputError(f"{name} is {quoted(given)}; expected {expected}")
-
-
-def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
-    """The direction as arrays of the engine and of the parameters' dtypes; other names or shapes are refused."""
-    given, wanted = ([(name, tuple(np.shape(x))) for name, x in named_leaves(t)] for t in (direction, parameters))
-    if given != wanted:
-        raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")
-    if engine_of(direction, parameters) is not engine:  # Arrays of two engines are refused by `engine_of`.
-        raise InputError(f"direction holds arrays of another engine; expected {engine.name}")
-    values = iter(leaves(direction))
-
-    def leaf(p: Array) -> Array:
-        d = next(values)
-        return namespace(p).astype(engine.constant(np.asarray(d), p) if is_constant(d) else d, p.dtype, copy=False)
-
-    return map_leaves(leaf, parameters)
 
 
 def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array], Array]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Tree, leaves, map_leaves
 from rts.contracts.checks import is_count
 from rts.errors import InputError, RtsWarning, warn

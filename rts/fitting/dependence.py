@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine, engine_of, is_constant
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import engine_of, is_constant
 from rts.arrays.trees import Array, Tree, leaves
 from rts.errors import EngineError, InputError
-from rts.fitting.parameter_names import listed
+from rts.fitting.parameter_names import names_in_words
 
 UNSEEN = 0.02
 """Numbers below this share of a direction's largest are left out of its description."""
@@ -133,7 +134,7 @@ def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[st
         entries.append(
             (int(np.flatnonzero(column)[0]), " with ".join([*terms[:3], *(["others"] if terms[3:] else [])]))
         )
-    return listed([text for _, text in sorted(entries)])
+    return names_in_words([text for _, text in sorted(entries)])
 
 
 def _terms(name: str, shape: tuple, part: np.ndarray) -> list[str]:

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import is_real
 from rts.errors import InputError
 from rts.fitting.dependence import refuse_independent
-from rts.fitting.parameter_names import listed
+from rts.fitting.parameter_names import names_in_words
 from rts.fitting.run import NO_GRADIENT, Run, require
 from rts.fitting.saving import Saving
 from rts.fitting.terms import Terms
@@ -27,16 +27,16 @@ class Method(NamedTuple):
     Attributes:
         optimizer: "adam", "sgd", or an optimiser object of the framework.
         rates: the learning rate, or a list of one for each array of the parameters.
-        given: the caller's parameters, whose arrays an optimiser object may hold.
+        original: the caller's parameters, whose arrays an optimiser object may hold.
     """
 
     optimizer: Any
     rates: float | list[float]
-    given: Tree
+    original: Tree
 
     def start(self, engine: Engine, parameters: Tree) -> Any:
         """The step function, from these parameters on; see `Engine.optimizer`."""
-        return engine.optimizer(self.optimizer, self.rates, parameters, self.given)
+        return engine.optimizer(self.optimizer, self.rates, parameters, self.original)
 
 
 class Validation(NamedTuple):
@@ -185,12 +185,14 @@ def checked_rates(learning_rate: Any, method: Any, names: Sequence[str]) -> floa
         raise InputError('learning_rate is a mapping, and method "lm" has no rates; leave it out')
     rates: dict[str, float] = {}
     for key in sorted(learning_rate, key=lambda key: len(str(key))):  # The longer, the more particular.
-        own = [name for name in names if name == key or name.startswith(f"{key}.")]
-        if not own:
-            raise InputError(f"learning_rate names {quoted(key)}; expected names of parameters: {listed(names, 8)}")
-        rates |= dict.fromkeys(own, _checked_rate(f"learning_rate[{key!r}]", learning_rate[key]))
+        named = [name for name in names if name == key or name.startswith(f"{key}.")]
+        if not named:
+            raise InputError(
+                f"learning_rate names {quoted(key)}; expected names of parameters: {names_in_words(names, 8)}"
+            )
+        rates |= dict.fromkeys(named, _checked_rate(f"learning_rate[{key!r}]", learning_rate[key]))
     if missing := [name for name in names if name not in rates]:
-        raise InputError(f"learning_rate has no rate for {listed(missing, 8)}; expected one for each array")
+        raise InputError(f"learning_rate has no rate for {names_in_words(missing, 8)}; expected one for each array")
     return [rates[name] for name in names]
 
 

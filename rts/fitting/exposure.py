@@ -71,12 +71,12 @@ def exposed(parts: Any, exposure: Any, view: Array, count: int) -> list[Part]:
             raise InputError(f"exposure gave a {name} of shape {shape}; expected ({count},) or ({count}, 3)")
         value, number = constants((value, view), engine_of(value, view), exemplar((value, view)))
         entry[name] = value[number, ...]
-    listed = list(parts) if isinstance(parts, (tuple, list)) else [parts]
-    if not all(isinstance(part, Part) for part in listed):
+    part_list = list(parts) if isinstance(parts, (tuple, list)) else [parts]
+    if not all(isinstance(part, Part) for part in part_list):
         raise InputError("scene gave prepared parts; with an exposure it has to give rts.Part, or several")
-    if any(ENTRY in part.theta for part in listed):
+    if any(ENTRY in part.theta for part in part_list):
         raise InputError(f"θ of a part has an entry {ENTRY!r}, which the exposure of views needs; rename it")
     return [
         replace(part, theta={**part.theta, ENTRY: entry}, shader=Exposed(check_shader(part.shader, "the shader")))
-        for part in listed
+        for part in part_list
     ]

@@ -10,27 +10,35 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays.argument_checks import check_flag, quoted
+from rts.arrays.argument_checks import check_flag
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import checked_plugin, is_count, is_real
+from rts.arrays.engine_base import Engine
+from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.residuals import Residuals
 from rts.errors import InputError
 from rts.fitting.checkpoint import Checkpoint
-from rts.fitting.dependence import differentiable
 from rts.fitting.descent import Method, Validation, checked_rates, descend
+from rts.fitting.fit_arguments import (
+    STEPS,
+    check_functions,
+    check_limits,
+    check_method,
+    checked_engine,
+    checked_residuals,
+    declared_loss,
+    stage_loss_of,
+    stages_of,
+)
 from rts.fitting.least_squares import levenberg_marquardt
-from rts.fitting.losses import SQUARE, Loss
-from rts.fitting.parameter_names import listed, named_leaves, one_line
+from rts.fitting.losses import Loss
+from rts.fitting.parameter_names import named_leaves, names_in_words, one_line
 from rts.fitting.processes import Processes
 from rts.fitting.run import LONGEST_REASON, Astray, Report, Run, progress_bar
 from rts.fitting.saving import Saving
-from rts.fitting.schedule import Stage, checked_schedule
+from rts.fitting.schedule import Stage
 from rts.fitting.terms import Terms
 from rts.plugin_base import overrides
 
-STEPS = {"adam": 200, "sgd": 200, "lm": 50}
 PATIENCE = 50
 """Steps without gain after which a fit stops; where losses are validated, three of these if that is more."""
 VALIDATION_SHARE = 4
@@ -77,7 +85,7 @@ class Fit(NamedTuple):
         held = [f"{name} {tuple(x.shape)}" for name, x in named_leaves(self.parameters)]
         return (
             f"loss {first}{self.loss:.4g} in {steps} and {self.seconds:.3g} s\n"
-            f"{one_line(self.reason, LONGEST_REASON)}\nparameters: {listed(held, 6)}"
+            f"{one_line(self.reason, LONGEST_REASON)}\nparameters: {names_in_words(held, 6)}"
         )
 
 
@@ -148,14 +156,14 @@ def fit(
             derivative that is not finite at the start.
         EngineError: parameters of two engines, or of another than the arrays that `residuals` holds.
     """
-    known = _check_functions(residuals, loss, callback)
+    known = check_functions(residuals, loss, callback)
     title = method if isinstance(method, str) else type(method).__name__
-    _check_method(title, method, loss, steps, validation)
-    _check_limits(tolerance, patience, validate_every)
+    check_method(title, method, loss, steps, validation)
+    check_limits(tolerance, patience, validate_every)
     check_flag("jit", jit)
-    stages = _stages(known, schedule)
-    taken = [_taken(stage, known, loss) for stage in stages]
-    engine = _checked_engine(parameters)
+    stages = stages_of(known, schedule)
+    taken = [stage_loss_of(stage, known, loss) for stage in stages]
+    engine = checked_engine(parameters)
     names = [name for name, _ in named_leaves(parameters)]
     optimizer = Method(method, checked_rates(learning_rate, method, names), parameters)
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
@@ -187,10 +195,18 @@ def fit(
                 run.validates = judge is not None
                 run.patience = patience or max(PATIENCE, 3 * judge.every if judge else 0)
                 if isinstance(reduced, Loss) and title == "lm":
-                    own = fits and overrides(stage, "normal_equations", Residuals)
+                    own_equations = fits and overrides(stage, "normal_equations", Residuals)
                     supersample = getattr(stage, "supersample", None)
                     levenberg_marquardt(
-                        terms, parameters, engine, run, saving, jit=jit, loss=reduced, own=own, supersample=supersample
+                        terms,
+                        parameters,
+                        engine,
+                        run,
+                        saving,
+                        jit=jit,
+                        loss=reduced,
+                        own_equations=own_equations,
+                        supersample=supersample,
                     )
                 else:
                     descend(terms, reduced, parameters, engine, optimizer, run, saving, jit=jit, validation=judge)
@@ -200,9 +216,9 @@ def fit(
         runs.append(run)
         if run.best is not None:
             parameters = run.best
-        if run.asked:
+        if run.stop_requested:
             break
-    return _outcome(parameters, runs, runs[-1].told(names), time.perf_counter() - start)
+    return _outcome(parameters, runs, runs[-1].summary(names), time.perf_counter() - start)
 
 
 def _outcome(parameters: Tree, runs: Sequence[Run], reason: str, seconds: float) -> Fit:
@@ -234,10 +250,10 @@ def _validation(
             return None
         judges = terms
     else:
-        known = _residuals(validation, "validation")
+        known = checked_residuals(validation, "validation")
         processes = processes if overrides(known, "draw", Residuals) else None
         judges = Terms(known, engine, processes, partial(_checked, engine=engine, run=run))
-        loss = _taken(known, known, None)[0] if _own_loss(known) else loss
+        loss = stage_loss_of(known, known, None)[0] if declared_loss(known) else loss
     share = -(-len(judges.drawn(None)) // len(terms.drawn(0)))
     return Validation(judges, loss, every or VALIDATION_SHARE * share)
 
@@ -251,106 +267,6 @@ def _copied(engine: Engine, x: Array) -> Array:
 
 
 # -------------------------------------------------------------------------------------------------- checks
-
-
-def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
-    """The residuals as `rts.Residuals`; loss and callback are checked, too."""
-    known = _residuals(residuals, "residuals")
-    if loss is not None and not callable(loss):
-        raise InputError(
-            f"loss is {quoted(loss)}; expected a function of the residuals, such as rts.Loss('huber', f_scale=0.1), or "
-            f"leave it out"
-        )
-    if callback is not None and not callable(callback):
-        raise InputError(f"callback is {quoted(callback)}; expected a function of step, parameters and loss, or None")
-    return known
-
-
-def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
-    """The residuals at each stage of a schedule; without one, as they are."""
-    if schedule is None:
-        return [residuals]
-    schedule = checked_schedule(schedule)
-    if not overrides(residuals, "at_stage", Residuals):
-        raise InputError(
-            f"residuals is {quoted(residuals)}, whose resolution nobody knows; with a schedule pass "
-            f"rts.ImageResiduals, or subclass rts.Residuals and give it a method at_stage(stage)"
-        )
-    return [_residuals(residuals.at_stage(stage), "what at_stage gave") for stage in schedule]
-
-
-class _Function(Residuals):
-    """Residuals that are a plain function of the parameters."""
-
-    def __init__(self, function: Callable[[Tree], Array]):
-        self._function = function
-
-    def __call__(self, parameters: Tree) -> Array:
-        """See `rts.Residuals`."""
-        return self._function(parameters)
-
-    def __repr__(self) -> str:
-        return quoted(self._function)
-
-
-def _residuals(value: Any, what: str) -> Residuals:
-    """An object as `rts.Residuals`; functions are wrapped. `what` names it in errors."""
-    function = callable(value) and not isinstance(value, (Residuals, type))
-    residuals = _Function(value) if function else value
-    return checked_plugin(residuals, what, Residuals, "a function of the parameters, ")
-
-
-def _taken(stage: Residuals, whole: Residuals, loss: Callable | None) -> tuple[Callable[[Array], Array], bool]:
-    """The loss at a stage of the residuals `whole`, and True if the stage's `normal_equations` are for it."""
-    if loss is not None and not overrides(stage, "normal_equations", Residuals):
-        return loss, False
-    own = _own_loss(stage)
-    taken = (own or _own_loss(whole) or SQUARE) if loss is None else loss
-    return taken, (own or SQUARE) == taken
-
-
-def _own_loss(residuals: Residuals) -> Loss | None:
-    """The loss that residuals declare; None if they declare none."""
-    loss = residuals.loss
-    if loss is None or isinstance(loss, Loss):
-        return loss
-    raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
-
-
-def _check_method(title: str, method: Any, loss: Callable | None, steps: int | None, validation: Any) -> None:
-    """Refuse methods by other names, and arguments that do not go with the method. `title` is its name."""
-    if (method is title and method not in STEPS) or isinstance(method, (type, type(None), bool, int, float)):
-        raise InputError(f"method is {quoted(method)}; expected one of {', '.join(STEPS)}, or an optimiser object")
-    if title == "lm" and not (loss is None or isinstance(loss, Loss)):
-        raise InputError(
-            f'method "lm" takes no loss but an rts.Loss, such as rts.Loss("huber", f_scale=0.1); it is {quoted(loss)}: '
-            f'use "adam", or leave it out'
-        )
-    if title == "lm" and validation is not None:
-        raise InputError('method "lm" takes no validation, since its loss decides; use "adam", or leave it out')
-    if steps is not None:
-        _check_count("steps", steps)
-
-
-def _check_limits(tolerance: float, patience: int | None, validate_every: int | None) -> None:
-    if not (is_real(tolerance) and tolerance >= 0):
-        raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
-    for name, value in (("patience", patience), ("validate_every", validate_every)):
-        if value is not None:
-            _check_count(name, value)
-
-
-def _check_count(name: str, value: Any) -> None:
-    if not is_count(value):
-        raise InputError(f"{name} is {quoted(value)}; expected a whole number, at least 1")
-
-
-def _checked_engine(parameters: Tree) -> Engine:
-    """The engine of the parameters, which must be differentiable arrays."""
-    engine = differentiable(parameters, " to optimise")
-    if any(engine.traced(x) for x in leaves(parameters)):
-        raise InputError("parameters holds traced arrays; call rts.fit outside jit and other transforms")
-    return engine
 
 
 def _checked(residuals: Callable[[Tree], Array], engine: Engine, run: Run) -> Callable[[Tree], Array]:

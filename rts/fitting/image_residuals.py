@@ -9,24 +9,17 @@ from typing import Any, TypeGuard
 
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
-from rts.arrays.engines import Engine, constants, context_of, engine_of, exemplar, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import (
-    CheckedPart,
-    check_background,
-    check_cameras,
-    check_floating,
-    check_ratio,
-    check_sampler,
-    check_scene,
-    is_count,
-)
+from rts.contracts.checked_parts import CheckedPart, check_cameras, check_scene
+from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count
 from rts.contracts.records import Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
 from rts.errors import InputError
-from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
+from rts.fitting.normal_equations import flatten, normal_equations
 from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
@@ -140,10 +133,10 @@ class ImageResiduals(Residuals):
             return
         if cameras not in (None, count):
             raise InputError(f"there are {cameras} cameras for targets of {count} views; expected as many")
-        for b, (own, factors) in enumerate(zip(target, _of_views(weights, count), strict=True)):
+        for b, (view_target, factors) in enumerate(zip(target, _of_views(weights, count), strict=True)):
             view = copy(self)
             view._view, view._views = b, []
-            view._take(own, factors)
+            view._take(view_target, factors)
             self._views.append(view)
         if len(kinds := {tuple(view._target.shape[2:]) for view in self._views}) > 1:
             raise InputError(f"targets of views have the channels {sorted(kinds)}; expected one kind for all views")
@@ -238,9 +231,9 @@ class ImageResiduals(Residuals):
         cameras = cameras if self._view is None else [cameras[self._view]]
         if self.size != self._full:
             # Sides are rounded: the ratio of fewer pixels may differ, but the extent of the image is the same.
-            for own in cameras:
-                check_ratio(own, self._full)
-            cameras = [own.for_size(self._full).replace(aspect=None) for own in cameras]
+            for view_camera in cameras:
+                check_ratio(view_camera, self._full)
+            cameras = [view_camera.for_size(self._full).replace(aspect=None) for view_camera in cameras]
         return parts, cameras if self._views else cameras[0]
 
     def _scene_as_given(self, parameters: Tree) -> tuple[Any, Cameras]:
@@ -348,8 +341,8 @@ class ImageResiduals(Residuals):
         Raises:
             EngineError: torch and jax arrays meet.
         """
-        own, like = (self._target, self._weights, self._background), exemplar(parameters)
-        return constants(tree, engine_of(tree, parameters, own), exemplar(own) if like is None else like)
+        images, like = (self._target, self._weights, self._background), exemplar(parameters)
+        return constants(tree, engine_of(tree, parameters, images), exemplar(images) if like is None else like)
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
         """Target, weights and background without derivatives, in the engine of the array `like`.
@@ -403,8 +396,8 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
 
 def _are_cameras(value: Any) -> TypeGuard[Cameras]:
     """True for a camera, or a list or tuple of at least one."""
-    listed: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
-    return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
+    cameras: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
+    return len(cameras) > 0 and all(isinstance(camera, Camera) for camera in cameras)
 
 
 def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:

@@ -20,28 +20,28 @@ def interrupts_held_back() -> Iterator[None]:
     The interrupt then goes to the signal handler that was set before. Nothing changes in threads other than the main
     one, which are never interrupted, and where no Python handler is set.
     """
-    own = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(own):
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
         yield
         return
     held, raised = False, None
 
-    def hold(number: int, frame: Any) -> None:
+    def hold_back(number: int, frame: Any) -> None:
         nonlocal held, raised
         if not held:
             held = True
             return
         try:
-            own(number, frame)
+            handler(number, frame)
         except BaseException as error:
             raised = error
             raise
 
     try:
-        signal.signal(signal.SIGINT, hold)
+        signal.signal(signal.SIGINT, hold_back)
         yield
     finally:
-        signal.signal(signal.SIGINT, own)
+        signal.signal(signal.SIGINT, handler)
         if raised is not None:
             raise raised from None
         if held:

@@ -60,8 +60,8 @@ class LargeSteps:
             )
         number = check_positive("smoothness", smoothness)
         if number is None or number > LARGEST:
-            given = "traced" if number is None else quoted(smoothness)
-            raise InputError(f"smoothness is {given}; expected a known number of at most {LARGEST:g}")
+            value = "traced" if number is None else quoted(smoothness)
+            raise InputError(f"smoothness is {value}; expected a known number of at most {LARGEST:g}")
         self.count, self.smoothness = int(count), float(number)
         self._laplacian = Laplacian(np.zeros((self.count, 3)), self.faces)
         edges = self._laplacian.edges
@@ -134,10 +134,10 @@ def _factorised(edges: np.ndarray, diagonal: np.ndarray, smoothness: float) -> A
     from scipy.sparse import coo_array
     from scipy.sparse.linalg import splu
 
-    own, ends = np.arange(len(diagonal)), np.concatenate([edges, edges[:, ::-1]])
-    rows, columns = np.concatenate([np.stack([own, own], axis=-1), ends]).T
+    vertices, ends = np.arange(len(diagonal)), np.concatenate([edges, edges[:, ::-1]])
+    rows, columns = np.concatenate([np.stack([vertices, vertices], axis=-1), ends]).T
     values = np.concatenate([diagonal, np.full(len(ends), -smoothness)])
-    matrix = coo_array((values, (rows, columns)), shape=(len(own), len(own))).tocsc()
+    matrix = coo_array((values, (rows, columns)), shape=(len(vertices), len(vertices))).tocsc()
     # The matrix is positive definite: an order made for symmetric matrices, and pivots from the diagonal.
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve
 

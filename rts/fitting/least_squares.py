@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
-from rts.arrays.engines import Engine, namespace
-from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.arrays.engine_base import Engine
+from rts.arrays.trees import Tree, leaves
 from rts.errors import InputError
 from rts.fitting.checkpoint import arrays_in, is_like
 from rts.fitting.dependence import directions_in_words, refuse_independent
-from rts.fitting.losses import SQUARE, Loss
+from rts.fitting.losses import Loss
+from rts.fitting.normal_equations import Linearization, flatten, least_squares_functions
 from rts.fitting.parameter_names import named_leaves
-from rts.fitting.run import NO_GRADIENT, Run, require
+from rts.fitting.run import NO_GRADIENT, Run
 from rts.fitting.saving import Saving
 from rts.fitting.terms import Terms
 
@@ -25,28 +25,6 @@ LARGEST_DAMPING = 1e12
 TINY = 1e-300
 RESOLVED = 10.0
 """Least predicted gain that must show in the loss, in rounding errors of the loss."""
-
-
-class _Linear(NamedTuple):
-    """Residuals r linearised at a point, on the host.
-
-    Attributes:
-        value: the mean loss of the n residuals.
-        matrix: (U, U) float64, JᵀSJ / n for the Jacobian J; W and S are those of `Loss.weights`.
-        gradient: (U,) float64, JᵀWr / n: half the gradient of the loss.
-        rounding: the machine epsilon of the dtype that these were computed in.
-    """
-
-    value: float
-    matrix: np.ndarray
-    gradient: np.ndarray
-    rounding: float
-
-    def checked(self, start: bool) -> _Linear:
-        """Give itself back, or raise the error of `require` if the loss or the matrix is not finite."""
-        require(math.isfinite(self.value), f"the loss is {self.value}", start)
-        require(bool(np.isfinite(self.matrix).all()), "the Jacobian is not finite", start)
-        return self
 
 
 class _Model:
@@ -68,7 +46,7 @@ class _Model:
         units: (U,), factors that make changes of different arrays comparable.
     """
 
-    def __init__(self, linear: _Linear, sizes: Sequence[int]):
+    def __init__(self, linear: Linearization, sizes: Sequence[int]):
         self.least = linear.rounding * len(linear.gradient)
         diagonal = np.diag(linear.matrix).copy()
         largest = np.concatenate(
@@ -90,11 +68,11 @@ class _Model:
             damping: positive number, added to the eigenvalues of the scaled JᵀSJ.
         """
         along = self._downhill / (self._values + damping)
-        step = self._directions @ along
+        change = self._directions @ along
         if self._open is not None:
-            step = step * self.units
-            step = (step - self._open @ (self._open.T @ step)) / self.units
-        return step, float(along @ (damping * along + self._downhill))
+            change = change * self.units
+            change = (change - self._open @ (self._open.T @ change)) / self.units
+        return change, float(along @ (damping * along + self._downhill))
 
 
 class _Control:
@@ -122,12 +100,12 @@ class _Control:
         Raises:
             InputError: the bytes are no such state, or the vector is not like the other one.
         """
-        known, own = arrays_in(packed) or {}, {"vector": like, **vars(self)}
-        sound = all(name in known and is_like(known[name], np.asarray(value)) for name, value in own.items())
-        if not sound or not (known["damping"] > 0 and known["growth"] > 0):
+        arrays, expected = arrays_in(packed) or {}, {"vector": like, **vars(self)}
+        sound = all(name in arrays and is_like(arrays[name], np.asarray(value)) for name, value in expected.items())
+        if not sound or not (arrays["damping"] > 0 and arrays["growth"] > 0):
             raise InputError("the state of its method is damaged")
-        self.__dict__.update({name: known[name].item() for name in vars(self)})
-        return known["vector"]
+        self.__dict__.update({name: arrays[name].item() for name in vars(self)})
+        return arrays["vector"]
 
 
 def _split(x: np.ndarray, sizes: Sequence[int]) -> list[np.ndarray]:
@@ -143,7 +121,7 @@ def levenberg_marquardt(
     *,
     jit: bool,
     loss: Loss,
-    own: bool,
+    own_equations: bool,
     supersample: int | None,
 ) -> None:
     """Minimise a loss of residuals by normal equations; `run` records the steps and keeps the result.
@@ -163,7 +141,7 @@ def levenberg_marquardt(
         saving: keeps checkpoints, and gives the state to go on from.
         jit: True to compile.
         loss: the loss of the residuals.
-        own: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
+        own_equations: True to take the residuals' own `normal_equations`; see `rts.Residuals`.
         supersample: samples a pixel along each axis, for words on why the fit stopped; None if no images are fitted.
 
     Raises:
@@ -174,10 +152,10 @@ def levenberg_marquardt(
         raise InputError('method "lm" needs all terms at every step; leave out batch and window, or use "adam"')
     vector, unflatten = flatten(parameters)
     sizes = [math.prod(x.shape) for x in leaves(parameters)]
-    linearize, loss_at = _least_squares(terms, loss, own, parameters, engine, run, jit)
+    linearize, loss_at = least_squares_functions(terms, loss, own_equations, parameters, engine, run, jit)
     control = _Control()
 
-    def taken(linear: _Linear, start: bool) -> tuple[_Linear, _Model]:
+    def taken(linear: Linearization, start: bool) -> tuple[Linearization, _Model]:
         linear = linear.checked(start)
         run.note_gradient([bool(d.any()) for d in _split(np.diag(linear.matrix), sizes)])
         return linear, _Model(linear, sizes)
@@ -237,7 +215,7 @@ def levenberg_marquardt(
     _note_open(model, parameters, sizes, run)
 
 
-def _loss_rounding(linear: _Linear, count: int) -> float:
+def _loss_rounding(linear: Linearization, count: int) -> float:
     """Rounding error of a mean loss of `count` residuals, each the difference of two numbers of about 1."""
     return linear.rounding * (linear.value + 2 * math.sqrt(linear.value / max(count, 1)))
 
@@ -279,98 +257,3 @@ def _note_open(model: _Model, parameters: Tree, sizes: Sequence[int], run: Run) 
     if columns.shape[1]:
         shapes = [tuple(x.shape) for x in arrays]
         run.remarks.append(f"not determined: {directions_in_words(columns, model.units, names, shapes)}")
-
-
-def normal_equations(
-    residuals: Callable[[Tree], Array], parameters: Tree, engine: Engine, loss: Loss = SQUARE
-) -> tuple[Array, Array, Array]:
-    """Normal equations of residuals by their whole Jacobian J, (n, U); see `Residuals.normal_equations`.
-
-    Args:
-        residuals: parameters → array of n residuals r, of any shape.
-        parameters: the point, a tree of U numbers in arrays of the engine.
-        engine: the engine, which has derivatives.
-        loss: the loss of each residual.
-
-    Returns:
-        Mean loss (), JᵀSJ / n (U, U) and JᵀWr / n (U,), where W and S are diagonals of `loss.weights(r)`.
-    """
-    xp = engine.namespace
-    vector, unflatten = flatten(parameters)
-    r, rows = engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,)))(vector)
-    rows = xp.astype(rows, r.dtype, copy=False)  # torch may widen values of no axes under its transforms.
-    value = loss(r)
-    if loss.robust:
-        weights, curvatures = loss.weights(r)
-        root = xp.sqrt(curvatures)
-        # A weight too small for the dtype is zero: the residual has no say, but for its loss.
-        r, rows = xp.where(root > 0, weights / xp.where(root > 0, root, 1.0), 0.0) * r, root * rows
-    return value, rows @ xp.matrix_transpose(rows) / r.shape[0], rows @ r / r.shape[0]
-
-
-def _least_squares(
-    terms: Terms, loss: Loss, own: bool, parameters: Tree, engine: Engine, run: Run, jit: bool
-) -> tuple[Callable, Callable]:
-    """Two functions of a vector (U,) of parameters: to a `_Linear`, on the host; and to the loss alone, a float.
-
-    All terms are computed, and their mean is taken; for the arguments see `levenberg_marquardt`.
-    """
-    vector, unflatten = flatten(parameters)
-
-    def equations(v: Array, data: Tree) -> tuple[Array, Array, Array]:
-        if own:
-            return _checked_equations(terms.own(data).normal_equations(unflatten(v)), v.shape[0], engine)
-        return normal_equations(terms.of(data), unflatten(v), engine, loss)
-
-    def value_at(v: Array, data: Tree) -> tuple[Array]:
-        return (loss(terms.of(data)(unflatten(v))),)
-
-    if jit:
-        equations, value_at = engine.jit(equations), engine.jit(value_at)
-
-    def mean(compute: Callable, v: Array) -> list[Array]:
-        return terms.mean(lambda key: run.attempt(engine, lambda: compute(v, terms.load(key))), None)
-
-    def linearize(v: Array) -> _Linear:
-        value, *rest = mean(equations, v)
-        rounding = float(engine.namespace.finfo(rest[0].dtype).eps)
-        matrix, gradient = (engine.to_numpy(x).astype(np.float64) for x in rest)
-        return _Linear(float(value), matrix, gradient, rounding)
-
-    return linearize, lambda v: float(mean(value_at, v)[0])
-
-
-def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
-    """The result of a user's `normal_equations`, refused unless it is arrays of the engine, of the right shapes."""
-    expected = (), (count, count), (count,)
-    equations: Any = tuple(result) if isinstance(result, (tuple, list)) else (result,)
-    if not all(engine.owns(x) for x in equations) or tuple(tuple(x.shape) for x in equations) != expected:
-        shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in equations)
-        raise InputError(
-            f"normal_equations gave {shapes}; expected {engine.name} arrays of shapes {', '.join(map(str, expected))}: "
-            f"mean loss, JᵀSJ / n, JᵀWr / n"
-        )
-    return equations
-
-
-def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
-    """All leaves, in order, as one vector (U,), and the function that makes a tree like `parameters` of such a vector.
-
-    The tree has the shapes and dtypes of `parameters`. The vector has the dtype that the engine promotes these to.
-    """
-    arrays = list(leaves(parameters))
-    xp = namespace(*arrays)
-
-    def unflatten(vector: Array) -> Tree:
-        at = 0
-
-        def take(x: Array) -> Array:
-            nonlocal at
-            count = math.prod(x.shape)
-            piece = xp.reshape(vector[at : at + count], tuple(x.shape))
-            at += count
-            return xp.astype(piece, x.dtype, copy=False)
-
-        return map_leaves(take, parameters)
-
-    return xp.concat([xp.reshape(x, (-1,)) for x in arrays]), unflatten

@@ -19,7 +19,7 @@ def one_line(text: str, longest: int = 200) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
-def listed(names: Sequence[str], most: int = 3) -> str:
+def names_in_words(names: Sequence[str], most: int = 3) -> str:
     """The first `most` names, separated by commas, and the number of the others."""
     more = [f"{len(names) - most} more"] if len(names) > most else []
     return ", ".join([*names[:most], *more])

@@ -52,10 +52,10 @@ class Processes:
             RtsError: another error, here or in another process; or a process has ended.
         """
         width = max((len(v) for v in vectors), default=0)
-        told = self._gathered(np.array([failure is not None, width], np.int64))
-        if told[:, 0].any():
+        states = self._gathered(np.array([failure is not None, width], np.int64))
+        if states[:, 0].any():
             self._raise(failure)
-        rows = np.zeros((-(-total // self.count), told[:, 1].max()))
+        rows = np.zeros((-(-total // self.count), states[:, 1].max()))
         for row, vector in zip(rows, vectors, strict=False):
             row[:] = vector
         gathered = self._gathered(rows)
@@ -69,8 +69,8 @@ class Processes:
 
     def _raise(self, failure: Exception | None) -> None:
         messages: list[Any] = [None] * self.count
-        own = None if failure is None else (isinstance(failure, Astray), str(failure))
-        self._tried(self._distributed.all_gather_object, messages, own)
+        report = None if failure is None else (isinstance(failure, Astray), str(failure))
+        self._tried(self._distributed.all_gather_object, messages, report)
         if failure is not None:
             raise failure
         rank, (astray, message) = next((i, m) for i, m in enumerate(messages) if m is not None)
@@ -80,9 +80,9 @@ class Processes:
         """Arrays of all processes, stacked."""
         import torch
 
-        own = torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
-        arrays = [torch.empty_like(own) for _ in range(self.count)]
-        self._tried(self._distributed.all_gather, arrays, own)
+        tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
+        arrays = [torch.empty_like(tensor) for _ in range(self.count)]
+        self._tried(self._distributed.all_gather, arrays, tensor)
         return torch.stack(arrays).cpu().numpy()
 
     def _tried(self, call: Any, *args: Any, **options: Any) -> None:

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from typing import Any
 
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Tree
 from rts.errors import EngineError, InputError, RtsError
 from rts.fitting.interrupts import interrupts_held_back
-from rts.fitting.parameter_names import listed, one_line
+from rts.fitting.parameter_names import names_in_words, one_line
 from rts.terminal import shows_bar
 
 Report = Callable[[int, Tree, float], Any]
@@ -35,14 +35,14 @@ class Run:
         mattered: for each array of the parameters, True once its gradient was other than zero.
         remarks: further remarks on the outcome, beside the reason.
         residuals: the number of residuals, once it is known.
-        asked: True if the callback has asked to stop.
+        stop_requested: True if the callback has asked to stop.
         patience: the number of steps after which `stalled` holds, if none gained.
         validates: True if other losses than those of the steps decide which parameters are best, and when to stop.
         validated: these losses, each with the number of its step in all stages.
     """
 
     def __init__(self, steps: int, callback: Report | None, tolerance: float, before: int = 0):
-        self.before, self.asked, self.validates = before, False, False
+        self.before, self.stop_requested, self.validates = before, False, False
         self.validated: list[tuple[int, float]] = []
         self.patience = steps
         self.steps, self.callback, self.tolerance = steps, callback, tolerance
@@ -63,8 +63,8 @@ class Run:
         if not self.validates:
             self._judge(parameters, loss)
         if self.callback is not None:
-            self.asked = bool(self.callback(self.before + len(self.history) - 1, parameters, loss))
-        if self.asked:
+            self.stop_requested = bool(self.callback(self.before + len(self.history) - 1, parameters, loss))
+        if self.stop_requested:
             return self.stop("the callback asked to")
         return self.left > 0
 
@@ -86,8 +86,8 @@ class Run:
         These are the history, the losses and gradients that decide, and when there was a gain. Why the run stopped,
         remarks, and the number of residuals are not among them.
         """
-        own = "history", "best_loss", "mattered", "validated", "_last_gain", "_reference"
-        return {name: copy(getattr(self, name)) for name in own}
+        names = "history", "best_loss", "mattered", "validated", "_last_gain", "_reference"
+        return {name: copy(getattr(self, name)) for name in names}
 
     def go_on(self, numbers: dict[str, Any], best: Tree) -> None:
         """Go on from the `numbers` of an earlier run, and its best parameters."""
@@ -103,12 +103,12 @@ class Run:
         """Note which arrays of the parameters have a gradient other than zero."""
         self.mattered = [a or b for a, b in zip(mattered, self.mattered or [False] * len(mattered), strict=True)]
 
-    def told(self, names: Sequence[str]) -> str:
+    def summary(self, names: Sequence[str]) -> str:
         """The reason why the fit stopped, and further remarks, in one line; arrays go by their names."""
         lost = [name for name, mattered in zip(names, self.mattered, strict=False) if not mattered]
         remarks = self.remarks
         if lost and len(lost) < len(names):
-            remarks = [f"the gradient was zero throughout in {listed(lost)}", *remarks]
+            remarks = [f"the gradient was zero throughout in {names_in_words(lost)}", *remarks]
         elif lost and self.best_loss and NO_GRADIENT not in self.reason:
             remarks = [NO_GRADIENT, *remarks]
         return one_line("; ".join([self.reason, *remarks]), LONGEST_REASON)

@@ -54,6 +54,9 @@ def warn_of_gradients(images: Mapping[str, Any]) -> None:
 
 def refuse_zero(weights: Sequence[Array | None]) -> None:
     """Refuse weights that are zero in all views, so that nothing is compared. None means ones; traced ones pass."""
-    known = [None if own is None else value_of(namespace(own).any(own != 0)) for own in weights]
-    if not any(own is None or own.any() for own in known):
+    known = [
+        None if view_weights is None else value_of(namespace(view_weights).any(view_weights != 0))
+        for view_weights in weights
+    ]
+    if not any(nonzero is None or nonzero.any() for nonzero in known):
         raise InputError("weights are all zero, so that nothing is compared; expected some above zero")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.arrays.trees import Array, Tree
 from rts.contracts.residuals import Residuals
 from rts.errors import InputError
@@ -40,13 +40,13 @@ class Terms:
         self.several = overrides(residuals, "draw", Residuals)
         self._processes = processes if self.several else None
 
-    def own(self, data: Tree) -> Residuals:
+    def unchecked(self, data: Tree) -> Residuals:
         """Residuals of one term, as they were given."""
         return self.residuals.of(data) if self.several else self.residuals
 
     def of(self, data: Tree) -> Callable[[Tree], Array]:
         """Residuals of one term, whose results are checked."""
-        return self._checked(self.own(data))
+        return self._checked(self.unchecked(data))
 
     def first(self) -> Tree:
         """The data of a term of the first step."""

@@ -9,16 +9,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.arrays.argument_checks import check_numbers, check_pixels, quoted
+from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import is_count, is_real
+from rts.contracts.checks import is_real
 from rts.contracts.residuals import Residuals
 from rts.errors import FileWarning, InputError, InputWarning, warn
 from rts.fitting.exposure import exposed
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage
+from rts.fitting.view_arguments import check_functions, checked_draws, checked_views, checked_weights
 from rts.operations.linear import matmul
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.scene.camera import Camera
@@ -103,11 +104,11 @@ class ViewResiduals(Residuals):
         loss: str | Loss = "linear",
         f_scale: float | None = None,
     ):
-        self.views = _checked_views(views)
-        _check_functions(scene, cameras, exposure, target)
+        self.views = checked_views(views)
+        check_functions(scene, cameras, exposure, target)
         self._scene, self._cameras, self._exposure, self._target = scene, cameras, exposure, target
-        self._weights = _checked_weights(weights, len(self.views))
-        self._batch, self._window = _checked_draws(batch, window, self.views)
+        self._weights = checked_weights(weights, len(self.views))
+        self._batch, self._window = checked_draws(batch, window, self.views)
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise InputError(f"seed is {quoted(seed)}; expected a whole number, at least 0")
         if not isinstance(unreadable, str) or unreadable not in ("error", "skip"):
@@ -142,8 +143,8 @@ class ViewResiduals(Residuals):
     @property
     def supersample(self) -> int:
         """Samples a pixel along each axis."""
-        own = None if self._stage is None else self._stage.supersample
-        return self._like.supersample if own is None else own
+        of_stage = None if self._stage is None else self._stage.supersample
+        return self._like.supersample if of_stage is None else of_stage
 
     def __repr__(self) -> str:
         return f"ViewResiduals({len(self.views)} views)"
@@ -290,44 +291,3 @@ class ViewResiduals(Residuals):
             raise InputError("no view has a picture that can be read")
         self.views, self._weights = [self.views[i] for i in kept], self._weights[kept]
         self._kept.clear()
-
-
-def _checked_views(views: Any) -> list[View]:
-    listed = list(views) if isinstance(views, (list, tuple)) else []
-    if not listed or not all(isinstance(view, View) for view in listed):
-        raise InputError(f"views is {quoted(views)}; expected a list of at least one view, such as of rts.load_views")
-    return listed
-
-
-def _check_functions(scene: Any, cameras: Any, exposure: Any, target: Any) -> None:
-    if not callable(scene):
-        raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → part or parts")
-    for name, value, what in (
-        ("cameras", cameras, "parameters, camera and view → camera"),
-        ("exposure", exposure, "parameters → gain and offset"),
-        ("target", target, "view → picture"),
-    ):
-        if value is not None and not callable(value):
-            raise InputError(f"{name} is {quoted(value)}; expected a function: {what}, or None")
-
-
-def _checked_weights(weights: Any, count: int) -> np.ndarray:
-    if weights is None:
-        return np.ones(count, np.float32)
-    known = check_numbers("weights", weights, (count,))
-    if known is None or known.min() < 0 or not known.max() > 0:
-        raise InputError(f"weights is {quoted(weights)}; expected {count} numbers, none negative and not all zero")
-    return known.astype(np.float32)
-
-
-def _checked_draws(batch: Any, window: Any, views: Sequence[View]) -> tuple[int | None, tuple[int, int] | None]:
-    if batch is not None and not (is_count(batch) and batch <= len(views)):
-        raise InputError(f"batch is {quoted(batch)}; expected a number of views from 1 to {len(views)}, or None")
-    if window is None:
-        return None if batch is None else int(batch), None
-    height, width = check_pixels(window)
-    for view in views:
-        if height > view.size[0] or width > view.size[1]:
-            given = f"window is {quoted(window)}, and the view {view.name} has {view.size} pixels"
-            raise InputError(f"{given}; expected a window within every view")
-    return None if batch is None else int(batch), (height, width)

@@ -32,20 +32,20 @@ def index_of_views(view: Array) -> Array:
     return view - namespace(view).astype(view > 0, view.dtype)
 
 
-def operation_of_views(name: str, own: Operation, specification: Callable[..., Array], placed: bool) -> Operation:
+def operation_of_views(name: str, operation: Operation, specification: Callable[..., Array], placed: bool) -> Operation:
     """An operation on matrices (B, R, 4), points (N, 3) and the view (N,) of each: the points of each by its matrix.
 
     Unused rows become zero.
 
     Args:
         name: its name.
-        own: the operation on the matrix (R, 4) and the points (N, 3) of one view.
+        operation: the operation on the matrix (R, 4) and the points (N, 3) of one view.
         specification: the operation in array code.
         placed: True for one more operand (B, 2), what to add to the first two columns of each view.
     """
 
     def each(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
-        """For each view its index, the slice of its points, and its operands of `own`."""
+        """For each view its index, the slice of its points, and its operands of `operation`."""
         rows, points, view, *places = operands
         if rows.shape[2] != 4 or points.shape != (len(view), 3) or any(x.shape != (len(rows), 2) for x in places):
             shapes = ", ".join(str(x.shape) for x in operands)
@@ -56,25 +56,25 @@ def operation_of_views(name: str, own: Operation, specification: Callable[..., A
 
     def forward(operands: Arrays, out: np.ndarray) -> None:
         out[rows_in_views(operands[2]) :] = 0
-        for b, part, given in each(operands):
-            own.forward(given, out[part])
+        for b, part, of_view in each(operands):
+            operation.forward(of_view, out[part])
             if placed:
                 out[part, :2] += operands[3][b]
 
     def push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
         out[rows_in_views(operands[2]) :] = 0
-        for b, part, given in each(operands):
-            own.push(given, [_of_view(tangents[0], b), _of_view(tangents[1], part)], out[part])
+        for b, part, of_view in each(operands):
+            operation.push(of_view, [_of_view(tangents[0], b), _of_view(tangents[1], part)], out[part])
 
     def pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-        for b, part, given in each(operands):
-            own.pull(given, g[part], [_of_view(results[0], b), _of_view(results[1], part)])
+        for b, part, of_view in each(operands):
+            operation.pull(of_view, g[part], [_of_view(results[0], b), _of_view(results[1], part)])
 
     return Operation(
         name,
         specification,
         ranks=(3, 2, 1, 2) if placed else (3, 2, 1),
-        shape=lambda rows, points, *_: own.shape(rows[1:], points),
+        shape=lambda rows, points, *_: operation.shape(rows[1:], points),
         forward=forward,
         push=push,
         pull=pull,

@@ -37,8 +37,8 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
     if not engine_of(ids).namespace.isdtype(ids.dtype, "integral"):
         raise InputError(f"ids have dtype {ids.dtype}; expected integers that name rows")
     if len(shapes[0]) != 2 or len(shapes[1]) != 2 or shapes[1] != shapes[2] or not shapes[1][1]:
-        given = ", ".join(map(str, shapes))
-        raise InputError(f"rows, ids and weights have shapes {given}; expected (V, C), (N, I), (N, I)")
+        listed_shapes = ", ".join(map(str, shapes))
+        raise InputError(f"rows, ids and weights have shapes {listed_shapes}; expected (V, C), (N, I), (N, I)")
     return COMBINE(*_alike(rows, weights), ids, column=0, count=shapes[1][1], affine=False)
 
 
@@ -56,11 +56,11 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     Raises:
         InputError: shapes of ids and weights do not fit; or, on the host, an id is no index of a row.
     """
-    given, wanted = shape_of(ids), shape_of(weights)
-    plain = len(given) == len(wanted) == 2
-    if not plain or not 0 <= column <= given[1] - 3 or wanted[1] < 2 or given[0] != wanted[0]:
+    ids_shape, weights_shape = shape_of(ids), shape_of(weights)
+    plain = len(ids_shape) == len(weights_shape) == 2
+    if not plain or not 0 <= column <= ids_shape[1] - 3 or weights_shape[1] < 2 or ids_shape[0] != weights_shape[0]:
         raise InputError(
-            f"samples have ids of shape {given} and parameters of shape {wanted}; expected "
+            f"samples have ids of shape {ids_shape} and parameters of shape {weights_shape}; expected "
             f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
         )
     return COMBINE(*_alike(rows, weights), ids, column=column, count=3, affine=True)

@@ -88,17 +88,17 @@ def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
         return VIEWS(rows, points, view)
     VIEWS.check_ranks((rows, points, view))
     mapped = np.zeros((len(points), rows.shape[1]), np.result_type(rows, points))
-    for b, own in ranges_of_views(view, len(rows)):
-        np.matmul(points[own], rows[b, :, :3].T, out=mapped[own])
-        mapped[own] += rows[b, :, 3]
+    for b, of_view in ranges_of_views(view, len(rows)):
+        np.matmul(points[of_view], rows[b, :, :3].T, out=mapped[of_view])
+        mapped[of_view] += rows[b, :, 3]
     return mapped
 
 
 def _specification_of_views(rows: Array, points: Array, view: Array) -> Array:
     xp = namespace(points)
-    own = xp.take(rows, index_of_views(view), axis=0)
-    terms = own[..., 0] * points[:, :1], own[..., 1] * points[:, 1:2], own[..., 2] * points[:, 2:]
-    return terms[0] + terms[1] + terms[2] + own[..., 3]
+    maps = xp.take(rows, index_of_views(view), axis=0)
+    terms = maps[..., 0] * points[:, :1], maps[..., 1] * points[:, 1:2], maps[..., 2] * points[:, 2:]
+    return terms[0] + terms[1] + terms[2] + maps[..., 3]
 
 
 VIEWS = operation_of_views("rts.affine_of_views", AFFINE, _specification_of_views, placed=False)

@@ -19,7 +19,7 @@ from rts.errors import InputError, RtsError
 _SHAPE = attrgetter("shape")
 
 
-def _listed(shapes: Iterable[tuple[int, ...]]) -> str:
+def _in_words(shapes: Iterable[tuple[int, ...]]) -> str:
     return ", ".join(str(tuple(shape)) for shape in shapes)
 
 
@@ -146,8 +146,8 @@ class Operation:
             object.__setattr__(self, name, self._integers(name))
         for name in ("packed_result", "keeps", "sweeps"):
             if type(getattr(self, name)) is not bool:
-                given = quoted(getattr(self, name))
-                raise InputError(f"{name} of the operation {self.name} is {given}; expected True or False")
+                value = quoted(getattr(self, name))
+                raise InputError(f"{name} of the operation {self.name} is {value}; expected True or False")
         self._check_indices()
 
     def _integers(self, name: str) -> tuple[int, ...]:
@@ -195,8 +195,8 @@ class Operation:
                 return engine_of(operands[0]).apply(self, operands, params)
         operands = tuple([from_numbers(x, f"an operand of {self.name}") for x in operands])
         if any(isinstance(x, (Mapping, list, tuple)) or x is None for x in operands):
-            given = ", ".join(map(kind_of, operands))
-            raise InputError(f"the operation {self.name} was given {given} as operands; expected arrays")
+            kinds = ", ".join(map(kind_of, operands))
+            raise InputError(f"the operation {self.name} was given {kinds} as operands; expected arrays")
         engine, like = context_of(operands)
         operands = constants(operands, engine, like)
         self.check_ranks(operands)
@@ -206,7 +206,7 @@ class Operation:
         """Raise an InputError if the number of axes of an operand is not its rank."""
         for x, rank in zip(operands, self.ranks, strict=True):
             if x.ndim != rank:
-                shapes = _listed(map(_SHAPE, operands))
+                shapes = _in_words(map(_SHAPE, operands))
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
@@ -233,8 +233,8 @@ class Operation:
             raise self._refused("shape", shapes, error) from error
         if type(result) is not tuple or not all(isinstance(n, (int, np.integer)) and n >= 0 for n in result):
             raise InputError(
-                f"shape of the operation {self.name} gives {quoted(result)} for operands of shapes {_listed(shapes)}; "
-                f"expected a tuple of integers of at least 0"
+                f"shape of the operation {self.name} gives {quoted(result)} for operands of shapes "
+                f"{_in_words(shapes)}; expected a tuple of integers of at least 0"
             )
         return result
 
@@ -259,7 +259,7 @@ class Operation:
         if isinstance(error, RtsError):
             return error
         return InputError(
-            f"{function} of the operation {self.name} cannot take operands of shapes {_listed(shapes)}: "
+            f"{function} of the operation {self.name} cannot take operands of shapes {_in_words(shapes)}: "
             f"{one_line(error)}; give it operands of shapes that fit"
         )
 

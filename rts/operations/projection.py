@@ -39,9 +39,9 @@ def projective_map_of_views(rows: Array, points: Array, view: Array, places: Arr
     if not is_plain_product(rows[0, ...], points):
         return VIEWS(rows, points, view, places)
     xp, placed = namespace(points), []
-    for b, own in ranges_of_views(view, len(rows)):
-        shown = _specification(rows[b, ...], points[own, :])
-        placed.append(xp.concat([shown[:, :2] + places[b, ...], shown[:, 2:]], axis=1))
+    for b, of_view in ranges_of_views(view, len(rows)):
+        projected = _specification(rows[b, ...], points[of_view, :])
+        placed.append(xp.concat([projected[:, :2] + places[b, ...], projected[:, 2:]], axis=1))
     return xp.concat(placed)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns
@@ -107,7 +107,9 @@ def _found_on_host(
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
-            gbuffer = part.surface.evaluate(part.theta, replace(samples, asked=None)) if "gbuffer" in kinds else {}
+            gbuffer = (
+                part.surface.evaluate(part.theta, replace(samples, gbuffer_names=None)) if "gbuffer" in kinds else {}
+            )
             arrays_of += [gbuffer[name] if kind == "gbuffer" else known_of[kind, name] for kind, name in tables]
         return [np.asarray(x, spec.dtype) for x, spec in zip([*found, *arrays_of], specs, strict=True)]
 

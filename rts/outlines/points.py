@@ -11,7 +11,7 @@ import numpy as np
 from rts.arrays.engines import engine_of, exemplar
 from rts.arrays.trees import Tree
 from rts.compiling.threads import each
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Cells, Fragments, Request, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputWarning, warn
@@ -234,7 +234,7 @@ class Points:
             sampler = _OnTriangles(fragments)
         request = Request(points=points, pairs=pairs, entry=entry)
         samples = sampler.sample(self._scene.parts[part], camera, self._grid.size, layers, request)
-        if "points" in samples.followed:
+        if samples.at_points:
             return samples
         warn(
             f"the sampler {name_of('rts.samplers', sampler)} does not sample single points, so that outlines lie midway"

@@ -11,7 +11,7 @@ import numpy as np
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import Fragments, Proxy
 from rts.outlines.gaps import Fronts
-from rts.sampling.points import kept_sign, near_and_far, pixel_rows
+from rts.sampling.points import near_and_far, pixel_rows
 from rts.scene.camera import Camera
 
 
@@ -107,7 +107,7 @@ class Sheets(NamedTuple):
             beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
         beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
         parallel(silhouettes_loops.turns, len(faces), rows, vertices, faces, seen, sides, work=10 * len(faces))
-        planes, keep = near_and_far(camera), kept_sign(camera, cull)
+        planes, keep = near_and_far(camera), camera.kept_sign(cull)
         return cls(first, starts, vertices, faces, beyond, rows, planes, keep, seen, sides)
 
     def holds(self, parts: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from rts.arrays.argument_checks import check_numbers, check_positive, quoted
 from rts.contracts.checks import is_count
 from rts.sampling.cache import fingerprint
-from rts.sampling.sample_checks import check_camera
+from rts.sampling.camera_checks import check_camera
 from rts.scene.topology import index_table
 from rts.terminal import shows_bar
 

@@ -88,5 +88,5 @@ class ARAP(OfRestShape):
         sign = (xp.linalg.det(u) * xp.linalg.det(v))[:, None, None]  # −1 for reflections.
         u = xp.concat([u[:, :, :2], u[:, :, 2:] * sign], axis=2)
         rotations = xp.sum(u[:, :, :, None] * v[:, None, :, :], axis=2)
-        own = xp.take(rotations, engine.constant(self._ids[:, 0], spokes), axis=0)
-        return (xp.sum(own * rest[:, None, :], axis=2),)
+        of_spokes = xp.take(rotations, engine.constant(self._ids[:, 0], spokes), axis=0)
+        return (xp.sum(of_spokes * rest[:, None, :], axis=2),)

@@ -42,10 +42,10 @@ def _turn(start, stop, spokes, rest, starts, out):
         _nearest_rotation(columns, axes, rotation)
         for n in range(starts[i], starts[i + 1]):
             for r in range(3):
-                turned = 0.0
+                total = 0.0
                 for c in range(3):
-                    turned += rotation[r, c] * rest[n, c]
-                out[n, r] = turned
+                    total += rotation[r, c] * rest[n, c]
+                out[n, r] = total
 
 
 @numba.njit(error_model="numpy")

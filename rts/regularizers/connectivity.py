@@ -58,10 +58,10 @@ def pairs_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = order[np.searchsorted(sides[order], 0) :]
     first, pairs = np.arange(len(order)), [np.zeros((0, 2), np.int64)]
     while len(first):  # Faces of an edge are neighbours in this order: pairs one apart, two apart, …
-        apart = len(pairs)
-        first = first[first + apart < len(order)]
-        first = first[sides[order[first]] == sides[order[first + apart]]]
-        pairs.append(order[np.stack([first, first + apart], axis=-1)])
+        stride = len(pairs)
+        first = first[first + stride < len(order)]
+        first = first[sides[order[first]] == sides[order[first + stride]]]
+        pairs.append(order[np.stack([first, first + stride], axis=-1)])
     halves = np.concatenate(pairs)
     # A face whose corners are two vertices passes its edge twice.
     halves = halves[halves[:, 0] // 3 != halves[:, 1] // 3]

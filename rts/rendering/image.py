@@ -89,7 +89,7 @@ def render(
 def image_over(scene: Scene, size: tuple[int, int], background: Array | None, settings: RenderSettings) -> Array:
     """The image (H, W, C + 1) of a checked scene over a checked background; see `render`."""
     context = scene.context if is_constant(background) else scene.context_with(background)
-    return over_background(seen(image_of(scene, size, context, settings), scene), background)
+    return over_background(warned_if_empty(image_of(scene, size, context, settings), scene), background)
 
 
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
@@ -201,12 +201,12 @@ def splatted(sampled: Sampled, scene: Scene, window: Camera, context: Context, s
     return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
 
 
-def seen(image: Array, scene: Scene, name: str = "the image") -> Array:
+def warned_if_empty(image: Array, scene: Scene, name: str = "the image") -> Array:
     """The image (H, W, C + 1) itself; a warning names it if alpha is 0 everywhere. A traced image is not looked at."""
     engine, (height, width) = engine_of(image), image.shape[:2]
     if not engine.on_host(image):
-        seen = value_of(engine.namespace.any(image[..., -1] > 0))
-        if seen is None or seen.any():
+        visible = value_of(engine.namespace.any(image[..., -1] > 0))
+        if visible is None or visible.any():
             return image
     pixels = engine.known(image)
     if pixels is None or pixels[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or pixels[..., -1].any():

@@ -7,7 +7,8 @@ from typing import Any
 
 from rts.arrays.engines import context_of_scene, uncompiled
 from rts.arrays.trees import Array
-from rts.contracts.checks import changed_part, check_background, check_changes, check_channels
+from rts.contracts.checked_parts import changed_part, check_changes, check_channels
+from rts.contracts.checks import check_background
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import image_over
 from rts.rendering.settings import RenderSettings

@@ -74,8 +74,8 @@ def sampled_scene(
     With `one_shader` they serve the shaders of the scene alone, so that cells of one colour may name one sample.
     """
     settings = settings.of(scene)
-    side, capacity = settings.supersample, settings.capacity
-    height, width = side * size[0], side * size[1]
+    factor, capacity = settings.supersample, settings.capacity
+    height, width = factor * size[0], factor * size[1]
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     scene = with_entries(scene, grid) if outlines else scene
@@ -87,7 +87,7 @@ def sampled_scene(
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:
         sampled = with_outlines(sampled, scene, grid, capacity)
-    return replace(sampled, supersample=side, apron=settings.apron)
+    return replace(sampled, supersample=factor, apron=settings.apron)
 
 
 def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:

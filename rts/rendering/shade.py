@@ -10,11 +10,13 @@ from functools import cache, partial
 from typing import Any
 
 from rts.arrays.array_functions import described, kind_of, shape_of
-from rts.arrays.engines import Context, Engine, is_constant, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import Context, is_constant, namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import CheckedPart, check_shaded
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
+from rts.contracts.result_checks import check_shaded
 from rts.errors import InputError
 from rts.operations.linear import affine_map
 from rts.scene.camera import Camera
@@ -31,7 +33,7 @@ def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
     theta = part.read
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
-        if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
+        if samples.gbuffer_names is None or (wanted is not None and set(wanted) <= set(samples.gbuffer_names)):
             return GBuffer(samples.gbuffer)
     gbuffer = part.surface.evaluate(context.constants(theta), samples)
     if not isinstance(gbuffer, Mapping) or "position" not in gbuffer:
@@ -60,16 +62,16 @@ def add_footprint(
     part: CheckedPart,
     samples: Samples,
     local: GBuffer,
-    own: Camera,
+    camera: Camera,
     grid: tuple[int, int],
     context: Context,
 ) -> None:
     """Add a deferred "uv_footprint" to the G-buffer `local` of samples in one view, if it has "uv" but no footprint.
 
-    Arguments are as in `uv_footprint`; `own` is its camera.
+    Arguments are as in `uv_footprint`; `camera` is its camera.
     """
     if "uv" in local and FOOTPRINT not in local:
-        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, part.read, samples, local, own, grid, *context))
+        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, part.read, samples, local, camera, grid, *context))
 
 
 def shade(
@@ -102,8 +104,8 @@ def shade(
         rows[NUMBER] = camera.number
 
     def few(rows: dict[str, Array]) -> Array:
-        own = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
-        return _colors(part, theta, transform, own, names, rows)
+        row_cameras = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
+        return _colors(part, theta, transform, row_cameras, names, rows)
 
     with suppress(_UnreadError):
         rgba = engine.by_rows_in_use(few, rows, samples.row, rgba)
@@ -114,23 +116,25 @@ NUMBER = "the numbers of views"
 """The key of `RowCameras.number` among attributes; no attribute has this name."""
 
 
-def apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
+def split_by_view(
+    samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine
+) -> list[tuple[Samples, GBuffer]]:
     """The samples and G-buffer of each view, cut from the arrays of all views; `sizes` are numbers of rows."""
-    pieces, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
+    pieces_of, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
 
     def split(name: str) -> Sequence[Array]:
         with lock:  # Views are shaded by several threads.
-            return pieces(name)
+            return pieces_of(name)
 
     split_tables = [samples.tables[name] for name in samples.by_sample]
     rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *split_tables)]
     views = []
     for b, (ids, params, *tables) in enumerate(zip(*rows, strict=True)):
-        own = GBuffer(position=split("position")[b])
+        view_gbuffer = GBuffer(position=split("position")[b])
         for name in set(gbuffer) - {"position"}:
-            own.defer(name, lambda name=name, b=b: split(name)[b])
+            view_gbuffer.defer(name, lambda name=name, b=b: split(name)[b])
         tables = {**samples.tables, **dict(zip(samples.by_sample, tables, strict=True))}
-        views.append((replace(samples, ids=ids, params=params, tables=tables, gbuffer=None), own))
+        views.append((replace(samples, ids=ids, params=params, tables=tables, gbuffer=None), view_gbuffer))
     return views
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
-from rts.contracts.checks import CheckedPart, check_splats
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, Sampled, Samples, Splats
+from rts.contracts.result_checks import check_splats
 from rts.errors import InputError
 from rts.rendering.shade import add_footprint, evaluate, shade, theta_of
 from rts.sampling.scene import Grid
@@ -37,7 +38,9 @@ def to_splats(
     grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
     sampled = owned(sampled, sampled.row, context)
     beside = None if sampled.outlines is None else sampled.outlines.rows
-    positions, rgba = together(*_shown(sampled.samples, sampled.row, parts, camera, grid, context, beside))
+    positions, rgba = concatenated(
+        *_positions_and_colors(sampled.samples, sampled.row, parts, camera, grid, context, beside)
+    )
     return splats_of(sampled, parts, positions, rgba, context, border=apron)
 
 
@@ -63,7 +66,7 @@ def splats_of(
     return Splats(positions, rgba, cells, border, opaque, outlines)
 
 
-def _shown(
+def _positions_and_colors(
     sampled: Sequence[Samples],
     row: Array,
     parts: Sequence[CheckedPart],
@@ -84,18 +87,18 @@ def _shown(
         beside: integers, the indices of samples beside outlines, behind those of cells; None without outlines.
     """
     inputs, engine = of_inputs(context), context.engine
-    seen = grid.camera.replace(view=inputs.constants(grid.camera.view))
+    world_camera = grid.camera.replace(view=inputs.constants(grid.camera.view))
     camera = context.constants(camera)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
         theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
         local = evaluate(part, samples, inputs)
-        own = seen.within(transform)
-        add_footprint(part, samples, local, own, grid.size, inputs)
+        local_camera = world_camera.within(transform)
+        add_footprint(part, samples, local, local_camera, grid.size, inputs)
         padded = beside is not None and engine.padded(samples.row)
         used = all_in_use(samples, inputs, beside, first) if padded else samples
         world, rgba = shade(part, theta, transform, used, local, camera, engine)
-        positions.append(context.constants(own.project(on_rays(samples, local["position"]), grid.size)))
+        positions.append(context.constants(local_camera.project(on_rays(samples, local["position"]), grid.size)))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(context.constants(rgba))
         first += samples.ids.shape[-2]
@@ -111,7 +114,7 @@ def all_in_use(samples: Samples, context: Context, beside: Array | None, first: 
     Args:
         samples: the samples of a part.
         context: of their arrays.
-        beside: see `_shown`; None if some row is in use.
+        beside: see `_positions_and_colors`; None if some row is in use.
         first: the index of the part's first sample.
     """
     xp, count = namespace(samples.row), samples.ids.shape[-2]
@@ -135,11 +138,11 @@ def on_rays(samples: Samples, position: Array) -> Array:
             f"samples are not centered, and have no table {ON_RAYS!r}: expected (N, 3), where their cells' rays are at "
             f"their depth"
         )
-    own = context_of(position)
-    place = namespace(position).astype(own.constants(samples.tables[ON_RAYS]), position.dtype, copy=False)
-    return place + (position - own.engine.stop_gradient(position))
+    context = context_of(position)
+    place = namespace(position).astype(context.constants(samples.tables[ON_RAYS]), position.dtype, copy=False)
+    return place + (position - context.engine.stop_gradient(position))
 
 
-def together(*kinds: Sequence[Array]) -> list[Array]:
+def concatenated(*kinds: Sequence[Array]) -> list[Array]:
     """One concatenated array of each kind, such as positions and colours."""
     return [arrays[0] if len(arrays) == 1 else namespace(arrays[0]).concat(list(arrays)) for arrays in kinds]

@@ -72,7 +72,7 @@ def is_static(part: Part, camera: Camera) -> bool:
 class Auto(Sampler):
     """A sampler that passes each part to the sampler that `choose` names."""
 
-    def suited(self, part: Part, camera: Camera | None) -> Sampler:
+    def sampler_for(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""
         choice = choose(part, static=camera is None or is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
@@ -80,4 +80,4 @@ class Auto(Sampler):
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
-        return self.suited(part, camera).sample(part, camera, size, layers, request)
+        return self.sampler_for(part, camera).sample(part, camera, size, layers, request)

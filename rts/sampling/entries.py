@@ -8,7 +8,7 @@ import numpy as np
 
 from rts.arrays.engines import is_traced, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
 from rts.sampling.scene import Grid, Scene

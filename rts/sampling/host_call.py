@@ -10,12 +10,12 @@ import numpy as np
 
 from rts.arrays.engines import context_of, floating_bits, is_constant, stopped
 from rts.arrays.trees import Array, leaves, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.cache import Entry
+from rts.sampling.camera_checks import check_camera
 from rts.sampling.layer_order import rays_of
-from rts.sampling.sample_checks import check_camera
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
@@ -23,7 +23,7 @@ Find = Callable[..., tuple[Samples, Mapping[str, np.ndarray]]]
 """(cameras, inputs of the proxy, further arrays), all on the host → samples, and further results by name."""
 
 
-class Shape(NamedTuple):
+class SampleBounds(NamedTuple):
     """Bounds on the number of samples: layers, cells and rows.
 
     Attributes:
@@ -76,7 +76,7 @@ class HostCall:
         part: the part.
         surface: its surface.
         cameras: cameras in the part's local space, without derivatives.
-        shape: bounds on the number of samples.
+        bounds: bounds on the number of samples.
         entry: the part's prepared entry, if known; the inputs of its proxy are then not read.
     """
 
@@ -85,18 +85,18 @@ class HostCall:
         part: Part | CheckedPart,
         surface: TriangleSurface,
         cameras: Sequence[Camera],
-        shape: Shape,
+        bounds: SampleBounds,
         entry: Entry | None,
     ):
-        self._surface, self._cameras, self._shape, self._entry = surface, cameras, shape, entry
+        self._surface, self._cameras, self._bounds, self._entry = surface, cameras, bounds, entry
         self._transform = [] if part.transform is None else [part.transform]
         self._engine, like = context_of(part.theta, cameras)
         self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
-        reads = {name: part.theta[name] for name in surface.reads(part.theta)}
+        theta = {name: part.theta[name] for name in surface.reads(part.theta)}
         # A surface without derivatives is evaluated where it is sampled, on the host.
-        self._theta = reads if self._engine.differentiates and is_constant(reads) else None
-        self._asked = part.reads if isinstance(part, CheckedPart) else None
-        self._attributes = _attribute_specs(surface, self._asked, self._theta, shape, like)
+        self._theta = theta if self._engine.differentiates and is_constant(theta) else None
+        self._reads = part.reads if isinstance(part, CheckedPart) else None
+        self._attributes = _attribute_specs(surface, self._reads, self._theta, bounds, like)
 
     def samples(
         self,
@@ -123,7 +123,7 @@ class HostCall:
         """
         tables = dict(tables or {})
         if not self._surface.centered:
-            tables[ON_RAYS] = self._shape.row_spec(np.float32, 3)._replace(by_sample=True)
+            tables[ON_RAYS] = self._bounds.row_spec(np.float32, 3)._replace(by_sample=True)
 
         def host(*operands: np.ndarray) -> tuple[Any, ...]:
             it = iter(operands)
@@ -132,37 +132,37 @@ class HostCall:
             cameras = [check_camera(camera, *moved) for camera in seen]
             further = [next(it) for _ in arrays]
             inputs = map_leaves(lambda _: next(it), self._inputs) if self._entry is None else self._entry.inputs
-            samples, more = find(cameras, inputs, *further)
-            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, samples)
+            found, more = find(cameras, inputs, *further)
+            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, found)
             if ON_RAYS in tables:
-                on_rays = _on_rays(samples, cameras[0], self._shape.view, *further)
-                samples = replace(samples, tables={**samples.tables, ON_RAYS: on_rays})
+                on_rays = _on_rays(found, cameras[0], self._bounds.view, *further)
+                found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
             return (
-                *(samples.ids, samples.params, samples.row, samples.depth, samples.overflow),
+                *(found.ids, found.params, found.row, found.depth, found.overflow),
                 *(more[name] for name in beside),
-                *(_allotted(samples.tables[name], spec) for name, spec in tables.items()),
+                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in self._attributes.items()),
             )
 
-        own_specs = self._shape.specs(self._surface.sample_widths)
-        specs = *own_specs, *beside.values(), *tables.values(), *self._attributes.values()
+        sample_specs = self._bounds.specs(self._surface.sample_widths)
+        specs = *sample_specs, *beside.values(), *tables.values(), *self._attributes.values()
         matrices = [m for camera in self._cameras for m in (camera.view, camera.projection)]
         operands = *matrices, *self._transform, *arrays, *leaves(self._inputs)
         results = iter(self._engine.call_host(host, specs, *operands))
-        ids, params, row, depth, overflow = (next(results) for _ in own_specs)
-        more, filled, known = ({name: next(results) for name in x} for x in (beside, tables, self._attributes))
-        samples = Samples(
+        ids, params, row, depth, overflow = (next(results) for _ in sample_specs)
+        more, filled, attributes = ({name: next(results) for name in x} for x in (beside, tables, self._attributes))
+        found = Samples(
             ids,
             params,
             Cells(row, depth),
             overflow,
             tables=filled,
-            gbuffer=None if self._theta is None else known,
-            asked=self._asked,
+            gbuffer=None if self._theta is None else attributes,
+            gbuffer_names=self._reads,
             centered=self._surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
         )
-        return samples, more
+        return found, more
 
 
 def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:
@@ -188,26 +188,30 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
 
 
 def _attribute_specs(
-    surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
+    surface: TriangleSurface,
+    reads: Sequence[str] | None,
+    host_theta: Mapping | None,
+    bounds: SampleBounds,
+    like: Array | None,
 ) -> dict[str, ArraySpec]:
     """Specs of the attributes that the host evaluates: "position", and others that the shader reads.
 
     Args:
         surface: the surface.
-        asked: names of the attributes that the shader reads; None for all.
+        reads: names of the attributes that the shader reads; None for all.
         host_theta: the θ that the surface reads, if it is constant; None gives no specs.
-        shape: bounds on the number of samples.
+        bounds: bounds on the number of samples.
         like: an array whose precision the attributes take; None for float32.
     """
     if host_theta is None:
         return {}
     real = np.float64 if like is not None and floating_bits(like) == 64 else np.float32
-    if asked is not None and not asked:
-        return {"position": shape.row_spec(real, 3)}
+    if reads is not None and not reads:
+        return {"position": bounds.row_spec(real, 3)}
     i, p = surface.sample_widths
     none = np.full((1, 1, 1), -1, np.int32)
-    tables = {name: np.zeros((1, *spec.shape[1:]), spec.dtype) for name, spec in shape.tables(surface).items()}
+    tables = {name: np.zeros((1, *spec.shape[1:]), spec.dtype) for name, spec in bounds.tables(surface).items()}
     one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), Cells(none, none), np.int32(0), tables)
     gbuffer = surface.evaluate(host_theta, one)
-    names = list(gbuffer) if asked is None else ["position", *(n for n in asked if n in gbuffer)]
-    return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
+    names = list(gbuffer) if reads is None else ["position", *(n for n in reads if n in gbuffer)]
+    return {n: bounds.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}

@@ -14,12 +14,13 @@ import numpy as np
 
 from rts.arrays.engines import floating_bits, is_constant
 from rts.arrays.trees import Array, map_leaves
-from rts.contracts.checks import CheckedPart
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
+from rts.sampling.camera_checks import check_camera
 from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
-from rts.sampling.packing import lift
-from rts.sampling.sample_checks import check_camera, check_fragments
+from rts.sampling.packing import pack_fragments
+from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
@@ -96,7 +97,7 @@ class Joint:
         """
         ids = fragments.triangle_ids
         covered = ids >= 0 if covered is None else covered
-        packed = lift(fragments, self.proxy, None, covered)
+        packed = pack_fragments(fragments, self.proxy, None, covered)
         row, tables = self._by_part(packed, ids[covered])
         context = self.scene.context
         real = np.float64 if context.like is not None and floating_bits(context.like) == 64 else np.float32
@@ -116,7 +117,7 @@ class Joint:
             own, params, used = next(results), next(results), next(results)
             gbuffer = None if known is None else {name: next(results) for name in known}
             cells = Cells(used)
-            samples.append(Samples(own, params, cells, overflow, gbuffer=gbuffer, asked=part.reads))
+            samples.append(Samples(own, params, cells, overflow, gbuffer=gbuffer, gbuffer_names=part.reads))
         return Sampled(tuple(samples), Cells(row, depth, triangle), overflow)
 
     def _by_part(self, packed: Samples, triangles: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:

@@ -45,7 +45,7 @@ def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:
         other_axes = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
         counts = (row[..., 1:, :, :] >= 0).sum(axis=other_axes)
         most = 1 + int(np.flatnonzero(np.append(1, counts)).max())
-        if (most < count and not _ran_out(sampled)) or count > LAYER_LIMIT:
+        if (most < count and not _may_have_more(sampled)) or count > LAYER_LIMIT:
             break
         count *= 2
     missing = int(counts[LAYER_LIMIT - 1 :].sum())
@@ -59,7 +59,7 @@ def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:
     return replace(sampled, cells=cells, overflow=sampled.overflow + missing)
 
 
-def _ran_out(sampled: Sampled) -> bool:
+def _may_have_more(sampled: Sampled) -> bool:
     """True if triangles ran out in some cells before a refined surface had all its layers: there may be more."""
-    known = (None if s.ran_out is None else value_of(s.ran_out) for s in sampled.samples)
-    return any(bool(x) for x in known if x is not None)
+    counts = (None if s.incomplete_cells is None else value_of(s.incomplete_cells) for s in sampled.samples)
+    return any(bool(x) for x in counts if x is not None)

@@ -13,7 +13,7 @@ from rts.arrays.trees import Tree
 from rts.compiling.threads import parallel, read_only
 from rts.contracts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import checked_refined
 from rts.scene.camera import Camera
 from rts.scene.rays import Rays
@@ -30,6 +30,7 @@ def on_surface(
     camera: Camera,
     layers: int,
     tables: Mapping[str, ArraySpec],
+    *,
     size: tuple[int, int],
     cells: np.ndarray | None = None,
 ) -> Samples:
@@ -51,32 +52,32 @@ def on_surface(
         cells: (L, C), the cells of the samples, as flat indices in the grid, or points (L, C, 2); None for all.
     """
     first = Fragments(*(x[:layers] for x in fragments))
-    moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables, size, cells)
-    settled = settle(moved, camera, rays.spread)
+    moved, rays = refined(surface, inputs, pack_fragments(first, proxy), camera, tables, size, cells)
+    ordered = settle(moved, camera, rays.spread)
     if len(fragments.depth) == layers:
-        return settled
-    places = np.nonzero((settled.row[-1] < 0) & (fragments.triangle_ids[layers] >= 0))
+        return ordered
+    places = np.nonzero((ordered.row[-1] < 0) & (fragments.triangle_ids[layers] >= 0))
     if not len(places[0]):
-        return settled
+        return ordered
     indices = np.ravel_multi_index(places, size) if cells is None else cells[places]
     # The cells where layers are missing, as the only line of an image.
     behind = Fragments(*(np.ascontiguousarray(x[layers:, *places])[:, None] for x in fragments))
-    more, _ = refined(surface, inputs, lift(behind, proxy), camera, tables, size, indices[None])
-    added = np.where(more.row >= 0, more.row + np.int32(len(settled.ids)), -1)
-    pairs = (settled.row, added), (settled.depth, more.depth)
+    more, _ = refined(surface, inputs, pack_fragments(behind, proxy), camera, tables, size, indices[None])
+    added = np.where(more.row >= 0, more.row + np.int32(len(ordered.ids)), -1)
+    pairs = (ordered.row, added), (ordered.depth, more.depth)
     row, depth = (np.concatenate([a[:, *places], b[:, 0]])[:, None] for a, b in pairs)
-    both = settle(settled.replace(row=row, depth=depth), camera, rays.spread)
-    row, depth = settled.row, settled.depth
+    both = settle(ordered.replace(row=row, depth=depth), camera, rays.spread)
+    row, depth = ordered.row, ordered.depth
     row[:, *places], depth[:, *places] = both.row[:layers, 0], both.depth[:layers, 0]
-    ids, params = (np.concatenate(x) for x in ((settled.ids, more.ids), (settled.params, more.params)))
-    overflow = np.asarray(settled.overflow + more.overflow, np.int32)
-    return settled.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow)
+    ids, params = (np.concatenate(x) for x in ((ordered.ids, more.ids), (ordered.params, more.params)))
+    overflow = np.asarray(ordered.overflow + more.overflow, np.int32)
+    return ordered.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow)
 
 
 def refined(
     surface: TriangleSurface,
     inputs: Tree,
-    lifted: Samples,
+    unrefined: Samples,
     camera: Camera,
     tables: Mapping[str, ArraySpec],
     size: tuple[int, ...] | None = None,
@@ -87,7 +88,7 @@ def refined(
     Args:
         surface: the surface.
         inputs: the result of its `proxy_inputs`, on the host.
-        lifted: the samples, a row for each covered cell.
+        unrefined: the samples, a row for each covered cell.
         camera: host matrices.
         tables: the result of the surface's `table_specs`.
         size: (height, width) of the grid of cells; None for that of the samples.
@@ -95,13 +96,15 @@ def refined(
     """
     by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
     allotted = {
-        name: np.zeros((len(lifted.ids) if name in by_sample else spec.shape[0], *spec.shape[1:]), spec.dtype)
+        name: np.zeros((len(unrefined.ids) if name in by_sample else spec.shape[0], *spec.shape[1:]), spec.dtype)
         for name, spec in tables.items()
     }
-    rays = rays_of(lifted, camera, size or lifted.row.shape[1:], cells)
-    lifted = lifted.replace(tables=allotted, by_sample=by_sample)
+    rays = rays_of(unrefined, camera, size or unrefined.row.shape[1:], cells)
+    unrefined = unrefined.replace(tables=allotted, by_sample=by_sample)
     # `refine` gets a copy of `row`, so that the check sees what it has changed.
-    return checked_refined(surface.refine(inputs, lifted.replace(row=lifted.row.copy()), rays), lifted, surface), rays
+    return checked_refined(
+        surface.refine(inputs, unrefined.replace(row=unrefined.row.copy()), rays), unrefined, surface
+    ), rays
 
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:

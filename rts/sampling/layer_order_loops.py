@@ -20,7 +20,7 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
         out_depth: (K, H, W), to be filled; 0 in empty layers.
     """
     layers, _, width = row.shape
-    near, far, apart, apart_by_depth = limits
+    near, far, least_gap, gap_by_depth = limits
     for y in range(start, stop):
         for x in range(width):
             count = 0
@@ -37,7 +37,7 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
             kept = 0
             for k in range(count):
                 z = out_depth[k, y, x]
-                if kept == 0 or z - out_depth[kept - 1, y, x] > apart + apart_by_depth * abs(z):
+                if kept == 0 or z - out_depth[kept - 1, y, x] > least_gap + gap_by_depth * abs(z):
                     out_depth[kept, y, x], out_row[kept, y, x] = z, out_row[k, y, x]
                     kept += 1
             for k in range(kept, layers):

@@ -32,22 +32,24 @@ def interleave(
     shape = (min(layers, sum(r.shape[0] for r in rows)), height, width)
     row, depth = np.full(shape, -1, np.int32), np.zeros(shape, kind)
     triangle = np.full(shape if triangles else (0, height, width), -1, np.int32)
-    for own, z, first, told in zip(rows, depths, firsts, triangles or [r[:0] for r in rows], strict=True):
-        given = read_only(own, np.int32), read_only(z, kind), read_only(told, np.int32)
-        parallel(_insert, height, *given, first, row, depth, triangle, work=3 * own.size)
+    for part_row, part_depth, first, part_triangle in zip(
+        rows, depths, firsts, triangles or [r[:0] for r in rows], strict=True
+    ):
+        arrays = read_only(part_row, np.int32), read_only(part_depth, kind), read_only(part_triangle, np.int32)
+        parallel(_insert, height, *arrays, first, row, depth, triangle, work=3 * part_row.size)
     return (row, depth, triangle) if triangles else (row, depth)
 
 
 @loop
-def _insert(start, stop, own_row, own_depth, own_triangle, first, row, depth, triangle):
+def _insert(start, stop, part_row, part_depth, part_triangle, first, row, depth, triangle):
     """Insert a part into lines [start, stop) of the layers of the parts before it.
 
     Args:
         start: first line.
         stop: end of the lines.
-        own_row: (L, H, W), of the part.
-        own_depth: (L, H, W).
-        own_triangle: (L, H, W) int32; no layers if triangles are not told.
+        part_row: (L, H, W), of the part.
+        part_depth: (L, H, W).
+        part_triangle: (L, H, W) int32; no layers if triangles are not told.
         first: the part's first row.
         row: (K, H, W) int32, counted over all parts; −1 in empty layers, which are the last ones.
         depth: (K, H, W).
@@ -56,14 +58,16 @@ def _insert(start, stop, own_row, own_depth, own_triangle, first, row, depth, tr
     for y in range(start, stop):
         for x in range(row.shape[2]):
             k = 0
-            for own in range(len(own_row)):
-                if own_row[own, y, x] >= 0:
-                    told = own_triangle[own, y, x] if len(own_triangle) > 0 else -1
-                    k = 1 + _put(first + own_row[own, y, x], own_depth[own, y, x], told, y, x, k, row, depth, triangle)
+            for layer in range(len(part_row)):
+                if part_row[layer, y, x] >= 0:
+                    t = part_triangle[layer, y, x] if len(part_triangle) > 0 else -1
+                    k = 1 + _put(
+                        first + part_row[layer, y, x], part_depth[layer, y, x], t, y, x, k, row, depth, triangle
+                    )
 
 
 @compiled
-def _put(own, z, told, y, x, k, row, depth, triangle):
+def _put(index, z, t, y, x, k, row, depth, triangle):
     """Put a sample into a cell, behind all that are not deeper, from layer k on; returns its layer, or the last."""
     layers = len(row)
     while k < layers and row[k, y, x] >= 0 and not z < depth[k, y, x]:
@@ -74,7 +78,7 @@ def _put(own, z, told, y, x, k, row, depth, triangle):
         row[n, y, x], depth[n, y, x] = row[n - 1, y, x], depth[n - 1, y, x]
         if len(triangle) > 0:
             triangle[n, y, x] = triangle[n - 1, y, x]
-    row[k, y, x], depth[k, y, x] = own, z
+    row[k, y, x], depth[k, y, x] = index, z
     if len(triangle) > 0:
-        triangle[k, y, x] = told
+        triangle[k, y, x] = t
     return k

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.extremes import named
+from rts.arrays.value_ranges import nonnegative
 from rts.contracts.records import Cells, Fragments, Proxy, Samples
 from rts.errors import InputError
 
@@ -17,13 +17,13 @@ def covered_cells(triangle_ids: np.ndarray) -> tuple[np.ndarray, int]:
     Raises:
         InputError: an entry is neither an index nor −1.
     """
-    covered, least, last = named(np.asarray(triangle_ids))
+    covered, least, last = nonnegative(np.asarray(triangle_ids))
     if least < -1:
         raise InputError(f"the sampler gave triangle {least} to a cell; expected indices, or -1 where it is empty")
     return covered, last
 
 
-def lift(
+def pack_fragments(
     fragments: Fragments,
     proxy: Proxy,
     capacity: int | None = None,

@@ -41,8 +41,8 @@ def pack(
     # Without corner parameters, the barycentrics themselves are taken.
     corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
     row, depth = np.empty(lines.kept.shape, np.int32), np.empty(lines.kept.shape, np.float32)
-    given = lines.kept, lines.triangle_ids, lines.barycentrics, lines.depths, table, corners, lines.offsets()
-    parallel(_pack, len(row), *given, ids, params, row, depth, work=2 * row.size)
+    arrays = lines.kept, lines.triangle_ids, lines.barycentrics, lines.depths, table, corners, lines.offsets()
+    parallel(_pack, len(row), *arrays, ids, params, row, depth, work=2 * row.size)
     return ids, params, row.reshape(lines.shape), depth.reshape(lines.shape), total
 
 

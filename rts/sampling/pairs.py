@@ -44,10 +44,10 @@ def with_pairs(
     if not len(seen):
         return samples.replace(pair=pair)
     rays, steps = rays_of(samples, camera, size, points), steps_of(camera, size)
-    own = Rays(rays.origins[row[seen]], rays.directions[row[seen]], rays.spread)
-    changed = [x[:, None] + NEIGHBOURS @ step for x, step in zip(own[:2], steps[:2], strict=True)]
+    pair_rays = Rays(rays.origins[row[seen]], rays.directions[row[seen]], rays.spread)
+    changed = [x[:, None] + NEIGHBOURS @ step for x, step in zip(pair_rays[:2], steps[:2], strict=True)]
     beside = Rays(changed[0], changed[1], rays.spread)
-    result = surface.refine_outlines(inputs, own, beside, samples.depth[0, 0, seen], samples.tables)
+    result = surface.refine_outlines(inputs, pair_rays, beside, samples.depth[0, 0, seen], samples.tables)
     if result is None or any(len(x) > specs[name].shape[0] for name, x in result[3].items()):
         return samples.replace(pair=pair)
     ids, params, there, tables = result

@@ -35,7 +35,7 @@ def at_points(
     arguments = np.ascontiguousarray(points[order]), begins, order, pixel_rows(camera, size)
     faces = np.ascontiguousarray(proxy.faces, np.int32)
     vertices = np.ascontiguousarray(proxy.vertices, np.float32)
-    points_loops.hits(*arguments, near_and_far(camera), kept_sign(camera, cull), vertices, faces, ids, weights, depth)
+    points_loops.hits(*arguments, near_and_far(camera), camera.kept_sign(cull), vertices, faces, ids, weights, depth)
     depth = np.where(ids >= 0, depth, 0).astype(np.float32)
     return Fragments(ids[:, None], weights[:, None], depth[:, None])
 
@@ -49,13 +49,6 @@ def near_and_far(camera: Camera) -> np.ndarray:
     """(2, 4) near and far plane of host matrices, positive on what is seen."""
     p = camera.projection
     return np.stack([p[3] + p[2], p[3] - p[2]]) @ camera.view
-
-
-def kept_sign(camera: Camera, cull: str) -> float:
-    """Sign of the determinant on screen of triangles to keep; 0 for both. A mirrored view or image reverses it."""
-    p = camera.projection
-    winding = np.sign(np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    return -float(winding) if cull == "back" else 0.0
 
 
 def pixel_widths(camera: Camera, size: tuple[int, int]) -> np.ndarray:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from rts.arrays.argument_checks import check_pixels
-from rts.contracts.checks import check_changes, check_sampler, check_scene, suited_sampler
+from rts.contracts.checked_parts import check_changes, check_scene
+from rts.contracts.checks import check_sampler, sampler_for_part
 from rts.sampling.cache import Entry
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -32,9 +33,11 @@ class Prepared:
         identity = Camera.look_at((0, 0, 1), (0, 0, 0))
         checked, _ = check_scene(parts, identity if camera is None else camera)
         size = None if size is None else check_pixels(size)
-        chosen = check_sampler(sampler)
-        samplers = [suited_sampler(chosen, part, None) for part in checked]
-        entries = [own.hold(part, camera, size) for own, part in zip(samplers, checked, strict=True)]
+        sampler_object = check_sampler(sampler)
+        samplers = [sampler_for_part(sampler_object, part, None) for part in checked]
+        entries = [
+            part_sampler.prepare_part(part, camera, size) for part_sampler, part in zip(samplers, checked, strict=True)
+        ]
         return cls(checked, samplers, entries)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
 
-from rts.arrays.argument_checks import is_invertible, one_line
+from rts.arrays.argument_checks import one_line
 from rts.arrays.array_functions import shape_of
 from rts.arrays.engines import namespace
-from rts.arrays.extremes import largest
 from rts.arrays.trees import Tree
+from rts.arrays.value_ranges import largest_absolute
 from rts.contracts.records import Fragments, Proxy, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError
 from rts.sampling.packing import covered_cells
-from rts.scene.camera import Camera
 from rts.scene.topology import table_extent
 from rts.splatting.cells import check_rows
 
@@ -106,9 +104,9 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
         sampler: the sampler.
     """
     count, shape = samples.ids.shape[-2], tuple(samples.row.shape)
-    own = {"row": shape[:1] + tuple(grid), "depth": shape}
+    shapes = {"row": shape[:1] + tuple(grid), "depth": shape}
     try:
-        for name, expected in own.items():
+        for name, expected in shapes.items():
             array: Any = getattr(samples, name)
             if array is None:
                 continue
@@ -151,89 +149,10 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
     return covered
 
 
-WELL_CONDITIONED = 1e-6
-"""The `_spread` of rows from which on a matrix is far from singular."""
-
-
-def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
-    """The camera of host matrices, refused where it makes no image.
-
-    Its matrices must be finite and invertible. The last row of the view must be 0, 0, 0, 1, and that of the projection
-    0, 0, c ≤ 0, d.
-
-    Args:
-        camera: float64; its view is that of the camera times the part's transform.
-        transform: the part's transform, if it has one, which an error may blame.
-
-    Returns:
-        The camera, the last row of its view without rounding.
-    """
-    for name, matrix in (("view", camera.view), ("projection", camera.projection)):
-        if not np.isfinite(matrix).all():
-            bad = name == "view" and transform is not None and not np.isfinite(transform).all()
-            what = "transform of a part" if bad else f"camera's {name} matrix"
-            raise InputError(f"the {what} holds NaN or infinity; check how it was made")
-    # Most are far from singular; singular values take longer.
-    well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
-    if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
-        _check_invertible(camera)
-    x, y, z, w = camera.view[3].tolist()
-    if max(abs(x), abs(y), abs(z), abs(w - 1)) > ROUNDING:
-        raise InputError(
-            f"the last row of the camera's view times the part's transform is {[x, y, z, w]}; expected 0, 0, 0, 1"
-        )
-    a, b, c, d = camera.projection[3].tolist()
-    if max(abs(a), abs(b)) > ROUNDING * max(abs(c), abs(d)):
-        raise InputError(
-            f"the last row of the camera's projection is {[a, b, c, d]}; expected (0, 0, ±c, d): if it is the product "
-            f"of projection and view, use Camera.from_mvp(matrix)"
-        )
-    if c > 0:
-        raise InputError(
-            f"the last row of the camera's projection is {[a, b, c, d]}: it looks along +z, which cannot be turned "
-            f"while it is traced; use Camera.from_mvp(projection @ view)"
-        )
-    if x == y == z == 0 and w == 1:
-        return camera
-    return camera.replace(view=np.concatenate([camera.view[:3], [[0.0, 0.0, 0.0, 1.0]]]))
-
-
-ROUNDING = 1e-6
-"""Tolerance of the entries of a matrix's last row, relative to its largest."""
-
-
-def _spread(m: np.ndarray) -> float:
-    """The squared determinant of a (3, 3) matrix over the product of its rows' squared lengths.
-
-    It is 1 for orthogonal rows, 0 for dependent rows.
-    """
-    a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
-    square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
-    return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
-
-
-@functools.lru_cache(maxsize=64)
-def _spread_of_projection(data: bytes) -> float:
-    """The `_spread` of a (4, 4) float64 matrix, given as bytes; cached, since calls often repeat it."""
-    matrix = np.frombuffer(data).reshape(4, 4)
-    square = float((matrix * matrix).sum(axis=1).prod())
-    return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
-
-
-def _check_invertible(camera: Camera) -> None:
-    # A view must not flatten, at whatever scale; the rows of a projection may differ in scale.
-    singular = np.linalg.svd(camera.view[:3, :3], compute_uv=False)
-    sound = {"view": singular[-1] > 1e-12 * singular[0], "projection": is_invertible(camera.projection)}
-    for name in (name for name, ok in sound.items() if not ok):
-        raise InputError(
-            f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
-        )
-
-
 def check_proxy(proxy: Proxy, surface: Any) -> None:
     """Refuse vertices that are NaN or infinite."""
     vertices = proxy.vertices
-    if not np.isfinite(largest(vertices)):
+    if not np.isfinite(largest_absolute(vertices)):
         bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         raise InputError(
             f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
@@ -241,27 +160,29 @@ def check_proxy(proxy: Proxy, surface: Any) -> None:
         )
 
 
-def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> Samples:
+def checked_refined(refined: Any, unrefined: Samples, surface: TriangleSurface) -> Samples:
     """The result of a surface's `refine` in arrays of the right dtypes, refused where it breaks its contract.
 
     Args:
         refined: the result.
-        lifted: the samples that `refine` was given. Fields that `refine` may not change are taken from these.
+        unrefined: the samples that `refine` was given. Fields that `refine` may not change are taken from these.
         surface: the surface.
     """
     who = f"refine of {surface!r}"
     if not isinstance(refined, Samples):
         raise InputError(f"{who} gave a {type(refined).__name__}; expected Samples")
-    rows, grid, (i, p) = len(lifted.ids), lifted.row.shape, surface.sample_widths
+    rows, grid, (i, p) = len(unrefined.ids), unrefined.row.shape, surface.sample_widths
     ids = _array(f"{who} gave ids", refined.ids, (rows, i), np.integer, np.int32)
     params = _array(f"{who} gave params", refined.params, (rows, p), np.floating, np.float32)
     row = _array(f"{who} gave row", refined.row, grid, np.integer, np.int32)
     depth = _array(f"{who} gave depth", refined.depth, grid, np.floating, np.float32)
     overflow = _array(f"{who} gave overflow", refined.overflow, (), np.integer, np.int32)
-    if ((row != lifted.row) & (row != -1)).any():
+    if ((row != unrefined.row) & (row != -1)).any():
         raise InputError(f"{who} gave another number to a row; expected what it was given, or −1 to drop a sample")
-    if overflow < lifted.overflow:
-        raise InputError(f"{who} gave an overflow of {overflow}; expected at least the {lifted.overflow} it was given")
+    if overflow < unrefined.overflow:
+        raise InputError(
+            f"{who} gave an overflow of {overflow}; expected at least the {unrefined.overflow} it was given"
+        )
     covered = row >= 0
     bad = covered & ~np.isfinite(depth)
     if bad.any():
@@ -269,17 +190,17 @@ def checked_refined(refined: Any, lifted: Samples, surface: TriangleSurface) -> 
     if not np.isfinite(params).all() and not np.isfinite(used := params[row[covered]]).all():
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
-    tables = _checked_tables(refined.tables, lifted, who)
-    shared = [name for name in tables if name not in lifted.by_sample]
+    tables = _checked_tables(refined.tables, unrefined, who)
+    shared = [name for name in tables if name not in unrefined.by_sample]
     if shared:
-        lengths = {(len(tables[name]), len(lifted.tables[name])) for name in shared}
+        lengths = {(len(tables[name]), len(unrefined.tables[name])) for name in shared}
         used, (count, _) = ids[row[covered]], next(iter(lengths))
         if len(lengths) > 1 or used.min(initial=0) < 0 or used.max(initial=0) >= max(1, count):
             raise InputError(
                 f"{who} gave ids from {used.min(initial=0)} to {used.max(initial=0)}, and tables {sorted(shared)} of "
                 f"{count} rows that samples share; expected tables of one length, and ids that are rows of them"
             )
-    return lifted.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
+    return unrefined.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 
 def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any) -> np.ndarray:
@@ -299,16 +220,16 @@ def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any
         return np.ascontiguousarray(array, dtype) if array.ndim else array.astype(dtype)
 
 
-def _checked_tables(refined: Any, lifted: Samples, who: str) -> dict[str, np.ndarray]:
+def _checked_tables(refined: Any, unrefined: Samples, who: str) -> dict[str, np.ndarray]:
     """The tables of refined samples, refused where they do not fit into the allotted ones."""
-    if set(refined) != set(lifted.tables):
-        raise InputError(f"{who} gave the tables {sorted(refined)}; table_specs declares {sorted(lifted.tables)}")
+    if set(refined) != set(unrefined.tables):
+        raise InputError(f"{who} gave the tables {sorted(refined)}; table_specs declares {sorted(unrefined.tables)}")
     tables = {}
-    for name, allotted in lifted.tables.items():
+    for name, allotted in unrefined.tables.items():
         table = np.asarray(refined[name], allotted.dtype)
-        if name in lifted.by_sample and len(table) != len(lifted.ids):
+        if name in unrefined.by_sample and len(table) != len(unrefined.ids):
             raise InputError(
-                f"{who} gave a table {name!r} of {len(table)} rows; expected {len(lifted.ids)}, one a sample"
+                f"{who} gave a table {name!r} of {len(table)} rows; expected {len(unrefined.ids)}, one a sample"
             )
         if table.shape[1:] != allotted.shape[1:] or len(table) > len(allotted):
             raise InputError(

@@ -9,7 +9,8 @@ from rts.advice.unread_entries import warn_of_unread
 from rts.advice.winding import warn_of_winding
 from rts.arrays.engines import Context, context_of_scene, is_traced
 from rts.arrays.trees import Tree, leaves
-from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
+from rts.contracts.checked_parts import CheckedPart, check_scene
+from rts.contracts.checks import check_ratio, check_sampler, sampler_for_part
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.prepared import Prepared
@@ -67,8 +68,8 @@ class Scene(NamedTuple):
         if prepared:
             fields = parts.samplers, parts.entries
         else:
-            chosen = check_sampler(sampler)
-            fields = [suited_sampler(chosen, part, camera) for part in checked], [None] * len(checked)
+            sampler_object = check_sampler(sampler)
+            fields = [sampler_for_part(sampler_object, part, camera) for part in checked], [None] * len(checked)
         return cls(checked, camera, *fields, context_of_scene(checked, camera, engine=engine))
 
     def at(self, size: tuple[int, int]) -> Scene:

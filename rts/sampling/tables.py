@@ -22,9 +22,9 @@ def in_one_table(samples: Sequence[Samples]) -> Samples:
     if first.gbuffer is not None:
         gbuffer = {name: xp.concat([(s.gbuffer or {})[name] for s in samples]) for name in first.gbuffer}
     ids, start = [first.ids], 0
-    for before, own in itertools.pairwise(samples):
+    for before, current in itertools.pairwise(samples):
         start += before.tables[shared[0]].shape[0] if shared else 0
-        ids.append(own.ids + start)
+        ids.append(current.ids + start)
     ids, params = xp.concat(ids), xp.concat([s.params for s in samples])
     return replace(first, ids=ids, params=params, tables=tables, gbuffer=gbuffer)
 
@@ -36,7 +36,7 @@ def taken_rows(samples: Samples, index: Array) -> Samples:
     def taken(named: Mapping[str, Array]) -> dict[str, Array]:
         return {name: xp.take(x, index, axis=0) for name, x in named.items()}
 
-    own = taken({"ids": samples.ids, "params": samples.params})
+    per_sample = taken({"ids": samples.ids, "params": samples.params})
     gbuffer = None if samples.gbuffer is None else taken(samples.gbuffer)
     tables = {**samples.tables, **taken({name: samples.tables[name] for name in samples.by_sample})}
-    return replace(samples, **own, tables=tables, gbuffer=gbuffer)
+    return replace(samples, **per_sample, tables=tables, gbuffer=gbuffer)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -18,12 +17,9 @@ from rts.contracts.surface import TriangleSurface
 from rts.errors import InputError, PluginError
 from rts.plugin_base import overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
-from rts.sampling.host_call import HostCall, Shape
-from rts.sampling.layer_order import on_surface, refined
-from rts.sampling.packing import lift, repack
-from rts.sampling.pairs import with_pairs
-from rts.sampling.points import at_points
-from rts.sampling.sample_checks import check_faces, check_fragments, checked_proxy
+from rts.sampling.host_call import HostCall, SampleBounds
+from rts.sampling.sample_checks import check_faces, checked_proxy
+from rts.sampling.triangle_search import TriangleSearch
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 
@@ -31,10 +27,6 @@ _T = TypeVar("_T")
 
 NOTHING_ELSE = Request()
 """A request for all samples, and nothing else."""
-
-LEAST_LAYERS = 3
-"""Fewest layers of triangles to draw for a surface that moves its samples; for K layers, K + 1 if that is more. At an
-outline both sides of a fold of triangles may lie beside the surface."""
 
 
 class TriangleSampler(Sampler):
@@ -122,7 +114,7 @@ class TriangleSampler(Sampler):
         """
         return None
 
-    def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
+    def prepare_part(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """The proxy of a part, and the result of `prepare` for it; see `Sampler`.
 
         Raises:
@@ -186,23 +178,23 @@ class TriangleSampler(Sampler):
         refines, moves = surface.refines, surface.refines and surface.refine_moves
         pairs = request.pairs and points is not None and refines and not moves
         pairs = pairs and overrides(surface, "refine_outlines", TriangleSurface)
-        shape = Shape(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
-        tables = shape.tables(surface) if refines else {}
+        bounds = SampleBounds(layers, cells, request.capacity, size, 2 * cells[1] if pairs else 0)
+        tables = bounds.tables(surface) if refines else {}
         beside = {
-            **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
+            **({"incomplete_cells": ArraySpec((), np.int32)} if moves else {}),
             **({"pair": ArraySpec((2, cells[1]), np.int32)} if pairs else {}),
             **({"triangle": ArraySpec((layers, *cells), np.int32)} if request.triangles and not moves else {}),
         }
 
-        def find(cameras: Sequence[Camera], inputs: Tree, *given: np.ndarray) -> tuple[Samples, dict[str, Any]]:
-            own = np.asarray(given[0], np.float64) if given else None
-            search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, entry, own)
+        def find(cameras: Sequence[Camera], inputs: Tree, *further: np.ndarray) -> tuple[Samples, dict[str, Any]]:
+            host_points = np.asarray(further[0], np.float64) if further else None
+            search = TriangleSearch(self, surface, part.cull, inputs, cameras[0], bounds, tables, entry, host_points)
             samples = search.moved() if moves else search.in_place(request.uniform, pairs)
             return samples, {name: getattr(samples, name) for name in beside}
 
-        call = HostCall(part, surface, [camera], shape, entry)
+        call = HostCall(part, surface, [camera], bounds, entry)
         samples, more = call.samples(find, beside, tables, [] if points is None else [points[None, ...]])
-        return samples.replace(**more, followed=() if points is None else ("points",))
+        return samples.replace(**more, at_points=points is not None)
 
     def working_on(
         self,
@@ -224,10 +216,10 @@ class TriangleSampler(Sampler):
             work: a function of the entry. Several threads may call it at once if `draws_at_once`.
         """
         with self._keeper.lock:
-            known = entry or self._entry(surface, inputs, camera, view)
+            ready = entry or self._entry(surface, inputs, camera, view)
             if not self.draws_at_once:
-                return work(known)
-        return work(known)
+                return work(ready)
+        return work(ready)
 
     @property
     def draws_at_once(self) -> bool:
@@ -240,94 +232,6 @@ class TriangleSampler(Sampler):
         return overrides(self, "update", TriangleSampler)
 
 
-@dataclass(frozen=True)
-class _Search:
-    """The search for the samples of one view, on the host.
-
-    Attributes:
-        sampler: draws the triangles.
-        surface: the surface.
-        cull: the part's `cull`.
-        inputs: the result of the surface's `proxy_inputs`, on the host.
-        camera: host matrices.
-        shape: bounds on the number of samples.
-        tables: the result of the surface's `table_specs`.
-        entry: the surface's prepared entry; None to look it up, or to build it.
-        points: (1, M, 2), the points to sample; None for the centres of all cells.
-    """
-
-    sampler: TriangleSampler
-    surface: TriangleSurface
-    cull: str
-    inputs: Tree
-    camera: Camera
-    shape: Shape
-    tables: Mapping[str, ArraySpec]
-    entry: Entry | None
-    points: np.ndarray | None
-
-    def in_place(self, uniform: bool, pairs: bool) -> Samples:
-        """Samples on the triangles, or refined by a surface that does not move them; arguments as in `Request`."""
-        known, fragments, covered = self._drawn(self.shape.layers)
-        ids, capacity = fragments.triangle_ids, self.shape.capacity
-        if not self.surface.refines:
-            if uniform:
-                return _of_one_row(lift(fragments, known.proxy, capacity, _first_of(covered)), covered, fragments)
-            packed = lift(fragments, known.proxy, capacity, covered)
-            return packed.replace(triangle=ids if capacity is None else np.where(packed.row >= 0, ids, np.int32(-1)))
-        lifted = lift(fragments, known.proxy, None, covered)
-        surface, inputs, camera, view, points = self.surface, self.inputs, self.camera, self.shape.view, self.points
-        samples, _ = refined(surface, inputs, lifted, camera, self.tables, view, points)
-        packed = repack(samples, samples.row >= 0, capacity)
-        if pairs and points is not None:
-            packed = with_pairs(packed, surface, inputs, camera, view, points, self.tables)
-        return packed.replace(triangle=np.where(packed.row >= 0, ids, np.int32(-1)))
-
-    def moved(self) -> Samples:
-        """Samples that the surface moves off its triangles, with `ran_out`."""
-        layers = self.shape.layers
-        # There is only one set of tables, so that no samples can be added later.
-        known, fragments, covered = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS))
-        given = self.surface, self.inputs, fragments, known.proxy, self.camera, layers, self.tables, self.shape.view
-        samples = on_surface(*given, self.points)
-        covers = samples.row >= 0
-        ran_out = np.count_nonzero(covered[-1] & ~covers[-1])
-        return repack(samples, covers, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
-
-    def _drawn(self, layers: int) -> tuple[Entry, Fragments, np.ndarray]:
-        """The entry, the triangles drawn into `layers` layers, and the covered cells of these."""
-        sampler, camera, view, points = self.sampler, self.camera, self.shape.view, self.points
-        grid = layers, *self.shape.size
-
-        def draw(known: Entry) -> tuple[Entry, Fragments, np.ndarray]:
-            if not (count := len(known.proxy.faces)):
-                return known, _no_fragments(grid), np.zeros(grid, np.bool_)
-            arguments = known.prepared, camera, view, layers, self.cull
-            if points is None:
-                fragments = sampler.rasterize(*arguments)
-            else:
-                fragments = sampler.rasterize_points(*arguments, points[0])
-                if fragments is None:
-                    fragments = at_points(known.proxy, camera, view, layers, self.cull, points[0])
-            return known, fragments, check_fragments(fragments, grid, count, sampler)
-
-        return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
-
-
-def _first_of(covered: np.ndarray) -> np.ndarray:
-    """The mask `covered` with only its first cell; none if there is none."""
-    first = np.zeros_like(covered)
-    at = covered.argmax()
-    first.reshape(-1)[at] = covered.reshape(-1)[at]
-    return first
-
-
-def _of_one_row(samples: Samples, covered: np.ndarray, fragments: Fragments) -> Samples:
-    """Samples of one row, which all covered cells name."""
-    row = covered.view(np.int8).astype(np.int32) - np.int32(1)
-    return samples.replace(row=row, depth=fragments.depth, triangle=fragments.triangle_ids)
-
-
 def _of_triangles(surface: Any) -> TriangleSurface:
     """The surface; an InputError refuses one without triangles."""
     if not isinstance(surface, TriangleSurface):
@@ -335,10 +239,6 @@ def _of_triangles(surface: Any) -> TriangleSurface:
             f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
-
-
-def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
-    return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
 
 
 def _held(x: Array) -> np.ndarray:

@@ -18,29 +18,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.arrays.argument_checks import (
-    check_numbers,
-    check_pixels,
-    check_planes,
-    check_positive,
-    check_rotation,
-    is_invertible,
-    quoted,
-)
+from rts.arrays.argument_checks import check_numbers, check_pixels, is_invertible, quoted
 from rts.arrays.array_functions import described, from_numbers, promote, shape_of, unit
 from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves, record
 from rts.errors import InputError
 from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
+from rts.scene.camera_converters import CameraConverters
 from rts.scene.rays import Rays
 from rts.scene.transforms import (
-    ROUNDING,
-    affine_matrix,
-    check_product,
-    is_parallel_product,
+    in_one_engine,
+    is_affine,
     look_at,
-    matrix_of,
     orthographic,
     perspective,
     scaled_rows,
@@ -52,11 +42,11 @@ FAR_OVER_DISTANCE = 1e2
 
 
 @record(static=("aspect",))
-class Camera:
+class Camera(CameraConverters):
     """A camera: two matrices, and the ratio of width to height that they are made for.
 
     `Camera(view, projection)` takes matrices as they are. Linear depth is read off `view`, so the product of both
-    matrices, as used for nvdiffrast, is no `projection`: `Camera.from_mvp` takes it apart.
+    matrices, as used for nvdiffrast, is no `projection`: `Camera.from_mvp` factors it.
 
     Attributes:
         view: (4, 4) camera-from-world, affine.
@@ -182,7 +172,7 @@ class Camera:
             far = FAR_OVER_DISTANCE * distance if far is None else far
         projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
         warn_of_radians(fov_y)
-        return cls(*_alike(view, projection), _known_ratio(aspect))
+        return cls(*in_one_engine(view, projection), _known_ratio(aspect))
 
     @classmethod
     @uncompiled
@@ -216,12 +206,12 @@ class Camera:
             InputWarning: a field of view below 2, likely to be in radians.
         """
         value = None if view is None else check_numbers("view", view, (4, 4))
-        if value is not None and not (_is_affine(value) and is_invertible(value[:3, :3])):
+        if value is not None and not (is_affine(value) and is_invertible(value[:3, :3])):
             raise InputError("view is singular, or its last row is not (0, 0, 0, 1); expected a camera-from-world map")
         _, (view,) = promote(np.eye(4) if view is None else view)
         projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
         warn_of_radians(fov_y)
-        return cls(*_alike(view, projection), _known_ratio(aspect))
+        return cls(*in_one_engine(view, projection), _known_ratio(aspect))
 
     @classmethod
     @uncompiled
@@ -255,307 +245,7 @@ class Camera:
         """
         view = look_at(eye, target, up)
         projection = orthographic(height, 1.0 if aspect is None else aspect, near, far, principal_point)
-        return cls(*_alike(view, projection), _known_ratio(aspect))
-
-    @classmethod
-    @uncompiled
-    def from_opencv(
-        cls,
-        K: Any,
-        R: Any,
-        t: Any,
-        size: tuple[int, int],
-        *,
-        near: Any = 0.01,
-        far: Any = 1000.0,
-        pixel_center: float = 0.0,
-    ) -> Camera:
-        """A camera from OpenCV's x = K (R X + t): camera axes x right, y down, z forward.
-
-        Args:
-            K: (3, 3) intrinsics, pixels; skew is kept.
-            R: (3, 3) rotation, camera-from-world.
-            t: (3,) translation, or (3, 1), world units.
-            size: (height, width).
-            near: depth of the near plane, positive.
-            far: depth of the far plane.
-            pixel_center: where K puts the centre of the first pixel: 0 in OpenCV, 0.5 in COLMAP and most data sets
-                whose principal point is exactly (width / 2, height / 2).
-
-        Raises:
-            InputError: K is no matrix of intrinsics, R no rotation, planes are out of order, or `t` or `size` is
-                wrong.
-        """
-        check_planes(near, far, positive=True)
-        _check_intrinsics(K)
-        check_rotation("R", R)
-        check_numbers("t", t, (3,), (3, 1))
-        check_numbers("pixel_center", pixel_center, ())
-        height, width = check_pixels(size)
-        xp, (K, R, t, near, far) = promote(K, R, t, near, far)
-        view = scaled_rows(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
-        cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
-        depth = far - near
-        projection = matrix_of(
-            xp,
-            [
-                [2 * K[0, 0] / width, -2 * K[0, 1] / width, 1 - 2 * cx / width, 0],
-                [0, 2 * K[1, 1] / height, 2 * cy / height - 1, 0],
-                [0, 0, -(far + near) / depth, -2 * far * near / depth],
-                [0, 0, -1, 0],
-            ],
-            cx,
-        )
-        return cls(view, projection, width / height)
-
-    @classmethod
-    @uncompiled
-    def from_mvp(cls, matrix: Any) -> Camera:
-        """A camera from one matrix: model-view-projection, the product that takes the world to clip space.
-
-        For users of nvdiffrast and diffren, which take vertices in clip space: give vertices in the world, and the
-        matrix that took them to clip space. The image is the same. Depth is linear, in units of the world, if the
-        matrix is the product of any projection, perspective or parallel, and of a view that does not scale.
-
-        A matrix that is transposed (for row vectors), or multiplied in the other order, is refused where it shows. It
-        does not show in a view without rotation, or of rotation alone. Depths from 0 to 1, as in Direct3D and Vulkan,
-        are read as those of a near plane at about half its depth; pictures are the same. Depths from 1 to 0 are
-        refused. A traced matrix is not checked, and taken for perspective.
-
-        Args:
-            matrix: (4, 4) OpenGL clip space from world space, acting on column vectors; `projection @ view`.
-
-        Raises:
-            InputError: the matrix is singular, transposed, in the other order, or has a plane behind the camera.
-        """
-        value = check_numbers("matrix", matrix, (4, 4))
-        if value is not None and not is_invertible(value):
-            raise InputError("matrix is singular; expected an invertible product projection @ view")
-        if value is not None:
-            check_product(value)
-        xp, (m,) = promote(matrix)
-        x, y, z, w = (m[i, :3] for i in range(4))
-        parallel = value is not None and is_parallel_product(value)
-        if parallel:  # Depth grows along the rays, from the near plane on.
-            along = xp.linalg.cross(x, y)
-            axis, start = unit(along * xp.sign(xp.sum(along * z))), m[2, :] + m[3, :]
-        else:
-            axis, start = unit(w), m[3, :]
-        rows = xp.stack([m[0, :], m[1, :], start])
-        eye = -matmul(xp.linalg.inv(rows[:, :3]), rows[:, 3:])
-        right = unit(x - axis * xp.sum(axis * x))
-        linear = xp.stack([right, xp.linalg.cross(right, axis), -axis])
-        view = affine_matrix(linear, -matmul(linear, eye)[:, 0])
-        projection = matmul(m, affine_matrix(xp.linalg.matrix_transpose(linear), eye[:, 0]))
-        # The last row, without its rounding.
-        last = [[0, 0, 0, m[3, 3]]] if parallel else [[0, 0, -xp.sum(axis * w), 0]]
-        return cls(view, xp.concat([projection[:3, :], matrix_of(xp, last, m[3, 3])]))
-
-    @classmethod
-    @uncompiled
-    def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
-        """A camera from OpenGL's matrices, which have the conventions of this library.
-
-        Args:
-            modelview: (4, 4) camera-from-world.
-            projection: (4, 4) clip space from camera space.
-
-        Raises:
-            InputError: a matrix has another shape, or is not finite.
-        """
-        check_numbers("modelview", modelview, (4, 4))
-        check_numbers("projection", projection, (4, 4))
-        _, (view, projection) = promote(modelview, projection)
-        return cls(view, projection)
-
-    @classmethod
-    @uncompiled
-    def from_nvdiffrast(cls, modelview: Any, projection: Any, *, top_down: bool = False) -> Camera:
-        """A camera from the matrices whose product feeds `nvdiffrast`.
-
-        nvdiffrast's row 0 is NDC y = −1, the bottom. With plain OpenGL matrices its image is ours upside down. The
-        matrices stay unchanged unless `top_down`.
-
-        Args:
-            modelview: (4, 4) camera-from-world.
-            projection: (4, 4) clip space from camera space.
-            top_down: whether the projection has its y negated, so that nvdiffrast's row 0 is the top already.
-        """
-        camera = cls.from_opengl(modelview, projection)
-        return camera._flipped() if top_down else camera
-
-    @classmethod
-    @uncompiled
-    def from_pytorch3d(
-        cls,
-        R: Any,
-        T: Any,
-        *,
-        focal_length: Any,
-        principal_point: Any = (0.0, 0.0),
-        size: tuple[int, int],
-        near: Any = 0.01,
-        far: Any = 1000.0,
-    ) -> Camera:
-        """A camera from PyTorch3D's `PerspectiveCameras` in NDC, whose x is left, y up and z forward.
-
-        Points are row vectors: X_camera = X R + T.
-
-        Args:
-            R: (3, 3), acting on row vectors.
-            T: (3,) translation, world units.
-            focal_length: number or (2,), NDC; 1 / tan(fov / 2) of a `FoVPerspectiveCameras`.
-            principal_point: (2,) NDC, x left and y up; the shorter side of the image spans [−1, 1].
-            size: (height, width).
-            near: depth of the near plane, positive.
-            far: depth of the far plane.
-
-        Raises:
-            InputError: R is no rotation, a focal length is not positive, planes are out of order, or another argument
-                has a wrong shape.
-        """
-        check_planes(near, far, positive=True)
-        check_rotation("R", R)
-        check_numbers("T", T, (3,))
-        check_positive("focal_length", focal_length, (), (1,), (2,))
-        check_numbers("principal_point", principal_point, (2,))
-        height, width = check_pixels(size)
-        xp, (R, T, focal, point, near, far) = promote(R, T, focal_length, principal_point, near, far)
-        sx, sy = min(height, width) / width, min(height, width) / height
-        focal = focal + xp.zeros_like(point)
-        view = scaled_rows(affine_matrix(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
-        depth = far - near
-        projection = matrix_of(
-            xp,
-            [
-                [focal[0] * sx, 0, point[0] * sx, 0],
-                [0, focal[1] * sy, -point[1] * sy, 0],
-                [0, 0, -(far + near) / depth, -2 * far * near / depth],
-                [0, 0, -1, 0],
-            ],
-            far,
-        )
-        return cls(view, projection, width / height)
-
-    @classmethod
-    @uncompiled
-    def from_blender(
-        cls, camera_to_world: Any, size: tuple[int, int], *, focal: Any, near: Any = 0.01, far: Any = 1000.0
-    ) -> Camera:
-        """A camera from the camera-to-world matrix of Blender and of NeRF's data sets; their camera axes are ours.
-
-        Args:
-            camera_to_world: (4, 4) or (3, 4).
-            size: (height, width).
-            focal: focal length, pixels: 0.5 width / tan(0.5 camera_angle_x).
-            near: depth of the near plane, positive.
-            far: depth of the far plane.
-
-        Raises:
-            InputError: the matrix is singular or not affine, `focal` is not positive, planes are out of order, or
-                `size` is wrong.
-        """
-        value = check_numbers("camera_to_world", camera_to_world, (4, 4), (3, 4))
-        if value is not None and not (_is_affine(value) and is_invertible(value[:3, :3])):
-            raise InputError(
-                "camera_to_world is singular, or its last row is not (0, 0, 0, 1); expected a rotation and a position"
-            )
-        check_positive("focal", focal)
-        height, width = check_pixels(size)
-        xp, (c2w, focal) = promote(camera_to_world, focal)
-        c2w = affine_matrix(c2w[:3, :3], c2w[:3, 3])
-        fov_y = xp.atan(height / (2 * focal)) * (360 / math.pi)
-        fov_y = fov_y if not is_constant(fov_y) else float(fov_y)
-        return cls(*_alike(xp.linalg.inv(c2w), perspective(fov_y, width / height, near, far)), width / height)
-
-    # ------------------------------------------------------------------------------------------ converters
-
-    def to_opencv(self, size: tuple[int, int], *, pixel_center: float = 0.0) -> tuple[Array, Array, Array]:
-        """OpenCV's K (3, 3), R (3, 3) and t (3,) of a perspective camera; arguments are as in `from_opencv`.
-
-        Raises:
-            InputError: the camera is orthographic, or `size` is wrong.
-        """
-        xp, p = self._perspective("to_opencv", size)
-        height, width = size
-        scale = -1 / p[3, 2]
-        shift = pixel_center - 0.5
-        K = matrix_of(
-            xp,
-            [
-                [
-                    p[0, 0] * scale * width / 2,
-                    -p[0, 1] * scale * width / 2,
-                    (1 - p[0, 2] * scale) * width / 2 + shift,
-                ],
-                [0, p[1, 1] * scale * height / 2, (1 + p[1, 2] * scale) * height / 2 + shift],
-                [0, 0, 1],
-            ],
-            scale,
-        )
-        view = scaled_rows(self.view, (1, -1, -1, 1))
-        return K, view[:3, :3], view[:3, 3]
-
-    def to_opengl(self, size: tuple[int, int] | None = None) -> tuple[Array, Array]:
-        """OpenGL's modelview and projection, (4, 4) each: the camera's own matrices.
-
-        Args:
-            size: (height, width) of the image; needed where the camera leaves its ratio open.
-
-        Raises:
-            InputError: the ratio is open, and there is no size.
-        """
-        view, projection = self if size is None else self.for_size(size)
-        return view, projection
-
-    def to_nvdiffrast(self, *, top_down: bool = False, size: tuple[int, int] | None = None) -> tuple[Array, Array]:
-        """Matrices (modelview, projection), (4, 4) each, for nvdiffrast; multiply projection @ modelview.
-
-        Args:
-            top_down: whether row 0 of nvdiffrast's image is to be the top, as in this library: y of the projection is
-                then negated. Otherwise the matrices are the camera's own, and nvdiffrast's image is ours upside down.
-            size: as in `to_opengl`.
-
-        Raises:
-            InputError: the ratio is open, and there is no size.
-        """
-        camera = self if size is None else self.for_size(size)
-        return (camera._flipped() if top_down else camera).to_opengl()
-
-    def to_pytorch3d(self, size: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
-        """PyTorch3D's R (3, 3), T (3,), focal_length (2,) and principal_point (2,); the inverse of `from_pytorch3d`.
-
-        Raises:
-            InputError: the camera is orthographic, or `size`, (height, width), is wrong.
-        """
-        xp, p = self._perspective("to_pytorch3d", size)
-        sx, sy, scale = min(size) / size[1], min(size) / size[0], -1 / p[3, 2]
-        view = scaled_rows(self.view, (-1, 1, -1, 1))
-        focal = xp.stack([p[0, 0] / sx, p[1, 1] / sy]) * scale
-        return (
-            xp.linalg.matrix_transpose(view[:3, :3]),
-            view[:3, 3],
-            focal,
-            xp.stack([p[0, 2] / sx, -p[1, 2] / sy]) * scale,
-        )
-
-    def to_blender(self, size: tuple[int, int]) -> tuple[Array, Array]:
-        """Blender's camera-to-world matrix (4, 4), and the focal length in pixels; the inverse of `from_blender`.
-
-        Raises:
-            InputError: the camera is orthographic, or `size`, (height, width), is wrong.
-        """
-        _, p = self._perspective("to_blender", size)
-        return namespace(self.view).linalg.inv(self.view), p[1, 1] * size[0] / 2
-
-    def _perspective(self, converter: str, size: tuple[int, int]) -> tuple[Any, Array]:
-        """Namespace and projection for a size. Cameras known to be orthographic are refused."""
-        height, width = check_pixels(size)
-        projection = self.for_size((height, width)).projection
-        last = value_of(projection[3, 2])
-        if last is not None and (last == 0).any():
-            raise InputError(f"the camera is orthographic; {converter} needs a perspective one")
-        return namespace(projection), projection
+        return cls(*in_one_engine(view, projection), _known_ratio(aspect))
 
     # ----------------------------------------------------------------------------------------------- use
 
@@ -636,10 +326,10 @@ class Camera:
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
         depth[3, 2] = -1
-        engine, own = engine_of(p), engine_of(self.view)
+        engine, view_engine = engine_of(p), engine_of(self.view)
         # Products of constant matrices are computed in NumPy.
         rows = matmul(engine.constant(from_clip, p), p) + engine.constant(depth, p)
-        return matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
+        return matmul(constants(rows, view_engine, None if is_constant(self.view) else self.view), self.view)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""
@@ -652,6 +342,15 @@ class Camera:
     def to_world(self, direction: Sequence[float]) -> Array:
         """(3,) the unit vector, in the world, of a direction (3,) in camera space."""
         return world_vectors(self.view, direction)
+
+    def kept_sign(self, cull: str) -> float:
+        """Sign of the determinant on screen of the triangles that `Part.cull` keeps; 0 for both. Host matrices.
+
+        A mirroring view, or an image upside down, reverses it.
+        """
+        p = self.projection
+        winding = np.sign(np.linalg.det(self.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
+        return -float(winding) if cull == "back" else 0.0
 
     def turned(self) -> Camera:
         """An equivalent camera that looks along −z, for a camera that looks along +z."""
@@ -745,12 +444,6 @@ def world_vectors(view: Array, direction: Sequence[float]) -> Array:
     return unit(sum(c * view[..., i, :3] for i, c in enumerate(direction)))
 
 
-def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
-    """View and projection in one engine; if only one is a constant, in the other's dtype, too."""
-    _, (view, projection) = promote(view, projection)
-    return view, projection
-
-
 def _known_ratio(aspect: Any) -> float | Literal["open"] | None:
     """`Camera.aspect` for a constructor's `aspect`: "open" if None was given, None for an array of an engine."""
     if aspect is None:
@@ -762,19 +455,3 @@ def _equal(a: Array, b: Array) -> bool:
     """True if two arrays, perhaps of two engines, have equal values; False if one is traced."""
     a, b = value_of(a), value_of(b)
     return a is not None and b is not None and np.array_equal(a, b)
-
-
-def _is_affine(matrix: np.ndarray) -> bool:
-    return matrix.shape[0] == 3 or bool(np.abs(matrix[3] - [0, 0, 0, 1]).max() <= ROUNDING)
-
-
-def _check_intrinsics(K: Any) -> None:
-    value = check_numbers("K", K, (3, 3))
-    if value is None:
-        return
-    rest = np.abs(value[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1])
-    if rest.max() > ROUNDING or min(value[0, 0], value[1, 1]) <= 0:
-        raise InputError(
-            f"K is {value.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, with positive fx and "
-            f"fy"
-        )

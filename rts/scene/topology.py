@@ -10,8 +10,8 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import shape_of
 from rts.arrays.engines import value_of
-from rts.arrays.extremes import extent
 from rts.arrays.trees import leaves
+from rts.arrays.value_ranges import value_range
 from rts.errors import EngineError, InputError
 
 
@@ -78,7 +78,7 @@ def table_extent(array: np.ndarray) -> tuple[int, int]:
     key = id(array)
     if kept and key in _extent and _extent[key][0]() is array:
         return _extent[key][1]
-    bounds = extent(array)
+    bounds = value_range(array)
     if kept:
         _extent[key] = weakref.ref(array, lambda _: _extent.pop(key, None)), bounds
     return bounds

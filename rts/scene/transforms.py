@@ -230,5 +230,16 @@ def _is_other_order(matrix: np.ndarray) -> bool:
     columns = matrix[:, [0, 1, 3]]
     products = columns[:3].T @ columns[:3]
     lengths = np.sqrt(np.diag(products))
-    apart = np.abs(products - np.diag(lengths**2)) <= ROUNDING * np.outer(lengths, lengths)
-    return bool((np.abs(columns[3]) <= ROUNDING * np.abs(matrix[3, 2])).all() and apart.all())
+    orthogonal = np.abs(products - np.diag(lengths**2)) <= ROUNDING * np.outer(lengths, lengths)
+    return bool((np.abs(columns[3]) <= ROUNDING * np.abs(matrix[3, 2])).all() and orthogonal.all())
+
+
+def is_affine(matrix: np.ndarray) -> bool:
+    """True for a (3, 4) matrix, and for a (4, 4) one whose last row is (0, 0, 0, 1)."""
+    return matrix.shape[0] == 3 or bool(np.abs(matrix[3] - [0, 0, 0, 1]).max() <= ROUNDING)
+
+
+def in_one_engine(view: Array, projection: Array) -> tuple[Array, Array]:
+    """View and projection in one engine; if only one is a constant, in the other's dtype, too."""
+    _, (view, projection) = promote(view, projection)
+    return view, projection

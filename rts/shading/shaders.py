@@ -19,15 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from rts.arrays.argument_checks import quoted
-from rts.arrays.array_functions import described, dot, is_finite, shape_of, unit
+from rts.arrays.array_functions import dot, shape_of, unit
 from rts.arrays.engines import engine_of, is_constant, namespace, value_of
 from rts.arrays.trees import Array, Tree, map_leaves
-from rts.contracts.checks import BRIGHTEST, check_bounded
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputError
@@ -35,6 +31,7 @@ from rts.plugin_base import promised
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.textures import WRAPS, sample_texture
+from rts.shading.theta_entries import check_base, check_entry, entry_of
 from rts.shading.uv_footprints import FOOTPRINT
 
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
@@ -84,7 +81,7 @@ class Depth(Shader):
         depth = camera.depth(gbuffer["position"])
         xp = namespace(depth)
         if "depth_range" in theta:
-            ends = _entry(theta, "depth_range", (2,))
+            ends = entry_of(theta, "depth_range", (2,))
             known, (near, far) = value_of(ends), (ends[0], ends[1])
             if known is not None and (known[..., 0] == known[..., 1]).any():
                 raise InputError(f"theta['depth_range'] is {quoted(known)}; expected two different depths")
@@ -135,20 +132,20 @@ class Unlit(Shader):
                 xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1) if weighed else texture
             )
             base = sample_texture(texture, gbuffer["uv"], self.wrap, footprint)
-            _check_base("theta['texture']", base)
+            check_base("theta['texture']", base)
             if weighed:
                 alpha = base[:, 3:]
                 base = xp.concat([base[:, :3] / xp.where(alpha > 0, alpha, 1.0), alpha], axis=1)
         elif "color" in gbuffer:
             base = gbuffer["color"]
-            _check_base("the surface's 'color'", base)
+            check_base("the surface's 'color'", base)
         else:
             base = xp.ones_like(position)
         one = xp.ones_like(position[:, :1])
         color = base if base.shape[1] >= 3 else base[:, :1] * xp.ones_like(position)
         color, alpha = color[:, :3], color[:, 3:4] if base.shape[1] == 4 else one
         if "color" in theta:
-            factor = _entry(theta, "color", (3,), (4,))
+            factor = entry_of(theta, "color", (3,), (4,))
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
         return color, alpha
@@ -205,8 +202,8 @@ class BlinnPhong(Unlit):
         normal, toward = facing_normals(gbuffer, camera)
         xp = namespace(color)
         shade, lights = _lit(theta, camera)
-        specular = _entry(theta, "specular", (), (1,), (3,)) if "specular" in theta else DEFAULT_SPECULAR
-        shininess = _entry(theta, "shininess", (), (1,)) if "shininess" in theta else DEFAULT_SHININESS
+        specular = entry_of(theta, "specular", (), (1,), (3,)) if "specular" in theta else DEFAULT_SPECULAR
+        shininess = entry_of(theta, "shininess", (), (1,)) if "shininess" in theta else DEFAULT_SHININESS
         highlight = xp.zeros_like(color)
         for direction, brightness in lights:
             cosine = dot(normal, direction)
@@ -243,18 +240,18 @@ def _lit(
             raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(LIGHT_ENTRIES)}")
         shape = shape_of(value)
         if name == "ambient":
-            _check("['light']['ambient']", value, "() or (3,)", shape in ((), (1,), (3,)))
+            check_entry("['light']['ambient']", value, "() or (3,)", shape in ((), (1,), (3,)))
         else:
             ok = len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0
-            _check(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
+            check_entry(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
     colors = [DEFAULT_DIFFUSE]
     if "color" in light:
-        colors = _listed(light["color"])
+        colors = _separate_vectors(light["color"])
     if "direction" in light:
         vectors = value_of(light["direction"])
         if vectors is not None and not vectors.any(axis=-1).all():
             raise InputError("theta['light']['direction'] is zero; expected vectors towards the lights, of any length")
-        directions = _listed(unit(light["direction"]))
+        directions = _separate_vectors(unit(light["direction"]))
     else:
         directions = [camera.to_world(DEFAULT_LIGHT)]
     if len(colors) not in (1, len(directions)):
@@ -264,35 +261,10 @@ def _lit(
     return light.get("ambient", DEFAULT_AMBIENT), list(zip(directions, colors, strict=True))
 
 
-def _listed(vectors: Array) -> list[Array]:
+def _separate_vectors(vectors: Array) -> list[Array]:
     """The vectors (3,) of an array (3,) or (L, 3)."""
     vectors = namespace(vectors).reshape(vectors, (-1, 3))
     return [vectors[i, :] for i in range(vectors.shape[0])]
-
-
-def _entry(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Array:
-    """An entry of θ, refused where it has none of these shapes."""
-    value = theta[name]
-    _check(f"[{name!r}]", value, " or ".join(map(str, shapes)), shape_of(value) in shapes)
-    return value
-
-
-def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
-    """Refuse an entry of θ that is no finite number or floating array; `ok` says that it has the expected shape."""
-    number = isinstance(value, (bool, int, float))
-    if not ok or not (number or hasattr(value, "dtype")):
-        raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
-    if not number and not namespace(value).isdtype(value.dtype, "real floating"):
-        raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
-    check_bounded(f"theta{entry}", np.asarray(value, float) if number else value)
-
-
-def _check_base(name: str, base: Array) -> None:
-    """Refuse base colours (N, C) of `BRIGHTEST` or more; NaN is refused with the shader's result, by its cause."""
-    if not is_finite(base, below=BRIGHTEST):
-        values = value_of(base)
-        if values is not None and not np.isnan(values).any():
-            raise InputError(f"{name} holds a number of {BRIGHTEST:g} or more; expected smaller colours")
 
 
 def _positive(x: Array) -> Array:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.arrays.engines import Engine, constants, namespace, stopped
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
@@ -67,9 +68,9 @@ def uv_footprint(
         # A step towards the middle stays on the patch.
         steps = xp.where(params < 0.5, axis, -axis)
         beside = surface.evaluate(theta, replace(samples, params=params + steps))
-        side = affine_map(linear, beside["position"] - position)
+        offset = affine_map(linear, beside["position"] - position)
         # The derivative of (p₀, p₁) / p₂.
-        moves.append((side[:, :2] * pixel[:, 2:3] - pixel[:, :2] * side[:, 2:3]) / _safe(pixel[:, 2:3] ** 2))
+        moves.append((offset[:, :2] * pixel[:, 2:3] - pixel[:, :2] * offset[:, 2:3]) / _safe(pixel[:, 2:3] ** 2))
         changes.append(beside["uv"] - uv)
     (ax, ay), (bx, by) = ((m[:, 0:1], m[:, 1:2]) for m in moves)
     # Where the surface is seen edge-on, the determinant is zero, and uv changes without bound.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rts.arrays.engines import namespace
-from rts.arrays.extremes import extent
 from rts.arrays.trees import Array
+from rts.arrays.value_ranges import value_range
 from rts.errors import InputError
 from rts.operations.operation import known_value
 
@@ -14,7 +14,7 @@ def check_rows(row: Array, count: int, name: str = "row") -> None:
     value = known_value(row)
     if value is None or not value.size:
         return
-    low, high = extent(value)
+    low, high = value_range(value)
     if high >= count:
         raise InputError(f"{name} refers to sample {high} of {count}; expected indices below, or -1 for an empty cell")
     if low < -1:

@@ -50,11 +50,11 @@ class Plain(Splatter):
         check_rows(row, rgba.shape[0])
         xp = namespace(rgba)
         # Zero, but connected to the positions, so that their derivative exists and is zero.
-        image = 0 * xp.sum(positions)
+        composite = 0 * xp.sum(positions)
         for k in reversed(range(row.shape[0])):
             layer = xp.where((row[k] >= 0)[..., None], unpack(rgba, row[k]), 0.0)
-            image = over(layer, image)
-        return image
+            composite = over(layer, composite)
+        return composite
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,8 @@ class Multi(Kernel):
         for splat, depth in sources:
             s = _pairing(depth, target)
             for k in range(depth.shape[0]):
-                for i, chosen in enumerate((k < s, k == s, k > s)):
-                    buffers[i] = buffers[i] + xp.where(chosen, splat[k, ...], 0.0)
+                for i, mask in enumerate((k < s, k == s, k > s)):
+                    buffers[i] = buffers[i] + xp.where(mask, splat[k, ...], 0.0)
         front, surface, behind = map(_normalised, buffers)
         return over(front, over(surface, behind))
 
@@ -179,8 +179,8 @@ def exact_calibration(sigma: float, reach: int = 1) -> float:
 def _bordered(cells: Array) -> Array:
     """Cells (K, H, W) with a border of empty ones, one cell wide."""
     xp = namespace(cells)
-    side = xp.full_like(cells[:, :, :1], -1)
-    cells = xp.concat([side, cells, side], axis=2)
+    margin = xp.full_like(cells[:, :, :1], -1)
+    cells = xp.concat([margin, cells, margin], axis=2)
     end = xp.full_like(cells[:, :1, :], -1)
     return xp.concat([end, cells, end], axis=1)
 

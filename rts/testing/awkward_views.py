@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import Engine
+from rts.arrays.engine_base import Engine
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes

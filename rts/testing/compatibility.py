@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.arrays.engines import Engine, constants, engine_named, is_constant
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, engine_named, is_constant
 from rts.arrays.trees import leaves, map_leaves
-from rts.contracts.checks import check_sampler, check_scene
+from rts.contracts.checked_parts import check_scene
+from rts.contracts.checks import check_sampler
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import EmptyImageWarning, InputError, RtsError
 from rts.rendering.image import render
@@ -65,20 +67,20 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
         RtsError: the image is empty or not finite; one of triangles is not that of the sampler `reference`; or the
             gradient is zero or not finite. Errors of rendering pass through.
     """
-    chosen = engine_named(engine)
-    theta = constants(map_leaves(single, part.theta), chosen, None)
+    wanted = engine_named(engine)
+    theta = constants(map_leaves(single, part.theta), wanted, None)
 
     def image(theta: Any) -> Any:
         seen = part.replace(theta=theta)
         return render(seen, CAMERA, SIZE, sampler=sampler, splatter="single", layers=LAYERS, capacity=CAPACITY)
 
-    shown = np.asarray(chosen.to_numpy(image(theta)))
+    shown = np.asarray(wanted.to_numpy(image(theta)))
     if not (np.isfinite(shown).all() and shown.any()):
         raise RtsError("the image is empty or not finite; an example lies about the origin, within two units of it")
     if _is_of_triangles(part, sampler):
         _check_image(shown, part)
-    if chosen.differentiates and not is_constant(theta):
-        _check_gradient(chosen, image, theta)
+    if wanted.differentiates and not is_constant(theta):
+        _check_gradient(wanted, image, theta)
     return shown
 
 
@@ -153,8 +155,8 @@ def _tried(surfaces: Sequence[str], samplers: Sequence[str], engines: Sequence[s
             continue
         for sampler in samplers:
             problems = {engine: _problem(part, sampler, engine) for engine in engines}
-            own = repr(part.surface)  # The row names it already.
-            yield Pair(surface, sampler, {e: p and p.replace(own, surface) for e, p in problems.items()})
+            surface_name = repr(part.surface)  # The row names it already.
+            yield Pair(surface, sampler, {e: p and p.replace(surface_name, surface) for e, p in problems.items()})
 
 
 def _problem(part: Part, sampler: str, engine: str) -> str | None:

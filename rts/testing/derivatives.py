@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from rts import registry
-from rts.arrays.engines import Engine, constants, engine_named
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, engine_named
 from rts.arrays.trees import Tree, map_leaves
 from rts.errors import PluginError
 from rts.testing.claims import claim, claim_close, claim_finite, no_error

@@ -10,7 +10,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from rts.arrays.engines import OWNERS, Engine, engine_named
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import OWNERS, engine_named
 from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.records import ArraySpec, Cells, Samples
 from rts.errors import EngineError
@@ -197,8 +198,8 @@ class EngineConformance(Conformance):
 
         samples = Samples(IDS, numbers(N, 2), Cells(np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1)), np.int32(0))
         with owning(chosen), no_error("a compiled function of Samples"):
-            given = map_leaves(chosen.constant, samples)
-            result = chosen.block(chosen.jit(f)(given))
+            constants = map_leaves(chosen.constant, samples)
+            result = chosen.block(chosen.jit(f)(constants))
         claim_close(chosen.to_numpy(result), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")
 
     # -------------------------------------------------------------------------------------- derivatives
@@ -312,16 +313,16 @@ class EngineConformance(Conformance):
     def test_optimizers_step(self, engine: Any) -> None:
         """`optimizer` steps by rate × gradient (SGD), or first by the rate (Adam), and changes no array in place."""
         chosen = _differentiating(engine)
-        given = {"x": numbers(3), "y": [numbers(2, seed=1)]}
-        slopes = map_leaves(lambda v: np.sign(v) * 2, given)
+        start = {"x": numbers(3), "y": [numbers(2, seed=1)]}
+        slopes = map_leaves(lambda v: np.sign(v) * 2, start)
         with owning(chosen):
             for name, expected in (("sgd", lambda v: v - 0.2 * np.sign(v)), ("adam", lambda v: v - 0.1 * np.sign(v))):
-                parameters = map_leaves(chosen.constant, given)
+                parameters = map_leaves(chosen.constant, start)
                 step = chosen.optimizer(name, 0.1, parameters)
                 stepped = derivatives.host(chosen, step(parameters, map_leaves(chosen.constant, slopes)))
-                for x, v in zip(leaves(stepped), leaves(given), strict=True):
+                for x, v in zip(leaves(stepped), leaves(start), strict=True):
                     claim_close(x, expected(v), 1e-4, f"the first step of {name}")
-                for x, v in zip(leaves(derivatives.host(chosen, parameters)), leaves(given), strict=True):
+                for x, v in zip(leaves(derivatives.host(chosen, parameters)), leaves(start), strict=True):
                     claim_close(x, v, 0, f"what {name} was given")
 
     def test_optimizers_go_on_from_their_state(self, engine: Any) -> None:

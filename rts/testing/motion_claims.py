@@ -76,10 +76,10 @@ def claim_followed(part: Part, sampler: Any) -> None:
         same = np.linalg.norm(start[old] - reached, axis=1) < 10 * MOVED
         across = normals[new] * same[:, None]
         off, way = (np.abs(np.sum((x[old] - reached) * across, axis=1)) for x in (points, start))
-        own = np.abs(np.sum((points - start)[old] * across, axis=1))
-        if same.sum() < ENOUGH or max(way.sum(), own.sum()) < 0.05 * MOVED * same.sum():
+        kept_way = np.abs(np.sum((points - start)[old] * across, axis=1))
+        if same.sum() < ENOUGH or max(way.sum(), kept_way.sum()) < 0.05 * MOVED * same.sum():
             continue
-        share = off.sum() / max(way.sum(), own.sum())
+        share = off.sum() / max(way.sum(), kept_way.sum())
         claim(
             share <= BEHIND,
             f"when {name} changes a little, the points that evaluate gives of kept samples end {share:.0%} of the way "

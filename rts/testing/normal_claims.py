@@ -53,8 +53,8 @@ def claim_upright(part: Part, sampler: Any) -> None:
     true = _perpendicular(part, sampler, samples)
     if true is None:
         return
-    told = ~zero & (np.linalg.norm(true[rows], axis=1) > 0)
-    lean = angles(normal[told], true[rows][told])
+    comparable = ~zero & (np.linalg.norm(true[rows], axis=1) > 0)
+    lean = angles(normal[comparable], true[rows][comparable])
     middle, most = np.quantile(lean, (0.5, 0.9))
     claim(
         middle <= UPRIGHT and most <= LARGEST,
@@ -78,15 +78,15 @@ def claim_upright_on_triangles(normals: np.ndarray, vertices: np.ndarray, faces:
     smooth = np.zeros(vertices.shape)
     for i in range(3):
         np.add.at(smooth, faces[:, i], outward)
-    given, seen = unit(normals.astype(np.float64)), np.linalg.norm(outward, axis=1) > 0
-    zero = (given == 0).all(axis=-1)
+    normal, seen = unit(normals.astype(np.float64)), np.linalg.norm(outward, axis=1) > 0
+    zero = (normal == 0).all(axis=-1)
     claim(zero.mean() <= FEW, f"{zero.sum()} of {zero.size} normals at the corners of triangles are zero")
-    between = np.median([angles(smooth[faces[seen, i]], outward[seen]) for i in range(3)])
-    lean = np.median(angles(given.mean(axis=0)[seen], outward[seen]))
-    tilt = np.linalg.norm((given.mean(axis=0) - unit(outward))[seen].mean(axis=0))
+    curvature = np.median([angles(smooth[faces[seen, i]], outward[seen]) for i in range(3)])
+    lean = np.median(angles(normal.mean(axis=0)[seen], outward[seen]))
+    tilt = np.linalg.norm((normal.mean(axis=0) - unit(outward))[seen].mean(axis=0))
     claim(
-        lean <= max(UPRIGHT, SPREAD * between) and tilt <= TILT,
-        f"normals of triangles lean by {lean:.2g}°, where those of neighbours differ by {between:.2g}°, and by "
+        lean <= max(UPRIGHT, SPREAD * curvature) and tilt <= TILT,
+        f"normals of triangles lean by {lean:.2g}°, where those of neighbours differ by {curvature:.2g}°, and by "
         f"{tilt:.2g} to one side; see 'normal' in evaluate",
     )
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.arrays.engines import Engine, floating_bits
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import floating_bits
 from rts.compiling.threads import read_only
 from rts.operations.operation import Operation
 from rts.testing import derivatives
@@ -47,9 +48,9 @@ class OperationConformance(Conformance):
         self, operation: Operation, operands: Sequence, params: dict, dtype: Any
     ) -> None:
         """`forward` fills `out`, whose shape is that of `shape`, with the specification's value."""
-        given, value = _of(operands, dtype), _value(operation, _of(operands, dtype), params)[0]
+        arrays, value = _of(operands, dtype), _value(operation, _of(operands, dtype), params)[0]
         with no_error(f"the specification of {operation.name}"):
-            expected = np.asarray(operation.specification(*given, **params))
+            expected = np.asarray(operation.specification(*arrays, **params))
         claim(expected.dtype == dtype, f"the specification gives {expected.dtype} for operands of {np.dtype(dtype)}")
         left = np.sum(np.isnan(value) & ~np.isnan(expected)) if value.shape == expected.shape else 0
         claim(not left, f"forward leaves {left} of {value.size} numbers of `out` unwritten, or NaN")
@@ -99,9 +100,9 @@ class OperationConformance(Conformance):
         at = _of(operands, np.float64)
         varied, (value, kept) = at[: operation.differentiable], _value(operation, at, params)
         which, g = list(range(len(varied))), read_only(np.ones_like(value))
-        pushed = [_pushed(operation, at, _tangents(varied, which), own, params) for own in (kept, None)]
+        pushed = [_pushed(operation, at, _tangents(varied, which), kept_data, params) for kept_data in (kept, None)]
         _claim_close(pushed[1], pushed[0], "push without what forward has kept, against with it,")
-        with_it, without = (_pulled(operation, at, g, which, own, params) for own in (kept, None))
+        with_it, without = (_pulled(operation, at, g, which, kept_data, params) for kept_data in (kept, None))
         for i in which:
             _claim_close(without[i], with_it[i], "pull without what forward has kept, against with it,")
 
@@ -134,20 +135,20 @@ class OperationConformance(Conformance):
         expected = np.asarray(operation.specification(*at, **params))
         for how, call in (("", operation), (", compiled,", engine.jit(lambda *x: operation(*x, **params)))):
             with no_error(f"{operation.name} in {name}{how}"):
-                given = _constants(engine, at)
-                result = engine.to_numpy(call(*given, **params) if call is operation else call(*given))
+                constants = _constants(engine, at)
+                result = engine.to_numpy(call(*constants, **params) if call is operation else call(*constants))
             _claim_close(result, expected, f"the value in {name}{how}")
         if not engine.differentiates:
             return
         weights = np.random.default_rng(4).standard_normal(expected.shape)
         along, fixed = derivatives.directions(at[:count]), _constants(engine, at[count:])
         with no_error(f"derivatives of {operation.name} in {name}"):
-            own, specified = (
+            computed, specified = (
                 derivatives.compiled(engine, lambda x, f=f: f(*x, *fixed, **params), at[:count], along, weights)
                 for f in (operation, operation.specification)
             )
-        _claim_close(own.along, specified.along, f"the derivative in forward mode in {name}")
-        for result, gradient in zip(own.gradient, specified.gradient, strict=True):
+        _claim_close(computed.along, specified.along, f"the derivative in forward mode in {name}")
+        for result, gradient in zip(computed.gradient, specified.gradient, strict=True):
             _claim_close(result, gradient, f"the gradient in {name}")
 
 
@@ -215,10 +216,10 @@ def _tangents(varied: Sequence[np.ndarray], which: Sequence[int], count: int = 1
 
 def _specified_slope(engine: Engine, operation: Operation, at: list, along: list, params: dict) -> np.ndarray:
     """The derivative of the specification, by the engine's forward mode."""
-    count, given = operation.differentiable, _constants(engine, at)
-    f: Callable = lambda x: operation.specification(*x, *given[count:], **params)  # noqa: E731
+    count, constants = operation.differentiable, _constants(engine, at)
+    f: Callable = lambda x: operation.specification(*x, *constants[count:], **params)  # noqa: E731
     with no_error(f"the derivative of the specification of {operation.name} in {engine.name}"):
-        return engine.to_numpy(engine.jvp(f, given[:count], _constants(engine, along))[1])
+        return engine.to_numpy(engine.jvp(f, constants[:count], _constants(engine, along))[1])
 
 
 def _claim_close(actual: Any, expected: Any, what: str) -> None:

@@ -61,13 +61,13 @@ def claim_corners(part: Part, surface: TriangleSurface, when: str) -> None:
 def claim_keys_tell_views(part: Part, surface: TriangleSurface) -> None:
     """Fail if triangles differ between two of `VIEWS`, each in two sizes, with one key."""
     inputs = inputs_of(part, surface)
-    given = {
+    views = {
         f"{view} of {scale * scenes.SIZE[0]} rows": (camera, (scale * scenes.SIZE[0], scale * scenes.SIZE[1]))
         for view, camera in VIEWS.items()
         for scale in (1, 4)
     }
     first: dict[Any, tuple[str, Proxy]] = {}
-    for view, (camera, size) in given.items():
+    for view, (camera, size) in views.items():
         key = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
         proxy = surface.proxy(inputs, camera, size)
         other, before = first.setdefault(key, (view, proxy))

@@ -10,7 +10,7 @@ from rts.contracts.records import Proxy
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
 from rts.sampling.layer_order import refined
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
@@ -60,9 +60,9 @@ def _off_rays(part: Part, surface: TriangleSurface, inputs: Tree, proxy: Proxy, 
         view: the name of the view, for messages.
     """
     sampler = registry.instance("rts.samplers", "reference")
-    lifted = lift(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
+    unrefined = pack_fragments(sampler.rasterize(proxy, local, GRID, LAYERS, part.cull), proxy)
     try:
-        samples, rays = refined(surface, inputs, lifted, local, surface.table_specs(len(lifted.ids), None))
+        samples, rays = refined(surface, inputs, unrefined, local, surface.table_specs(len(unrefined.ids), None))
     except InputError as error:
         raise AssertionError(f"{view}: {error}") from error
     cells = samples.row >= 0
@@ -108,14 +108,14 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
     missed, total, worst = 0, 0, 0.0
     for k in range(len(hit)):
         # Hits with another one just before them are left out.
-        apart = distance[k] - (distance[k - 1] if k else 0) > 2 * SHORT
-        chosen = np.flatnonzero(hit[k] & apart)
-        if not len(chosen):
+        distinct = distance[k] - (distance[k - 1] if k else 0) > 2 * SHORT
+        rays_hit = np.flatnonzero(hit[k] & distinct)
+        if not len(rays_hit):
             continue
-        start = origins[chosen] + (distance[k, chosen] - SHORT)[:, None] * directions[chosen]
-        again = surface.intersect(theta, start.astype(np.float32), directions[chosen], 1)
+        start = origins[rays_hit] + (distance[k, rays_hit] - SHORT)[:, None] * directions[rays_hit]
+        again = surface.intersect(theta, start.astype(np.float32), directions[rays_hit], 1)
         off = np.abs(np.where(np.asarray(again.hit)[0], np.asarray(again.distance)[0] - SHORT, np.inf))
-        missed, total = missed + int((off > SHORT / 2).sum()), total + len(chosen)
+        missed, total = missed + int((off > SHORT / 2).sum()), total + len(rays_hit)
         worst = max(worst, float(off.max()))
     claim(
         missed <= MISSED * total,
@@ -130,10 +130,12 @@ def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, vie
     hits = surface.intersect(theta, origins, directions, DEEP)
     hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)
     # Rays whose hits are all known: the last layer is empty.
-    chosen = np.flatnonzero(hit[0] & ~hit[-1])
-    last = distance.max(axis=0)[chosen] + BEYOND
-    back = surface.intersect(theta, origins[chosen] + last[:, None] * directions[chosen], -directions[chosen], DEEP)
-    there = np.where(hit[:, chosen], distance[:, chosen], NOWHERE)
+    rays_hit = np.flatnonzero(hit[0] & ~hit[-1])
+    last = distance.max(axis=0)[rays_hit] + BEYOND
+    back = surface.intersect(
+        theta, origins[rays_hit] + last[:, None] * directions[rays_hit], -directions[rays_hit], DEEP
+    )
+    there = np.where(hit[:, rays_hit], distance[:, rays_hit], NOWHERE)
     again = np.where(np.asarray(back.hit), last - np.asarray(back.distance), NOWHERE)
     again = np.where(again < 0, NOWHERE, again)  # Hits nearer than the near plane, where the first rays began.
     wrong = np.any(np.abs(np.sort(there, axis=0) - np.sort(again, axis=0)) > 1e-2, axis=0)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import inspect
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 
-from rts import registry
 from rts.arrays.trees import leaves
 from rts.contracts.checks import check_sampler
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Request, Sampled
-from rts.contracts.surface import Surface, TriangleSurface
+from rts.contracts.surface import Surface
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.scene.camera import Camera
@@ -24,10 +22,8 @@ from rts.testing.claims import claim, claim_close, no_error, refusal
 from rts.testing.compatibility import APRON
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, joined, split
+from rts.testing.expected_samples import Silhouettes, again, claim_like, differing, is_of_triangles, reference, right
 from rts.testing.sample_claims import claim_empty_where_empty, claim_ordered, claim_reprojected
-
-DEEPER = 4
-"""Layers of the reference beyond those compared, which show where silhouettes are."""
 
 SCALES = 1, 0.9, 0.8, 0.7, 0.8
 """Factors of θ in successive calls: more than the cache keeps (`rts.sampling.cache.KEPT`), then one that it keeps."""
@@ -114,12 +110,12 @@ class SamplerConformance(Conformance):
 
     def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
         """Two calls agree to the last bit; parts with new θ on the same surfaces, sampled in between, are right."""
-        between = [_scaled(part, 0.9) for part in parts]
-        expected = [right(part, scenes.AXES[2], sampler) for part in between]
+        scaled_parts = [_scaled(part, 0.9) for part in parts]
+        expected = [right(part, scenes.AXES[2], sampler) for part in scaled_parts]
         silhouettes = Silhouettes()
         for view, camera, part in _scenes(parts):
             first = scenes.find(part, camera, sampler)
-            for i, (other, like) in enumerate(zip(between, expected, strict=True)):
+            for i, (other, like) in enumerate(zip(scaled_parts, expected, strict=True)):
                 sampled = scenes.find(other, scenes.AXES[2], sampler)
                 silhouettes += claim_like(sampled, like, f"part {i} with new arrays in θ, after {view}")
             _claim_same(scenes.find(part, camera, sampler), first, view)
@@ -132,8 +128,11 @@ class SamplerConformance(Conformance):
         for index, part in enumerate(parts):
             held = prepare(part, sampler, camera=scenes.CAMERA, size=scenes.SIZE)
             for moved in (part, part.replace(transform=turn)):
-                own, whole = held.replace(transform=moved.transform), {"splatter": None, "layers": scenes.LAYERS}
-                sampled = sample(own, scenes.CAMERA, scenes.SIZE, **whole)
+                moved_parts, whole = (
+                    held.replace(transform=moved.transform),
+                    {"splatter": None, "layers": scenes.LAYERS},
+                )
+                sampled = sample(moved_parts, scenes.CAMERA, scenes.SIZE, **whole)
                 silhouettes += claim_like(sampled, right(moved, scenes.CAMERA, sampler), f"part {index}, prepared")
         silhouettes.claim_few("prepared, ")
 
@@ -159,8 +158,8 @@ class SamplerConformance(Conformance):
                 v *= 0.9
             expected = again(part.replace(theta=join([v.copy() for v in changing])), scenes.CAMERA, sampler)
             sampled = scenes.find(changed, sampler=sampler)
-            if _differing(sampled, expected.sampled).any():
-                stale = not _differing(sampled, before).any()
+            if differing(sampled, expected.sampled).any():
+                stale = not differing(sampled, before).any()
                 claim(not stale, "a change in place of the arrays of θ is not seen; keep what is built by their values")
                 claim_like(sampled, expected, f"part {i}, after a change in place of the arrays of θ").claim_few("")
 
@@ -189,11 +188,11 @@ class SamplerConformance(Conformance):
         y, x = np.append(y, y[:1]), np.append(x, x[:1])  # One of them twice.
         for index, part in enumerate(map(scenes.checked, parts)):
             for move, layers in (((0.0, 0.0), 3), ((0.3, -0.21), 2)):
-                own = scenes.CAMERA.for_size(scenes.SIZE).within(part.transform)
-                centred = scenes.shifted(scenes.shifted(own, -move[0], 0), move[1], 1)
+                camera = scenes.CAMERA.for_size(scenes.SIZE).within(part.transform)
+                centred = scenes.shifted(scenes.shifted(camera, -move[0], 0), move[1], 1)
                 request = Request(points=np.column_stack([x, y]) + 0.5 + move, triangles=True)
-                found = chosen.sample(part, own, scenes.SIZE, layers, request)
-                if "points" not in found.followed:
+                found = chosen.sample(part, camera, scenes.SIZE, layers, request)
+                if not found.at_points:
                     pytest.skip("the sampler samples whole grids")
                 whole = chosen.sample(part, centred, scenes.SIZE, layers, Request(triangles=True))
                 row, depth = np.asarray(whole.row)[:, y, x], np.asarray(whole.depth)[:, y, x]
@@ -302,125 +301,10 @@ class SamplerConformance(Conformance):
             claim_awkward_views_are_finite(part, sampler, differentiating(engine))
 
 
-class Expected(NamedTuple):
-    """Samples to compare with.
-
-    Attributes:
-        sampled: the samples.
-        edge: (H, W) bool, pixels at silhouettes, where other samples may be right, too.
-        source: name of their sampler, in words.
-    """
-
-    sampled: Sampled
-    edge: np.ndarray
-    source: str
-
-
-class Silhouettes(NamedTuple):
-    """The number of pixels at silhouettes, and of those among them that differ from the expected ones."""
-
-    pixels: int = 0
-    different: int = 0
-
-    def __add__(self, other: Any) -> Silhouettes:
-        """The sums of both counts."""
-        return Silhouettes(self.pixels + other[0], self.different + other[1])
-
-    def claim_few(self, what: str) -> None:
-        """Fail if more than one pixel in a hundred differs."""
-        claim(
-            self.different <= 0.01 * self.pixels,
-            f"{what}{self.different} of {self.pixels} pixels at silhouettes differ from what they should be; expected "
-            f"at most 1 %",
-        )
-
-
-def reference(part: Part, camera: Camera, layers: int = scenes.LAYERS) -> Expected:
-    """The samples of the sampler `reference`."""
-    exact = registry.instance("rts.samplers", "reference")
-    deep = scenes.find(part, camera, exact, layers=layers + DEEPER)
-    return Expected(scenes.find(part, camera, exact, layers=layers), _edges(deep), "the reference")
-
-
-def again(part: Part, camera: Camera, sampler: Any) -> Expected:
-    """The samples of a new object of the sampler's class, or of the reference if none can be made."""
-    new = _new(sampler)
-    if new is None and is_of_triangles(part):
-        return reference(part, camera)
-    sampled = scenes.find(part, camera, sampler if new is None else new)
-    return Expected(sampled, _edges(sampled), "a new object of the sampler's class")
-
-
-def right(part: Part, camera: Camera, sampler: Any) -> Expected:
-    """The samples of the reference; for a surface without triangles, those of a new object of the sampler."""
-    return reference(part, camera) if is_of_triangles(part) else again(part, camera, sampler)
-
-
-def _new(sampler: Any) -> Any:
-    """A new sampler of the same class; None if that fails, or if the class of a given object takes arguments."""
-    kind = type(registry.instance("rts.samplers", sampler) if isinstance(sampler, str) else sampler)
-    plain = kind.__init__ is object.__init__ or len(inspect.signature(kind.__init__).parameters) == 1
-    if not (isinstance(sampler, str) or plain):
-        return None
-    try:
-        return kind()
-    except Exception:  # A plugin's class may raise anything.
-        return None
-
-
-def claim_like(actual: Sampled, expected: Expected, what: str) -> Silhouettes:
-    """Fail unless samples have the expected ids and depths; at silhouettes ids may differ. Returns counts of these."""
-    sampled, edge, source = expected
-    different = (_ids(actual) != _ids(sampled)).any(axis=(0, -1)) | (_covered(actual) != _covered(sampled)).any(axis=0)
-    inside = different & ~edge
-    claim(
-        not inside.any(),
-        f"{what}: {inside.sum()} of {(~edge).sum()} pixels inside have other triangles than {source}, the first at "
-        f"{tuple(np.argwhere(inside)[0].tolist()) if inside.any() else ()} of the grid",
-    )
-    off = _off(actual, sampled) & ~different
-    claim(not off.any(), f"{what}: the depth of {off.sum()} samples is not that of {source}, by more than 1e-5 of it")
-    return Silhouettes(int(edge.sum()), int((different & edge).sum()))
-
-
-def is_of_triangles(part: Part) -> bool:
-    """True if the part's surface has triangles."""
-    return isinstance(scenes.checked(part).surface, TriangleSurface)
-
-
-def _edges(sampled: Sampled) -> np.ndarray:
-    """Mask (H, W) bool of pixels whose number of layers differs from a neighbour's."""
-    count = np.pad(_covered(sampled).sum(axis=0), 1, mode="edge")
-    height, width = scenes.GRID
-    around = np.stack([count[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-    return (around != around[4]).any(axis=0)
-
-
-def _covered(sampled: Sampled) -> np.ndarray:
-    return np.asarray(sampled.row) >= 0
-
-
-def _off(actual: Sampled, expected: Sampled) -> np.ndarray:
-    """Mask (K, H, W) bool of cells whose depths differ by more than 1e-5 of the expected depth."""
-    depth, other = np.asarray(actual.depth), np.asarray(expected.depth)
-    return np.abs(depth - other) > 1e-5 * other
-
-
-def _differing(actual: Sampled, expected: Sampled) -> np.ndarray:
-    """Mask (K, H, W) bool of cells with different ids or depths."""
-    return (_ids(actual) != _ids(expected)).any(axis=-1) | _off(actual, expected)
-
-
 def _scaled(part: Part, scale: float) -> Part:
     """The part with θ times a factor, in new arrays."""
     values, join = split(part.theta)
     return part.replace(theta=join([(scale * v).astype(v.dtype) for v in values]))
-
-
-def _ids(sampled: Sampled) -> np.ndarray:
-    """Ids (K, H, W, I) in each cell; −1 in empty ones."""
-    row = np.asarray(sampled.row)
-    return np.where((row >= 0)[..., None], np.asarray(sampled.samples[0].ids)[row], -1)
 
 
 def _scenes(parts: list[Part]) -> list[tuple[str, Camera, Part]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rts import registry
 from rts.arrays.trees import Array
-from rts.contracts.checks import check_scene
+from rts.contracts.checked_parts import check_scene
 from rts.contracts.records import Sampled
 from rts.rendering.image import render, render_samples
 from rts.rendering.samples import sample

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.arrays.engines import Engine, constants, engine_of
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import constants, engine_of
 from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.checks import check_shader
 from rts.contracts.gbuffer import GBuffer
@@ -122,18 +123,18 @@ class ShaderConformance(Conformance):
 
     def test_samples_of_several_views_are_shaded_as_by_each(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that takes samples of several views gives each the colour seen by its own camera."""
-        own: Any = _instance(shader)
-        if not promised(own, "takes_views"):
+        instance: Any = _instance(shader)
+        if not promised(instance, "takes_views"):
             pytest.skip("the shader does not take samples of several views")
         claim(
-            promised(own, "reads") is not None,
+            promised(instance, "reads") is not None,
             "the shader takes samples of several views; expected it to say what it `reads`, too",
         )
         cameras, single = [scenes.CAMERA, scenes.NEAR], map_leaves(derivatives.single, theta)
         number = np.repeat(np.array([1, 2], np.int32), [ROWS // 4, ROWS - ROWS // 4])
         with no_error("shading samples of two views with RowCameras"):
-            colors = own(single, GBuffer(gbuffer), RowCameras.of(cameras, number))
-        first, second = (np.asarray(own(single, GBuffer(gbuffer), camera)) for camera in cameras)
+            colors = instance(single, GBuffer(gbuffer), RowCameras.of(cameras, number))
+        first, second = (np.asarray(instance(single, GBuffer(gbuffer), camera)) for camera in cameras)
         expected = np.where(number[:, None] == 1, first, second)
         claim_close(colors, expected, TOLERANCE, "the colour of samples of two views")
 

@@ -87,8 +87,10 @@ class SplatterConformance(Conformance):
         far, r = np.ones((HEIGHT, WIDTH), bool), check_splatter(splatter).reach
         far[max(0, 2 - r) : 3 + r, max(0, 3 - r) : 4 + r] = False
         claim((image[far] == 0).all(), f"a sample reaches beyond the cells that `reach` says, {r} on each side")
-        own, most = image[2, 3, 3], image[..., 3].max()
-        claim(0 < own == most, f"a sample shows with {own:.3g} in its own cell, and with {most:.3g} in another")
+        own_cell, most = image[2, 3, 3], image[..., 3].max()
+        claim(
+            0 < own_cell == most, f"a sample shows with {own_cell:.3g} in its own cell, and with {most:.3g} in another"
+        )
 
     def test_colors_stay_premultiplied(self, splatter: Any) -> None:
         """The image of scattered samples has 0 ≤ colour ≤ alpha ≤ 1."""
@@ -128,9 +130,9 @@ class SplatterConformance(Conformance):
         """`splat` of no samples at all gives an image of zeros."""
         chosen = engine_or_skip(engine)
         row = np.full((LAYERS, HEIGHT, WIDTH), -1, np.int32)
-        given = derivatives.on(chosen, (np.zeros((0, 3)), np.zeros((0, 4)), row))
+        empty = derivatives.on(chosen, (np.zeros((0, 3)), np.zeros((0, 4)), row))
         with no_error(f"splat in {engine} with no rows, where nothing can be taken by index"):
-            image = chosen.to_numpy(check_splatter(splatter).splat(*given))
+            image = chosen.to_numpy(check_splatter(splatter).splat(*empty))
         claim_close(image, np.zeros((HEIGHT, WIDTH, 4)), 0, f"the image of no rows in {engine}")
 
     # -------------------------------------------------------------------------------------- derivatives
@@ -162,8 +164,8 @@ class SplatterConformance(Conformance):
     def test_engines_agree(self, splatter: Any) -> None:
         """Engines agree on image, gradient and derivative along a direction; forward and reverse mode agree."""
         splats = scattered(LAYERS + 1)
-        f, given = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
-        derivatives.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
+        f, arrays = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
+        derivatives.claim_engines_agree(f, arrays, np.asarray(f(arrays)), "the image")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
@@ -225,6 +227,6 @@ def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list],
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
     """The image's derivative (h, w, 4), without border, when positions (N, 3) move along a direction (N, 3)."""
-    given, d = derivatives.on(engine, (splats, [along]))
+    on_engine, d = derivatives.on(engine, (splats, [along]))
     image = check_splatter(splatter).cropped
-    return engine.to_numpy(engine.jvp(lambda x: image(given.replace(positions=x[0])), [given.positions], d)[1])
+    return engine.to_numpy(engine.jvp(lambda x: image(on_engine.replace(positions=x[0])), [on_engine.positions], d)[1])

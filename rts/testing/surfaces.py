@@ -264,6 +264,6 @@ def _single(theta: Tree) -> Tree:
 
 def _evaluated(part: Part, theta: Tree, samples: Samples) -> dict[str, np.ndarray]:
     """Every entry of the G-buffer, deferred ones too."""
-    given = part.surface.evaluate(theta, samples)
-    gbuffer = given if isinstance(given, GBuffer) else GBuffer(given)
+    result = part.surface.evaluate(theta, samples)
+    gbuffer = result if isinstance(result, GBuffer) else GBuffer(result)
     return {name: np.asarray(gbuffer[name]) for name in list(gbuffer)}

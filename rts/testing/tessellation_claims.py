@@ -108,7 +108,7 @@ def _front(part: Part, sampler: Any) -> np.ndarray:
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:
     """The median difference of depths (H, W) where both are finite; fails if these are under 30 % of `one`'s cells."""
-    apart = np.abs(one - other)
-    both = np.isfinite(apart)
+    difference = np.abs(one - other)
+    both = np.isfinite(difference)
     claim(both.sum() >= 0.3 * np.isfinite(one).sum(), "a coarser or finer form is seen elsewhere than the surface")
-    return float(np.median(apart[both]))
+    return float(np.median(difference[both]))

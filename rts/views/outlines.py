@@ -30,20 +30,22 @@ def with_outlines_of_views(views: Views, sampling: Sampling) -> Views:
     grids = sampling.grids
     first = Points.of(scenes[0], grids[0], inputs_of(scenes[0]))
     further = [(scene._replace(entries=first.entries), grid) for scene, grid in zip(scenes[1:], grids[1:], strict=True)]
-    points = [first, *each(lambda own: Points.of(*own, [None] * len(scenes[0].parts)), further)]
+    points = [first, *each(lambda scene_and_grid: Points.of(*scene_and_grid, [None] * len(scenes[0].parts)), further)]
     centres = at_centres(map_leaves(host_value, sampled.cells), sampled.samples)
     layers = [Fronts(*(np.ascontiguousarray(x[:, *place]) for x in centres)) for place in picture.places()]
     found, more = found_in_views(points, layers)
     samples, counts, moved, cells, start = [], [], [], sampled.cells, 0
     rows = [np.full(of.rows.shape, -1, np.int32) for of in found]
-    for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        count, here = own.ids.shape[0], [(of.parts == part) & (of.rows >= 0) for of in found]
+    for part, (samples_of_part, extra) in enumerate(zip(sampled.samples, more, strict=True)):
+        count, here = samples_of_part.ids.shape[0], [(of.parts == part) & (of.rows >= 0) for of in found]
         beside = np.array([np.count_nonzero(x) for x in here])
         order = _view_after_view(views.counts[part], beside)
         place = np.full(count + extra.ids.shape[0], -1, np.int32)
         place[order] = np.arange(len(order), dtype=np.int32)
-        at = engine_of(own.ids).constant(order.astype(np.int32), own.ids)
-        samples.append(taken_rows(in_one_table([own, extra]), at).replace(row=_moved(own.row, place)))
+        at = engine_of(samples_of_part.ids).constant(order.astype(np.int32), samples_of_part.ids)
+        samples.append(
+            taken_rows(in_one_table([samples_of_part, extra]), at).replace(row=_moved(samples_of_part.row, place))
+        )
         counts.append(views.counts[part] + beside)
         moved.append(start + place[:count])
         for at, of, x in zip(rows, found, here, strict=True):
@@ -68,5 +70,5 @@ def _view_after_view(cells: np.ndarray, beside: np.ndarray) -> np.ndarray:
 
 def _moved(row: Array, place: np.ndarray) -> Array:
     """The rows of cells, −1 for none, with a new `place` for each."""
-    known = host_value(row)
-    return engine_of(row).constant(np.where(known >= 0, place[known], np.int32(-1)), row)
+    rows = host_value(row)
+    return engine_of(row).constant(np.where(rows >= 0, place[rows], np.int32(-1)), row)

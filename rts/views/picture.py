@@ -39,10 +39,11 @@ class Picture(NamedTuple):
     def of(cls, count: int, view: tuple[int, int]) -> Picture:
         """A picture of `count` views, about as high as wide, with few empty places."""
         down, most = (max(1, SIDE // n) for n in view)
-        even = math.sqrt(count * view[0] / view[1])
+        square_across = math.sqrt(count * view[0] / view[1])
         # From half as wide to twice as wide as high.
         least, most = (
-            max(-(-count // down), min(round(n), most, count)) for n in (even / math.sqrt(2), even * math.sqrt(2))
+            max(-(-count // down), min(round(n), most, count))
+            for n in (square_across / math.sqrt(2), square_across * math.sqrt(2))
         )
 
         def cost(across: int) -> tuple[int, int]:
@@ -59,10 +60,10 @@ class Picture(NamedTuple):
 
     def places(self) -> list[tuple[slice, slice]]:
         """Lines and columns of the cells of each view."""
-        (height, width), places = self.view, []
+        (height, width), slices = self.view, []
         for y, x in np.ndindex(self.down, self.across):
-            places.append((slice(y * height, (y + 1) * height), slice(x * width, (x + 1) * width)))
-        return places[: self.views]
+            slices.append((slice(y * height, (y + 1) * height), slice(x * width, (x + 1) * width)))
+        return slices[: self.views]
 
     def corners(self) -> np.ndarray:
         """(B, 2) the column and the line of the first cell of each view."""
@@ -77,7 +78,7 @@ class Picture(NamedTuple):
         grid = xp.reshape(views, (self.down, self.across, -1, height, width))
         return xp.reshape(xp.permute_dims(grid, (2, 0, 3, 1, 4)), (-1, *self.size))
 
-    def apart(self, image: Array, border: int) -> Array:
+    def split(self, image: Array, border: int) -> Array:
         """The views (B, h, w, C), borders cut off, of an image (height, width, C) of the picture."""
         xp, (height, width) = namespace(image), self.view
         grid = xp.reshape(image, (self.down, height, self.across, width, image.shape[-1]))
@@ -114,13 +115,13 @@ def outlines_side_by_side(
         starts: (B, P) the first row of each part in a view.
         shifts: (B, P) by how much the rows of these parts move in the picture.
     """
-    xp, first, known = namespace(views[0].place), views[0], {}
+    xp, first, joined = namespace(views[0].place), views[0], {}
     for name in (field.name for field in fields(Outlines) if getattr(first, field.name) is not None):
         of_views = [getattr(view, name) for view in views]
-        known[name] = picture.laid_out(xp.stack(of_views), False) if name == "joined" else xp.concat(of_views)
-    whole, constant = Outlines(**known), engine_of(first.place).constant
+        joined[name] = picture.laid_out(xp.stack(of_views), False) if name == "joined" else xp.concat(of_views)
+    whole, constant = Outlines(**joined), engine_of(first.place).constant
     counts = np.array([(view.place.shape[0], view.square.shape[0]) for view in views], np.int32)
-    of_break, of_segment = (np.repeat(np.arange(len(views)), own) for own in counts.T)
+    of_break, of_segment = (np.repeat(np.arange(len(views)), count) for count in counts.T)
     corners = np.insert(picture.corners()[:, ::-1], 2, 0, axis=1).astype(np.int32)
     before = np.cumsum(counts[:, :1], axis=0, dtype=np.int32) - counts[:, :1]
 

@@ -12,11 +12,12 @@ from rts.arrays.array_functions import averaged, described, shape_of
 from rts.arrays.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.checks import check_background, check_cameras
+from rts.contracts.checked_parts import check_cameras
+from rts.contracts.checks import check_background
 from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
-from rts.rendering.image import image_of, over_background, seen, splatted
+from rts.rendering.image import image_of, over_background, splatted, warned_if_empty
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
@@ -81,17 +82,17 @@ def render_views(
         EmptyImageWarning: nothing is seen in a view; the warning says why.
         AspectWarning: a camera is for images of another ratio of width to height.
     """
-    listed = check_cameras(cameras)
-    scene = Scene.of(parts, listed[0], sampler, engine)
+    camera_list = check_cameras(cameras)
+    scene = Scene.of(parts, camera_list[0], sampler, engine)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
-    context = context_of_scene(scene.parts, listed, engine=engine)
-    scenes = [scene._replace(camera=camera, context=context).at(size) for camera in listed]
-    background = _check_backgrounds(background, len(listed), size, scene.channels)
+    context = context_of_scene(scene.parts, camera_list, engine=engine)
+    scenes = [scene._replace(camera=camera, context=context).at(size) for camera in camera_list]
+    background = _check_backgrounds(background, len(camera_list), size, scene.channels)
     if not is_constant(background):
-        context = scene.context_with(listed, background)
+        context = scene.context_with(camera_list, background)
     images = _images(scenes, size, context, settings)
-    for b, own in enumerate(scenes):
-        seen(images[b], own, f"view {b}")
+    for b, view_scene in enumerate(scenes):
+        warned_if_empty(images[b], view_scene, f"view {b}")
     return over_background(images, background)
 
 
@@ -114,20 +115,22 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
         height, width = (settings.supersample * n + 2 * settings.apron for n in size)
         chunks = _chunks(scenes, at_once((height, width)))
         place = Picture.of(len(chunks[0]), (height, width))
-        samplings = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
+        samplings = [Sampling(chunk, place._replace(views=len(chunk)), size, settings) for chunk in chunks]
         # Which rows are in use is unknown if they are padded, so that one call must serve all views.
         padded = engine.padded(like)
         one_call = len(samplings) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
-        if place.views > 1 and all(own.possible for own in samplings):
+        if place.views > 1 and all(sampling.possible for sampling in samplings):
             countable = settings.capacity is None and engine.concurrent() and engine.on_host(like)
             # Outlines of padded samples are found view by view.
             if (one_call and not settings.finds_outlines) if padded else countable:
-                pictures = [_sampled_as_one(own) for own in samplings]
+                pictures = [_sampled_as_one(sampling) for sampling in samplings]
                 return _as_pictures(pictures, scenes, context, settings)
         outlined = settings.finds_outlines and place.views > 1 and (one_call or not padded)
         if (several and differentiates) or outlined:
             views = _sampled_at_once(scenes, size, settings)
-            pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
+            pictures = [
+                laid_side_by_side(chunk, place._replace(views=len(chunk))) for chunk in _chunks(views, place.views)
+            ]
             complete = [picture for picture in pictures if picture is not None]
             if len(complete) == len(pictures):
                 return _as_pictures(complete, scenes, context, settings)
@@ -149,10 +152,10 @@ def _sampled_as_one(sampling: Sampling) -> Views:
 def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
     """The samples of each view; every core samples one view at a time, if threads may."""
 
-    def own(scene: Scene) -> Sampled:
-        return sampled_scene(scene, scene.camera, size, settings)
+    def sample_view(view_scene: Scene) -> Sampled:
+        return sampled_scene(view_scene, view_scene.camera, size, settings)
 
-    return each(own, scenes) if _concurrent(scenes[0]) else list(map(own, scenes))
+    return each(sample_view, scenes) if _concurrent(scenes[0]) else list(map(sample_view, scenes))
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
@@ -166,7 +169,7 @@ def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Cont
     """The images (B, H, W, C + 1) of sampled views, splatted view by view."""
     pairs, splatter = zip(views, scenes, strict=True), settings.splatter
     assert splatter is not None
-    images = [splatted(own, scene, scene.camera, context, splatter) for own, scene in pairs]
+    images = [splatted(sampled, scene, scene.camera, context, splatter) for sampled, scene in pairs]
     return namespace(*images).stack(images)
 
 
@@ -177,11 +180,11 @@ def _as_pictures(
     images, cameras, splatter = [], [scene.camera for scene in scenes], settings.splatter
     assert splatter is not None
     for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
-        cells = views.picture.apart(cropped_image(splatter, splats), views.sampled.apron)
-        xp, (count, height, width, channels), side = namespace(cells), cells.shape, views.sampled.supersample
-        if side > 1:
-            cells = averaged(xp.reshape(cells, (count * height, width, channels)), side)
-        images.append(xp.reshape(cells, (count, height // side, width // side, channels)))
+        cells = views.picture.split(cropped_image(splatter, splats), views.sampled.apron)
+        xp, (count, height, width, channels), factor = namespace(cells), cells.shape, views.sampled.supersample
+        if factor > 1:
+            cells = averaged(xp.reshape(cells, (count * height, width, channels)), factor)
+        images.append(xp.reshape(cells, (count, height // factor, width // factor, channels)))
     return images[0] if len(images) == 1 else namespace(*images).concat(images)
 
 

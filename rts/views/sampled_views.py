@@ -16,15 +16,16 @@ import numpy as np
 from rts.arrays.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.checks import CheckedPart, check_memory
+from rts.contracts.checked_parts import CheckedPart
+from rts.contracts.checks import check_memory
 from rts.contracts.records import ArraySpec, Cells, Fragments, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.plugin_base import overrides
 from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
-from rts.sampling.host_call import HostCall, Shape
+from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.merging import merge
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.tables import in_one_table
@@ -69,8 +70,8 @@ class Sampling:
     @property
     def cells(self) -> tuple[int, int]:
         """(height, width) of each view in cells, without its apron."""
-        side = self.settings.supersample
-        return side * self.size[0], side * self.size[1]
+        factor = self.settings.supersample
+        return factor * self.size[0], factor * self.size[1]
 
     @cached_property
     def grids(self) -> list[Grid]:
@@ -107,27 +108,27 @@ class Sampling:
         surface, picture, layers = part.surface, self.picture, settings.most_layers
         assert isinstance(surface, TriangleSurface)
         capacity = None if settings.capacity is None else picture.views * settings.capacity
-        shape = Shape(layers, picture.size, capacity, picture.size)
-        specs = {"view": shape.row_spec(np.int32)}
+        bounds = SampleBounds(layers, picture.size, capacity, picture.size)
+        specs = {"view": bounds.row_spec(np.int32)}
         if settings.finds_outlines:
             specs["triangle"] = ArraySpec((layers, *picture.size), np.int32)
 
-        def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
+        def find(view_cameras: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
             def drawn(built: Entry) -> tuple[Entry, Fragments, np.ndarray]:
-                return built, *_drawn(sampler, built, own, picture, layers, part.cull)
+                return built, *_drawn(sampler, built, view_cameras, picture, layers, part.cull)
 
-            built, fragments, kept = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
+            built, fragments, kept = sampler.working_on(surface, inputs, view_cameras[0], picture.view, entry, drawn)
             over = 0
             if settings.capacity is not None:
                 over = _leave_out(kept, picture, settings.capacity)
-            lifted = lift(fragments, built.proxy, capacity, kept, views=(picture.down, picture.across))
-            counts = _counts(lifted.row, len(lifted.ids) if capacity is None else 0, picture)
-            extras = {"view": _numbers(counts, len(lifted.ids))}
+            packed = pack_fragments(fragments, built.proxy, capacity, kept, views=(picture.down, picture.across))
+            counts = _counts(packed.row, len(packed.ids) if capacity is None else 0, picture)
+            extras = {"view": _numbers(counts, len(packed.ids))}
             if settings.finds_outlines:
-                extras["triangle"] = np.where(lifted.row >= 0, fragments.triangle_ids, np.int32(-1))
-            return replace(lifted, overflow=np.asarray(over, np.int32)), extras
+                extras["triangle"] = np.where(packed.row >= 0, fragments.triangle_ids, np.int32(-1))
+            return replace(packed, overflow=np.asarray(over, np.int32)), extras
 
-        samples, extras = HostCall(part, surface, cameras, shape, entry).samples(find, specs)
+        samples, extras = HostCall(part, surface, cameras, bounds, entry).samples(find, specs)
         view = extras.pop("view")
         return samples.replace(**extras), view
 
@@ -140,7 +141,7 @@ def sampled_as_one(sampling: Sampling) -> Views:
     results = [sampling.of_part(*part) for part in parts]
     sampled = merge([samples for samples, _ in results], settings.most_layers)
     sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
-    padded, view = engine_of(sampled.row).padded(sampled.row), tuple(own for _, own in results)
+    padded, view = engine_of(sampled.row).padded(sampled.row), tuple(view_of_row for _, view_of_row in results)
     if is_traced(sampled.row) or (padded and len(parts) == 1):
         return Views(sampled, picture, view, None)
     if len(parts) == 1:
@@ -172,7 +173,7 @@ def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
 def with_counts(sampled: Sampled, picture: Picture, counts: tuple[np.ndarray, ...]) -> Views:
     """`Views` of samples with these numbers of rows; which rows are in use is unknown where they are padded."""
     engine = engine_of(sampled.row)
-    view = tuple(engine.constant(_numbers(own, own.sum()), sampled.row) for own in counts)
+    view = tuple(engine.constant(_numbers(part_counts, part_counts.sum()), sampled.row) for part_counts in counts)
     return Views(sampled, picture, view, None if engine.padded(sampled.row) else counts)
 
 
@@ -183,10 +184,10 @@ def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
     """
     over = 0
     for lines, columns in picture.places():
-        own = kept[:, lines, columns]
-        count = int(np.count_nonzero(own))
+        kept_in_view = kept[:, lines, columns]
+        count = int(np.count_nonzero(kept_in_view))
         if count > capacity:
-            own[own] = np.arange(count) < capacity
+            kept_in_view[kept_in_view] = np.arange(count) < capacity
             over += count - capacity
     return over
 
@@ -200,20 +201,20 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
     # Rows are numbered part by part, in each view and in the picture.
-    own_starts = np.cumsum(counts, axis=1, dtype=np.int32) - counts
+    first_rows = np.cumsum(counts, axis=1, dtype=np.int32) - counts
     total = counts.sum(axis=0, dtype=np.int32)
-    shifts = np.cumsum(total, dtype=np.int32) - total + starts - own_starts
+    shifts = np.cumsum(total, dtype=np.int32) - total + starts - first_rows
     xp, samples = namespace(first.row), []
 
     def laid_out(grids: Sequence[Array], empty: int, shift: np.ndarray | None = None) -> Array:
         """One grid from the grids (K, H, W) of all views; `shift` (B, parts) is added to rows of each part."""
         stacked = xp.stack(list(grids))
-        return picture.laid_out(stacked if shift is None else renumbered(stacked, own_starts, shift), empty)
+        return picture.laid_out(stacked if shift is None else renumbered(stacked, first_rows, shift), empty)
 
     for index in range(len(first.samples)):
-        own = [view.samples[index] for view in views]
-        row = laid_out([s.row for s in own], -1, starts[:, index, None])
-        samples.append(in_one_table(own).replace(row=row, depth=laid_out([s.depth for s in own], 0)))
+        part_samples = [view.samples[index] for view in views]
+        row = laid_out([s.row for s in part_samples], -1, starts[:, index, None])
+        samples.append(in_one_table(part_samples).replace(row=row, depth=laid_out([s.depth for s in part_samples], 0)))
     row, depth = laid_out([view.row for view in views], -1, shifts), laid_out([view.depth for view in views], 0)
     found = [view.outlines for view in views if view.outlines is not None]
     sampled = replace(
@@ -221,7 +222,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         samples=tuple(samples),
         cells=Cells(row, depth),
         overflow=sum(view.overflow for view in views),
-        outlines=outlines_side_by_side(found, picture, own_starts, shifts) if found else None,
+        outlines=outlines_side_by_side(found, picture, first_rows, shifts) if found else None,
     )
     return with_counts(sampled, picture, tuple(counts.T))
 
@@ -255,9 +256,9 @@ def _drawn(
         return fragments, covered
 
     def draw(b: int) -> None:
-        own = sampler.rasterize(built.prepared, cameras[b], picture.view, layers, cull)
-        covered[:, *places[b]] = check_fragments(own, (layers, *picture.view), faces, sampler)
-        for to, x in zip(fragments, own, strict=True):
+        view_fragments = sampler.rasterize(built.prepared, cameras[b], picture.view, layers, cull)
+        covered[:, *places[b]] = check_fragments(view_fragments, (layers, *picture.view), faces, sampler)
+        for to, x in zip(fragments, view_fragments, strict=True):
             to[:, *places[b]] = x
 
     if sampler.draws_at_once:

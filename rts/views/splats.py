@@ -9,11 +9,12 @@ import numpy as np
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array
 from rts.compiling.threads import each
-from rts.contracts.checks import CheckedPart, check_splats
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Sampled, Splats
+from rts.contracts.result_checks import check_splats
 from rts.operations.projection import projective_map_of_views
-from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
-from rts.rendering.splats import all_in_use, of_inputs, on_rays, owned, splats_of, together
+from rts.rendering.shade import add_footprint, evaluate, shade, shaded_at_once, split_by_view, theta_of
+from rts.rendering.splats import all_in_use, concatenated, of_inputs, on_rays, owned, splats_of
 from rts.sampling.scene import Grid
 from rts.sampling.tables import in_one_table
 from rts.scene.camera import Camera
@@ -43,18 +44,19 @@ def views_to_splats(
     (height, width), border = pictures[0].picture.view, sampled[0].apron
     grids = [Grid.around(camera, (height - 2 * border, width - 2 * border), border) for camera in cameras]
     shown = [
-        _shown_in_views(index, part, pictures, sampled, cameras, grids, context) for index, part in enumerate(parts)
+        _positions_and_colors(index, part, pictures, sampled, cameras, grids, context)
+        for index, part in enumerate(parts)
     ]
     splats, start = [], 0
     for picture, whole in zip(pictures, sampled, strict=True):
         here = slice(start, start := start + picture.picture.views)
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
-        positions, rgba = together(*zip(*of_parts, strict=True))
+        positions, rgba = concatenated(*zip(*of_parts, strict=True))
         splats.append(splats_of(whole, parts, positions, rgba, context))
     return splats
 
 
-def _shown_in_views(
+def _positions_and_colors(
     index: int,
     part: CheckedPart,
     pictures: Sequence[Views],
@@ -72,13 +74,13 @@ def _shown_in_views(
         sampled: their samples, in arrays of the engine.
         cameras: the camera of the whole image of each view.
         grids: the cells of each view, and their camera.
-        context: as in `_shown`.
+        context: as in `to_splats`.
     """
     inputs, engine = of_inputs(context), context.engine
-    whole = in_one_table([own.samples[index] for own in sampled])
+    whole = in_one_table([sampled_picture.samples[index] for sampled_picture in sampled])
     used, outlines = whole, sampled[0].outlines
     if outlines is not None and engine.padded(whole.row):
-        before = sum(own.ids.shape[-2] for own in sampled[0].samples[:index])
+        before = sum(sampled_picture.ids.shape[-2] for sampled_picture in sampled[0].samples[:index])
         # Engines that pad rows have all views in one picture.
         used = all_in_use(whole, inputs, outlines.rows if len(sampled) == 1 else None, before)
     counts, size = _counts_of(pictures, index), grids[0].size
@@ -88,9 +90,9 @@ def _shown_in_views(
     for picture in pictures:
         view.append(picture.view[index] + first if first else picture.view[index])
         first += picture.picture.views
-    (view,) = together([inputs.constants(own) for own in view])
-    seen = [g.camera.replace(view=inputs.constants(g.camera.view)).within(transform) for g in grids]
-    rows = namespace(seen[0].view).stack([own.pixel_rows(size) for own in seen])
+    (view,) = concatenated([inputs.constants(numbers) for numbers in view])
+    local_cameras = [g.camera.replace(view=inputs.constants(g.camera.view)).within(transform) for g in grids]
+    rows = namespace(local_cameras[0].view).stack([camera.pixel_rows(size) for camera in local_cameras])
     points = on_rays(whole, gbuffer["position"])
     rows, points = context_of(rows, points).constants((rows, points))
     places = _places_of(pictures, Context(engine_of(points), points))
@@ -102,8 +104,10 @@ def _shown_in_views(
     else:
         assert counts is not None
         shaded = []
-        for own, (samples, local) in zip(seen, apart(whole, gbuffer, counts.tolist(), engine), strict=True):
-            add_footprint(part, samples, local, own, size, inputs)
+        for local_camera, (samples, local) in zip(
+            local_cameras, split_by_view(whole, gbuffer, counts.tolist(), engine), strict=True
+        ):
+            add_footprint(part, samples, local, local_camera, size, inputs)
             shaded.append((samples, local))
 
         def colored(pair: tuple) -> Array:
@@ -119,7 +123,7 @@ def _shown_in_views(
         views = list(zip(cameras, shaded, strict=True))
         colors = [colored(views[0])]
         colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray else map(colored, views[1:])
-        (rgba,) = together(colors)
+        (rgba,) = concatenated(colors)
     rgba = context.constants(rgba)
     if engine_of(rgba) is not engine:
         positions, rgba = context_of(rgba).constants((positions, rgba))
@@ -147,4 +151,4 @@ def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
 
 def _places_of(pictures: Sequence[Views], context: Context) -> Array:
     """(B, 2) for each view its offsets along x and y in its picture, in cells."""
-    return context.constants(np.concatenate([own.picture.corners() for own in pictures]).astype(np.float32))
+    return context.constants(np.concatenate([views.picture.corners() for views in pictures]).astype(np.float32))

@@ -13,7 +13,7 @@ from rts.plugin_api.threads import parallel
 from rts_backends.embree.enlarged_triangles import Covers
 from rts_backends.embree.library import Scene
 from rts_backends.embree.loops import TILE, cast, keep_nearest_address
-from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
+from rts_backends.triangles import bounding_sphere, pixel_matrix
 
 REFITS = 32
 """One move of vertices in so many builds the structure anew; the others refit it, which loosens its boxes."""
@@ -86,7 +86,7 @@ def _cast(
         np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
         prepared.sphere,
         _planes(camera.projection),
-        facing(camera, cull),
+        camera.kept_sign(cull),
         prepared.proxy.vertices,
         prepared.proxy.faces,
         prepared.covers.owners,

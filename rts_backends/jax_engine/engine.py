@@ -192,10 +192,10 @@ class JaxEngine(Engine):
             return whole
         used = jnp.max(row) + 1
 
-        def few(*own: jax.Array) -> jax.Array:
+        def few(*arrays: jax.Array) -> jax.Array:
             # For small pieces array code takes less time than a call to the host.
             with operations.by_specification():
-                return f(dict(zip(rows, own, strict=True)))
+                return f(dict(zip(rows, arrays, strict=True)))
 
         result = row_blocks.apply(few, used, list(rows.values()))
         return whole if result is None else result
@@ -275,7 +275,7 @@ class JaxEngine(Engine):
         """`jax.jit`."""
         return jax.jit(f)
 
-    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
+    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, original: Tree = None) -> Any:
         """See `Engine.optimizer`: optax's `adam` or `sgd`, or an `optax.GradientTransformation`."""
         from rts_backends.jax_engine.optimizer import Optimizer
 

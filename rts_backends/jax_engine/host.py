@@ -108,8 +108,8 @@ def _results(*operands: Any, function: HostFunction, shapes: Shapes, used: Seque
 def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
     mapped = [jnp.moveaxis(x, d, 0) for x, d in zip(operands, dims, strict=True) if d is not None]
 
-    def item(own: list) -> list[jax.Array]:
-        it = iter(own)
+    def item(mapped_items: list) -> list[jax.Array]:
+        it = iter(mapped_items)
         return _call.bind(*(x if d is None else next(it) for x, d in zip(operands, dims, strict=True)), **params)
 
     results = jax.lax.map(item, mapped)
@@ -139,15 +139,15 @@ def _in_place(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequ
 
 
 def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
-    own = [shapes[i] for i in used]
+    wanted = [shapes[i] for i in used]
 
     def whole(*operands: Any) -> list[np.ndarray]:
-        arrays, results = function(*map(np.asarray, operands)), [np.empty(shape.shape, shape.dtype) for shape in own]
+        arrays, results = function(*map(np.asarray, operands)), [np.empty(shape.shape, shape.dtype) for shape in wanted]
         for i, result in zip(used, results, strict=True):
             _write(result, arrays[i])
         return results
 
-    return list(jax.pure_callback(whole, own, *operands))
+    return list(jax.pure_callback(whole, wanted, *operands))
 
 
 def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:

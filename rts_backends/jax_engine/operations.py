@@ -53,8 +53,8 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
     """
     if operation not in _bound:
         _bound[operation] = _Differentiable(operation, _name(operation), params)
-    own = () if not _Differentiable.told(operation) else (used,)
-    return _bound[operation](*operands, *own, **params)
+    used_rows = () if not _Differentiable.takes_used_rows(operation) else (used,)
+    return _bound[operation](*operands, *used_rows, **params)
 
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
@@ -120,9 +120,9 @@ class _Differentiable:
         self.operation, self.varied = operation, operation.differentiable
         self.rank = len(operation.result_shape(*((1,) * r for r in operation.ranks), **params))
         self._inputs = len(operation.ranks)
-        self._told = self.told(operation)
-        given = self._inputs + self._told
-        count = self.count = given + operation.keeps
+        self._takes_used_rows = self.takes_used_rows(operation)
+        inputs_of_value = self._inputs + self._takes_used_rows
+        count = self.count = inputs_of_value + operation.keeps
         varied, shape, inputs = self.varied, operation.result_shape, self._inputs
 
         def pulled(*shapes: tuple, wanted: Wanted, single: bool, **_: Any) -> list[tuple]:
@@ -137,16 +137,16 @@ class _Differentiable:
             return [shape(*shapes[:inputs], **params), *[()] * operation.keeps]
 
         noted = operation.keeps
-        ranks = *operation.ranks, *[0] * self._told
-        self._value = HostPrimitive(name, ranks, given, valued, self._host_value, self._plain, noted=noted)
+        ranks = *operation.ranks, *[0] * self._takes_used_rows
+        self._value = HostPrimitive(name, ranks, inputs_of_value, valued, self._host_value, self._plain, noted=noted)
         ranks = *ranks, *[0] * noted
         swept, backward = (*ranks, *(r + 1 for r in ranks[:varied])), (*ranks, self.rank + 1)
         self._push = HostPrimitive(
             f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, some=True
         )
-        own = tuple(i for i in operation.packed if i < varied)
+        in_place = tuple(i for i in operation.packed if i < varied)
         self._pull = HostPrimitive(
-            f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, in_place=own
+            f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, in_place=in_place
         )
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
@@ -155,33 +155,33 @@ class _Differentiable:
         ad.primitive_transposes[self._pull.primitive] = self._pull_transpose
 
     @staticmethod
-    def told(operation: Operation) -> bool:
+    def takes_used_rows(operation: Operation) -> bool:
         """True if the operation's primitives take the number of rows in use: rows are packed, and it has no `used`."""
         return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:
-        """The operation's result; `operands` include the number of rows in use if `told`."""
+        """The operation's result; `operands` include the number of rows in use if `takes_used_rows`."""
         return self._value(*operands, **params)[0]
 
     # ------------------------------------------------------------------------------------------ by compiled loops
 
-    def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
+    def _in_use(self, arrays: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
         """Operands, packed ones cut to rows in use; the number of these rows, or 0; what the value has kept, or None.
 
         The number is 0 if no operand is packed.
         """
-        operands = [read_only(x) for x in given[: self._inputs]]
+        operands = [read_only(x) for x in arrays[: self._inputs]]
         operation, used = self.operation, 0
         if operation.packed:
-            used = int(given[self._inputs]) if operation.used is None else operation.used(operands)
+            used = int(arrays[self._inputs]) if operation.used is None else operation.used(operands)
             for i in operation.packed:
                 operands[i] = operands[i][:used]
-        kept = _kept.get(int(given[self.count - 1])) if operation.keeps and len(given) >= self.count else None
+        kept = _kept.get(int(arrays[self.count - 1])) if operation.keeps and len(arrays) >= self.count else None
         return operands, used, kept
 
-    def _host_value(self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], **params: Any) -> None:
+    def _host_value(self, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray], **params: Any) -> None:
         """Fill `results`: the value, zeros in rows not in use; and a note, if the operation `keeps`, −1 for none."""
-        operands, used, _ = self._in_use(given)
+        operands, used, _ = self._in_use(arrays)
         out = results[0]
         if self.operation.packed_result:
             out = out[:used]
@@ -191,14 +191,14 @@ class _Differentiable:
             results[1][...] = -1 if kept is None else _kept.add(kept)
 
     def _host_push(
-        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, single: bool, **params: Any
+        self, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, single: bool, **params: Any
     ) -> None:
-        """Fill `results`: the value's tangents (T, ·), from those of operands marked `wanted`, last in `given`."""
+        """Fill `results`: the value's tangents (T, ·), from those of operands marked `wanted`, last in `arrays`."""
         if single:
-            given = [*given[: self.count], *(t[None] for t in given[self.count :])]
+            arrays = [*arrays[: self.count], *(t[None] for t in arrays[self.count :])]
             results = [x[None] for x in results]
-        operands, used, kept = self._in_use(given)
-        tangents: list[Any] = _spread(given[self.count :], wanted)
+        operands, used, kept = self._in_use(arrays)
+        tangents: list[Any] = _spread(arrays[self.count :], wanted)
         for i in self.operation.packed:
             if i < self.varied and tangents[i] is not None:
                 tangents[i] = tangents[i][:, :used]
@@ -210,30 +210,30 @@ class _Differentiable:
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
     def _host_pull(
-        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, single: bool, **params: Any
+        self, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, single: bool, **params: Any
     ) -> None:
         """Fill `results`, gradients (T, ·) of the operands that `wanted` marks; zeros in rows not in use.
 
-        The last of `given` are the value's gradients (T, ·). A result may share the memory of its operand.
+        The last of `arrays` are the value's gradients (T, ·). A result may share the memory of its operand.
         """
         if single:
-            given, results = [*given[:-1], given[-1][None]], [x[None] for x in results]
-        operands, used, kept = self._in_use(given)
+            arrays, results = [*arrays[:-1], arrays[-1][None]], [x[None] for x in results]
+        operands, used, kept = self._in_use(arrays)
         places = _spread(results, wanted)
-        for t, g in enumerate(given[-1]):
+        for t, g in enumerate(arrays[-1]):
             found: list[Any] = [None if x is None else x[t, ...] for x in places]
-            apart = {}
+            shared = {}
             for i, x in enumerate(found):
                 if x is None:
                     continue
-                if np.may_share_memory(x, given[i]):  # It is to take the place of what is still read.
-                    apart[i], found[i] = x, np.zeros((used, *x.shape[1:]), x.dtype)
+                if np.may_share_memory(x, arrays[i]):  # It is to take the place of what is still read.
+                    shared[i], found[i] = x, np.zeros((used, *x.shape[1:]), x.dtype)
                     continue
                 clear(x)
                 if i in self.operation.packed:
                     found[i] = x[:used]
             self.operation.pull_on_host(operands, g[:used] if self.operation.packed_result else g, found, kept, params)
-            for i, x in apart.items():
+            for i, x in shared.items():
                 x[:used] = found[i]
                 clear(x[used:])
 
@@ -244,21 +244,23 @@ class _Differentiable:
         return [self.operation.specification(*operands[: self._inputs], **params), *note]
 
     def _specified_push(self, *operands: jax.Array, wanted: Wanted, single: bool, **params: Any) -> list[jax.Array]:
-        function, given = self._among(wanted, operands[: self.count], params)
-        push = jax.linearize(function, *given)[1]
+        function, varied = self._among(wanted, operands[: self.count], params)
+        push = jax.linearize(function, *varied)[1]
         return [(push if single else jax.vmap(push))(*operands[self.count :])]
 
     def _specified_pull(self, *operands: jax.Array, wanted: Wanted, single: bool, **params: Any) -> list[jax.Array]:
-        function, given = self._among(wanted, operands[: self.count], params)
-        pull = jax.vjp(function, *given)[1]
+        function, varied = self._among(wanted, operands[: self.count], params)
+        pull = jax.vjp(function, *varied)[1]
         return list((pull if single else jax.vmap(pull))(operands[-1]))
 
     def _among(self, wanted: Wanted, operands: Sequence, params: dict) -> tuple[Callable, list[jax.Array]]:
         """The operation's array code as a function of the wanted operands alone, and the list of these operands."""
         n = self.varied
 
-        def function(*given: jax.Array) -> jax.Array:
-            varied = (x if g is None else g for x, g in zip(operands[:n], _spread(given, wanted), strict=True))
+        def function(*wanted_operands: jax.Array) -> jax.Array:
+            varied = (
+                x if g is None else g for x, g in zip(operands[:n], _spread(wanted_operands, wanted), strict=True)
+            )
             return self.operation.specification(*varied, *operands[n : self._inputs], **params)
 
         return function, [x for x, wish in zip(operands[:n], wanted, strict=True) if wish]
@@ -267,25 +269,25 @@ class _Differentiable:
 
     def _value_jvp(self, primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
         found = self._value(*primals, **params)
-        given, wanted = _present(tangents[: self.varied])
-        if not given:
+        nonzero, wanted = _present(tangents[: self.varied])
+        if not nonzero:
             return found, _zeros(found)
         if not any(isinstance(x, Tracer) for x in primals):
-            (pushed,) = self._push(*primals, *found[1:], *given, wanted=wanted, single=True, **params)
+            (pushed,) = self._push(*primals, *found[1:], *nonzero, wanted=wanted, single=True, **params)
             return found, [pushed, *_zeros(found[1:])]
         at = 1 if found[0].ndim > self.rank else 0
         # Tangents of operands by item have the axes B and T, in this order; tangents of others T alone.
         ranks = (r for r, wish in zip(self._value.ranks, wanted, strict=False) if wish)
-        swept = [jnp.expand_dims(t, t.ndim - rank) for t, rank in zip(given, ranks, strict=True)]
+        swept = [jnp.expand_dims(t, t.ndim - rank) for t, rank in zip(nonzero, ranks, strict=True)]
         (pushed,) = self._push(*primals, *found[1:], *swept, wanted=wanted, single=False, **params)
         return found, [jax.lax.squeeze(pushed, (at,)), *_zeros(found[1:])]
 
     def _push_jvp(self, primals: Sequence, tangents: Sequence, *, wanted: Wanted, **params: Any) -> tuple[list, list]:
         found = self._push(*primals, wanted=wanted, **params)
         along = self._along_operands(self._push, primals, tangents, {**params, "wanted": wanted})
-        given, moved = _present(tangents[self.count :], wanted)
-        if given:
-            linear = self._push(*primals[: self.count], *given, wanted=moved, **params)
+        nonzero, moved = _present(tangents[self.count :], wanted)
+        if nonzero:
+            linear = self._push(*primals[: self.count], *nonzero, wanted=moved, **params)
             along = linear if along is None else [a + b for a, b in zip(along, linear, strict=True)]
         return found, _zeros(found) if along is None else along
 
@@ -307,8 +309,8 @@ class _Differentiable:
             return None
         fixed = [x for x, m in zip(primals[:n], moved, strict=True) if not m]
 
-        def function(*given: jax.Array) -> list[jax.Array]:
-            it, rest = iter(given), iter(fixed)
+        def function(*moving: jax.Array) -> list[jax.Array]:
+            it, rest = iter(moving), iter(fixed)
             both = [next(it) if m else next(rest) for m in moved]
             return _whole(operation, tuple(params.items()))(*both, *primals[n:])
 
@@ -325,10 +327,10 @@ class _Differentiable:
 
     def _pull_transpose(self, tangents: Sequence, *operands: Any, wanted: Wanted, **params: Any) -> list:
         *samples, g = operands
-        given, moved = _present(tangents, wanted)
-        if not given:
+        nonzero, moved = _present(tangents, wanted)
+        if not nonzero:
             return [None] * self.count + [ad.Zero(g.aval)]
-        (found,) = self._push(*samples, *given, wanted=moved, **params)
+        (found,) = self._push(*samples, *nonzero, wanted=moved, **params)
         return [None] * self.count + [_summed(found, g.aval.ndim)]
 
 
@@ -338,9 +340,9 @@ def _whole(operation: HostPrimitive, params: tuple) -> Callable:
     return jax.jit(functools.partial(operation.specification, **dict(params)))
 
 
-def _spread(given: Sequence, wanted: Wanted) -> list:
-    """A list as long as `wanted`: the items of `given`, in order, where `wanted` is True, and None elsewhere."""
-    it = iter(given)
+def _spread(items: Sequence, wanted: Wanted) -> list:
+    """A list as long as `wanted`: the items of `items`, in order, where `wanted` is True, and None elsewhere."""
+    it = iter(items)
     return [next(it) if wish else None for wish in wanted]
 
 
@@ -358,8 +360,8 @@ def _present(tangents: Sequence, wanted: Wanted | None = None) -> tuple[list, Wa
     `tangents` are of all operands, or of those that `wanted` marks; jax's `ad.Zero`, or None, is one of zeros.
     """
     places = tangents if wanted is None else _spread(tangents, wanted)
-    given = tuple(t is not None and not _is_zero(t) for t in places)
-    return [t for t, g in zip(places, given, strict=True) if g], given
+    present = tuple(t is not None and not _is_zero(t) for t in places)
+    return [t for t, g in zip(places, present, strict=True) if g], present
 
 
 _bound: dict[Operation, _Differentiable] = {}

@@ -55,13 +55,13 @@ class Optimizer:
         Raises:
             InputError: the state is damaged, or of another transformation.
         """
-        own = [*map(np.asarray, jax.tree.leaves(self._state))]
+        expected = [*map(np.asarray, jax.tree.leaves(self._state))]
         try:
             with np.load(io.BytesIO(state), allow_pickle=False) as file:
-                known = [file[f"arr_{i}"] for i in range(len(file.files))]
+                arrays = [file[f"arr_{i}"] for i in range(len(file.files))]
         except Exception:  # Of which damaged archives raise many kinds.
-            known = []
-        same = [(x.shape, x.dtype) for x in known] == [(x.shape, x.dtype) for x in own]
-        if not same or not all((np.isfinite(x) | ~np.isfinite(y)).all() for x, y in zip(known, own, strict=True)):
+            arrays = []
+        same = [(x.shape, x.dtype) for x in arrays] == [(x.shape, x.dtype) for x in expected]
+        if not same or not all((np.isfinite(x) | ~np.isfinite(y)).all() for x, y in zip(arrays, expected, strict=True)):
             raise InputError("the state of its optimiser is damaged, or of another optimiser")
-        self._state = jax.tree.unflatten(jax.tree.structure(self._state), [*map(jax.numpy.asarray, known)])
+        self._state = jax.tree.unflatten(jax.tree.structure(self._state), [*map(jax.numpy.asarray, arrays)])

@@ -45,7 +45,7 @@ class HostPrimitive:
         ranks: tuple[int, ...],
         samples: int,
         shapes: Callable,
-        host: Callable,
+        on_host: Callable,
         specified: Callable,
         *,
         noted: bool = False,
@@ -53,7 +53,7 @@ class HostPrimitive:
         in_place: tuple[int, ...] = (),
     ):
         self.name, self.ranks, self.samples, self._noted = name, ranks, samples, noted
-        self._shapes, self._host, self._specified = shapes, host, specified
+        self._shapes, self._host, self._specified = shapes, on_host, specified
         self._some, self._in_place = some, in_place
         self.primitive = primitive = Primitive(f"rts_{name}")
         primitive.multiple_results = True
@@ -114,10 +114,10 @@ class HostPrimitive:
             if params["wanted"][i] and shapes[at].shape == (1, *ctx.avals_in[i].shape) and _read_once(operands[i]):
                 places[i] = at
         alike = set(places.values())
-        own = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
+        result_shapes = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
 
         def call(*arrays: jax.Array) -> list[jax.Array]:
-            results = host.filled(filler, own, *arrays, in_place=places)
+            results = host.filled(filler, result_shapes, *arrays, in_place=places)
             return [x[None] if i in alike else x for i, x in enumerate(results)]
 
         def filler(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
@@ -171,9 +171,9 @@ class HostPrimitive:
         lead = size, inner[0]
         for i, (x, m, rank) in enumerate(zip(operands, mapped, ranks, strict=True)):
             if m or x.ndim > rank:
-                own = x.shape[x.ndim - rank :]
+                item_shape = x.shape[x.ndim - rank :]
                 x = x[:, None] if m and x.ndim == rank + 1 else x
-                operands[i] = jnp.broadcast_to(x, (*lead, *own)).reshape(size * inner[0], *own)
+                operands[i] = jnp.broadcast_to(x, (*lead, *item_shape)).reshape(size * inner[0], *item_shape)
         results = self(*operands, **params)
         return [x.reshape(*lead, *x.shape[1:]) for x in results], [0] * len(results)
 

@@ -146,12 +146,12 @@ class _Pieces:
         def function(*varied: Any) -> jax.Array:
             it = iter(varied)
             values = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
-            own = []
+            filled = []
             for x, whole in zip(values[self.fixed :], self._rows, strict=True):
                 # Unused rows may hold values at which there are no derivatives.
                 other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
-                own.append(self.among(x, in_use, other))
-            return eval_jaxpr(self._jaxpr, [], *values[: self.fixed], *own)[0]
+                filled.append(self.among(x, in_use, other))
+            return eval_jaxpr(self._jaxpr, [], *values[: self.fixed], *filled)[0]
 
         return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
 
@@ -197,8 +197,8 @@ def _pulled(most: Any, used: Any, *arrays: Any, jaxpr: Jaxpr, fixed: int, wanted
     def step(start: Any, first: Any, totals: list[jax.Array]) -> list[jax.Array]:
         function, varied = pieces.varying(start, wanted)
         # The last piece may begin with rows of the one before.
-        own = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
-        gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(own)
+        gradient = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
+        gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(gradient)
         sums = [a + b for a, b in zip(totals[:same], gradients[:same], strict=True)]
         for whole, x in zip(totals[same:], gradients[same:], strict=True):
             sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
@@ -237,8 +237,8 @@ def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
 
         def whole(*varied: Any) -> list[jax.Array]:
             it = iter(varied)
-            _, *given = (next(it) if t else x for x, t in zip(primals, present, strict=True))
-            return function(None, *given, **params)
+            _, *operands = (next(it) if t else x for x, t in zip(primals, present, strict=True))
+            return function(None, *operands, **params)
 
         return primitive.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
 
@@ -274,8 +274,12 @@ def _value_jvp(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[li
     return results, _push.bind(*primals, *along, wanted=wanted, **params)
 
 
-def _push_transpose(gradients: Sequence, *given: Any, wanted: tuple[bool, ...], **params: Any) -> list:
-    (g,), operands, tangents = gradients, given[: 2 + len(wanted)], given[2 + len(wanted) :]
+def _push_transpose(gradients: Sequence, *operands_and_tangents: Any, wanted: tuple[bool, ...], **params: Any) -> list:
+    (g,), operands, tangents = (
+        gradients,
+        operands_and_tangents[: 2 + len(wanted)],
+        operands_and_tangents[2 + len(wanted) :],
+    )
     if type(g) is ad.Zero:
         return [None] * len(operands) + [ad.Zero(t.aval) for t in tangents]
     return [None] * len(operands) + _pull.bind(*operands, g, wanted=wanted, **params)

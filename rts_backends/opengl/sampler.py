@@ -24,7 +24,7 @@ from rts.plugin_api.threads import parallel
 from rts_backends.exact_hits import corner_lists, correct, places
 from rts_backends.opengl.worker import LESS, Worker
 from rts_backends.raster.sampler import Raster
-from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
+from rts_backends.triangles import bounding_sphere, pixel_matrix
 
 TARGETS = 4
 """The most image sizes for which framebuffers are kept."""
@@ -110,7 +110,7 @@ class OpenGL(TriangleSampler):
         if _beyond_float32(camera, prepared, size):
             self._warn()
             return Raster().rasterize(prepared.proxy, camera, size, layers, cull)
-        keep = facing(camera, cull)
+        keep = camera.kept_sign(cull)
         clip = _tight(camera.projection, camera.view, prepared) @ camera.view
         # Read from below, the image has its top row first.
         clip = np.diag([1.0, -1.0, 1.0, 1.0]) @ clip
@@ -271,7 +271,7 @@ def _peel(
 ) -> np.ndarray:
     """(K, H, W) triangle ids, −1 for none, of vertices as hardware rounds them; `exact_hits` corrects them later.
 
-    `clip` (4, 4) leads from the unit sphere to clip space; `keep` is the sign of `facing`, 0 for both orientations.
+    `clip` (4, 4) leads from the unit sphere to clip space; `keep` is that of `Camera.kept_sign`.
     """
     parts, array = _programs(context), _upload(context, prepared)
     program, query = parts["peel"], parts["query"]

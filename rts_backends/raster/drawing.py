@@ -25,22 +25,22 @@ corners; the corners' w + z of clip space; and their w − z."""
 
 
 @loop
-def draw(first, last, listed, vertices, matrix, view_depth, size, fragments):
+def draw(first, last, triangles, vertices, matrix, view_depth, size, fragments):
     """Fill the fragment arrays, ids and depths (K, H · W) and barycentrics (K, H · W, 2), in bands `turns[first:last]`.
 
-    `listed` holds the fields of the sampler's `_List`; `size` is (H, W).
+    `triangles` holds the fields of a `TriangleList` of `selection`; `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
     layers, (height, width) = len(triangle_ids), size
     nearest = np.empty((layers, BAND_ROWS * width))
-    keep, turns, offsets, items, rows = listed
-    given = rows, vertices, matrix, view_depth, keep
+    keep, turns, offsets, items, rows = triangles
+    geometry = rows, vertices, matrix, view_depth, keep
     for band in turns[first:last]:
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         start, stop = top * width, end * width
         nearest[:], triangle_ids[:, start:stop], barycentrics[:, start:stop] = np.inf, -1, 0
         here, layered = items[offsets[band] : offsets[band + 1]], (start, nearest, triangle_ids, barycentrics)
-        _draw(here, given, top, end, width, layered)
+        _draw(here, geometry, top, end, width, layered)
         for k in range(layers):
             _depths(depths[k, start:stop], nearest[k])
 
@@ -53,20 +53,20 @@ def _depths(depths, nearest):
 
 
 @compiled
-def _draw(items, given, top, end, width, layered):
+def _draw(items, geometry, top, end, width, layered):
     """Insert the triangles of a band, rows [top, end), `width` wide, into layers of cells.
 
     Args:
         items: indices of the triangles in `rows`.
-        given: `_List.rows`, vertices (V, 3), the matrix (4, 4) to homogeneous pixels, coefficients (4,) of depth, and
-            `_List.keep`.
+        geometry: `TriangleList.rows`, vertices (V, 3), the matrix (4, 4) to homogeneous pixels, coefficients (4,) of
+            depth, and `TriangleList.keep`.
         top: first row.
         end: end of the rows.
         width: columns of the image.
         layered: the index of the band's first cell among M; `nearest`, depths (K, ·); ids (K, M); and barycentrics (K,
             M, 2). They hold the layers found so far, or empty ones.
     """
-    rows, vertices, matrix, view_depth, keep = given
+    rows, vertices, matrix, view_depth, keep = geometry
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), vertices.dtype)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most = 4 * BLOCK
@@ -240,13 +240,13 @@ def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
     The hit has depth z, triangle t and barycentrics p, q. `place` is the cell's index in `nearest`, `cell` in the
     others.
     """
-    moved, own = z, t
+    moved, triangle = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, place], triangle_ids[k, cell]
         old_p, old_q = barycentrics[k, cell, 0], barycentrics[k, cell, 1]
         before = z < old  # A branch would be mispredicted every other time.
         if z == old:  # In clusters triangles are not in the order of their indices.
-            before = own < old_t
+            before = triangle < old_t
         nearest[k, place], triangle_ids[k, cell] = moved if before else old, t if before else old_t
         barycentrics[k, cell, 0], barycentrics[k, cell, 1] = p if before else old_p, q if before else old_q
         moved, t = old if before else moved, old_t if before else t

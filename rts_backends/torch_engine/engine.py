@@ -18,6 +18,7 @@ from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import array_api, operations, torch_internals
 from rts_backends.torch_engine.functions import foreign, quiet_forward_mode, tangent_alike, transformed
+from rts_backends.torch_engine.host_call import call_host, to_host, to_tensor
 
 for _cls, _split, _join in Engine.records():
     _pytree.register_pytree_node(_cls, _split, _join, serialized_type_name=f"rts.{_cls.__name__}")
@@ -29,61 +30,6 @@ _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, tor
 
 _running = threading.local()
 """`_running.checkpoint` is True on a thread that runs what `TorchEngine.checkpoint` may run again."""
-
-
-def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
-    array = np.asarray(value)
-    if not (array.flags.c_contiguous and array.flags.writeable):
-        array = array.copy("C")  # torch warns of read-only memory, since it cannot mark a tensor so.
-    tensor = torch.from_numpy(array)
-    return tensor if device is None or device.type == "cpu" else tensor.to(device)
-
-
-def _to_host(x: torch.Tensor) -> np.ndarray:
-    """The detached value as NumPy, without a copy where it is on the host; both half precisions as float32."""
-    x = x.detach().cpu()
-    return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
-
-
-class _HostCall(torch.autograd.Function):
-    """A call of a host function, without derivative, that works under every torch transform."""
-
-    @staticmethod
-    def forward(fn, specs, *args):
-        device, values = None, []
-        for a in args:
-            tensor = isinstance(a, torch.Tensor)
-            device = a.device if tensor and device is None else device
-            values.append(_to_host(a) if tensor else a)
-        return tuple([_tensor(r, device) for r in fn(*values)])
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.mark_non_differentiable(*output)
-        ctx.counts = len(inputs), len(output)
-
-    @staticmethod
-    def backward(ctx, *_):
-        return (None,) * ctx.counts[0]
-
-    @staticmethod
-    def jvp(ctx, *_):
-        return (None,) * ctx.counts[1]
-
-    # torch's own signature has no named arguments, though its manual has.
-    @staticmethod
-    def vmap(info, in_dims, fn, specs, *args):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
-        def select(b):
-            return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
-
-        items = [_HostCall.apply(fn, specs, *select(b)) for b in range(info.batch_size)]
-        outputs = []
-        for spec, values in zip(specs, zip(*items, strict=True), strict=True):
-            if spec.packed:
-                rows = max(v.shape[0] for v in values)
-                values = [torch.cat([v, v.new_zeros((rows - v.shape[0], *v.shape[1:]))]) for v in values]
-            outputs.append(torch.stack(tuple(values)))
-        return tuple(outputs), (0,) * len(outputs)
 
 
 class TorchEngine(Engine):
@@ -104,20 +50,14 @@ class TorchEngine(Engine):
             # Too large numbers become infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
                 array = array.astype(dtype)
-        return _tensor(array, None if like is None else like.device)
+        return to_tensor(array, None if like is None else like.device)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`, without derivative.
 
         Under `torch.vmap` it is called once for each item, and packed results are padded with zeros to the longest.
         """
-        if torch.compiler.is_compiling():
-            # torch annotates nothing of what `disable` returns.
-            return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
-        if transformed() or foreign(*(a for a in args if isinstance(a, torch.Tensor))):
-            return _HostCall.apply(fn, specs, *args)
-        with torch.no_grad():
-            return _HostCall.forward(fn, specs, *args)
+        return call_host(fn, specs, *args)
 
     def uncompiled(self, f: Callable) -> Callable:
         """`f` itself; while `torch.compile` traces, a function that calls `f` without tracing it."""
@@ -171,8 +111,8 @@ class TorchEngine(Engine):
         if torch.compiler.is_compiling() or foreign(x):
             return None
         if torch_internals.current_level() is None:
-            return _to_host(x)
-        return torch_internals.value_within(x, _to_host)
+            return to_host(x)
+        return torch_internals.value_within(x, to_host)
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under a `torch.func` transform: under `torch.vmap` all items have as many rows as the longest."""
@@ -186,14 +126,14 @@ class TorchEngine(Engine):
 
     def segment_sum(self, values: torch.Tensor, segments: torch.Tensor | np.ndarray, count: int) -> torch.Tensor:
         """(count, n) sums of the rows of `values` (N, n) that have the same number in `segments` (N,)."""
-        index = segments if isinstance(segments, torch.Tensor) else _tensor(segments, values.device)
+        index = segments if isinstance(segments, torch.Tensor) else to_tensor(segments, values.device)
         return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(
             0, index, values
         )
 
     def to_numpy(self, x: torch.Tensor) -> np.ndarray:
         """The value on the host."""
-        return _to_host(x)
+        return to_host(x)
 
     def repeat(
         self,
@@ -303,7 +243,7 @@ class TorchEngine(Engine):
 
         return call
 
-    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, given: Tree = None) -> Any:
+    def optimizer(self, method: Any, learning_rate: Any, parameters: Tree, original: Tree = None) -> Any:
         """See `Engine.optimizer`: torch's `Adam` or `SGD`, or a `torch.optim.Optimizer`, on copies of parameters."""
         from rts_backends.torch_engine.optimizer import Optimizer
 
@@ -312,4 +252,4 @@ class TorchEngine(Engine):
                 f"method is {quoted(method)}; expected one of adam, sgd, lm, or a torch.optim.Optimizer, such as "
                 f"torch.optim.Adam([parameters], lr=0.01), for torch tensors"
             )
-        return Optimizer(method, learning_rate, parameters, parameters if given is None else given)
+        return Optimizer(method, learning_rate, parameters, parameters if original is None else original)

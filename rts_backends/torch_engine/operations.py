@@ -75,9 +75,9 @@ class _Call:
         """A call of this operation with these parameters, at other operands."""
         return _Call(self.operation, self.params)
 
-    def split(self, given: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
-        """The differentiable operands at the head of `given`, and the rest."""
-        return given[: self.count], given[self.count :]
+    def split(self, operands: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+        """The differentiable operands at the head of `operands`, and the rest."""
+        return operands[: self.count], operands[self.count :]
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
         """The operation's array code as a function of the differentiable operands; `fixed` are the others."""
@@ -99,8 +99,8 @@ class _Call:
         It returns a gradient for each differentiable operand, empty if not wanted.
         """
 
-        def pull(*given: Tensor) -> tuple[Tensor, ...]:
-            found = torch.func.vjp(self.specification(*fixed), *given[:-1])[1](given[-1])
+        def pull(*varied_and_gradient: Tensor) -> tuple[Tensor, ...]:
+            found = torch.func.vjp(self.specification(*fixed), *varied_and_gradient[:-1])[1](varied_and_gradient[-1])
             return tuple(x if wish else x.new_empty(0) for x, wish in zip(found, wanted, strict=True))
 
         return pull
@@ -111,8 +111,8 @@ class _Call:
         It returns the result's tangents (T, ·).
         """
 
-        def push(*given: Tensor) -> Tensor:
-            varied, tangents = self.split(given)
+        def push(*varied_and_tangents: Tensor) -> Tensor:
+            varied, tangents = self.split(varied_and_tangents)
 
             def one(*moves: Tensor) -> Tensor:
                 return along(self.specification(*fixed), varied, _spread(moves, present))
@@ -122,9 +122,9 @@ class _Call:
         return push
 
 
-def _spread(given: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
-    """A list as long as `present`: the items of `given`, in order, where `present` is True, and None elsewhere."""
-    it = iter(given)
+def _spread(items: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
+    """A list as long as `present`: the items of `items`, in order, where `present` is True, and None elsewhere."""
+    it = iter(items)
     return [next(it) if there else None for there in present]
 
 
@@ -169,9 +169,9 @@ class _Value(torch.autograd.Function):
         return None, *found, *[None] * (len(operands) - call.count)
 
     @staticmethod
-    def jvp(ctx, *given):
+    def jvp(ctx, *input_tangents):
         call, operands = ctx.call, ctx.saved_tensors
-        tangents = given[1 : 1 + call.count]
+        tangents = input_tangents[1 : 1 + call.count]
         present = tuple(t is not None for t in tangents)
         if not any(present):
             return None
@@ -192,8 +192,8 @@ class _Pull(torch.autograd.Function):
     """Gradients of the differentiable operands, from the result's gradient; empty where not wanted."""
 
     @staticmethod
-    def forward(call, wanted, *given):
-        *operands, g = _host(given)
+    def forward(call, wanted, *arrays):
+        *operands, g = _host(arrays)
         found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
         results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
@@ -201,9 +201,9 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.call, ctx.wanted, *given = inputs
-        ctx.save_for_backward(*given)
-        ctx.save_for_forward(*given)
+        ctx.call, ctx.wanted, *arrays = inputs
+        ctx.save_for_backward(*arrays)
+        ctx.save_for_forward(*arrays)
 
     @staticmethod
     def _differentiable(ctx):
@@ -219,16 +219,16 @@ class _Pull(torch.autograd.Function):
         return None, None, *found, *[None] * fixed, g
 
     @staticmethod
-    def jvp(ctx, *given):
+    def jvp(ctx, *tangents):
         pull, primals, _ = _Pull._differentiable(ctx)
-        return along(pull, primals, (*given[2 : 2 + ctx.call.count], given[-1]))
+        return along(pull, primals, (*tangents[2 : 2 + ctx.call.count], tangents[-1]))
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, wanted, *given):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
+    def vmap(info, in_dims, call, wanted, *arrays):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         same = all(d is None for d in in_dims[2:-1])
         items = [
-            _Pull.apply(call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], given)
+            _Pull.apply(call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], arrays)
         ]
         return tuple(torch.stack(x) for x in zip(*items, strict=True)), (0,) * len(wanted)
 
@@ -237,9 +237,9 @@ class _Push(torch.autograd.Function):
     """Tangents (T, ·) of the result along the present tangents of the differentiable operands."""
 
     @staticmethod
-    def forward(call, present, *given):
+    def forward(call, present, *arrays):
         count = sum(present)
-        operands, tangents = _host(given[:-count]), _host(given[-count:])
+        operands, tangents = _host(arrays[:-count]), _host(arrays[-count:])
         shape = call.operation.result_shape(*(x.shape for x in operands), **call.params)
         out = np.empty((len(tangents[0]), *shape), operands[0].dtype)
         call.operation.push_on_host(operands, _spread(tangents, present), out, call.kept, call.params)
@@ -247,16 +247,16 @@ class _Push(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.call, ctx.present, *given = inputs
-        ctx.save_for_backward(*given)
-        ctx.save_for_forward(*given)
+        ctx.call, ctx.present, *arrays = inputs
+        ctx.save_for_backward(*arrays)
+        ctx.save_for_forward(*arrays)
 
     @staticmethod
     def _differentiable(ctx):
         """The pushforward by array code, its arguments that have derivatives, and the number of the other operands."""
-        given, count = ctx.saved_tensors, sum(ctx.present)
-        varied, fixed = ctx.call.split(given[:-count])
-        return ctx.call.pushed(ctx.present, fixed), (*varied, *given[-count:]), len(fixed)
+        arrays, count = ctx.saved_tensors, sum(ctx.present)
+        varied, fixed = ctx.call.split(arrays[:-count])
+        return ctx.call.pushed(ctx.present, fixed), (*varied, *arrays[-count:]), len(fixed)
 
     @staticmethod
     def backward(ctx, *gradients):
@@ -265,23 +265,23 @@ class _Push(torch.autograd.Function):
         return None, None, *found[:n], *[None] * fixed, *found[n:]
 
     @staticmethod
-    def jvp(ctx, *given):
+    def jvp(ctx, *tangents):
         push, primals, _ = _Push._differentiable(ctx)
-        return along(push, primals, (*given[2 : 2 + ctx.call.count], *given[-sum(ctx.present) :]))
+        return along(push, primals, (*tangents[2 : 2 + ctx.call.count], *tangents[-sum(ctx.present) :]))
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, present, *given):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
+    def vmap(info, in_dims, call, present, *arrays):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         count, dims = sum(present), in_dims[2:]
         if any(d is not None for d in dims[:-count]):
-            items = _items(info, dims, given)
+            items = _items(info, dims, arrays)
             return torch.stack([_Push.apply(call.another(), present, *item) for item in items]), 0
         # The batch is more tangents of the same operands: one sweep for all.
         folded = (
             (t.expand(info.batch_size, *t.shape) if d is None else t.movedim(d, 0)).flatten(0, 1)
-            for t, d in zip(given[-count:], dims[-count:], strict=True)
+            for t, d in zip(arrays[-count:], dims[-count:], strict=True)
         )
-        out = _Push.apply(call, present, *given[:-count], *folded)
+        out = _Push.apply(call, present, *arrays[:-count], *folded)
         return out.unflatten(0, (info.batch_size, -1)), 0
 
 

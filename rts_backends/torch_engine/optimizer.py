@@ -33,7 +33,7 @@ class Optimizer:
     """
 
     def __init__(
-        self, method: str | torch.optim.Optimizer, rates: float | Sequence[float], parameters: Tree, given: Tree
+        self, method: str | torch.optim.Optimizer, rates: float | Sequence[float], parameters: Tree, original: Tree
     ):
         self._variables = [p.detach().clone() for p in leaves(parameters)]
         if isinstance(method, str):
@@ -42,27 +42,27 @@ class Optimizer:
             groups = [{"params": [v], "lr": rate} for v, rate in zip(self._variables, each, strict=True)]
             self._optimizer = kind(groups, lr=each[0])
         else:
-            self._optimizer = self._copied(method, list(leaves(given)))
+            self._optimizer = self._copied(method, list(leaves(original)))
         self._like = parameters
 
-    def _copied(self, method: torch.optim.Optimizer, given: Sequence[torch.Tensor]) -> torch.optim.Optimizer:
+    def _copied(self, method: torch.optim.Optimizer, tensors: Sequence[torch.Tensor]) -> torch.optim.Optimizer:
         """A copy of an optimiser, its state included, that steps the private tensors."""
         if isinstance(method, torch.optim.LBFGS):
             raise InputError('method is LBFGS, which evaluates the loss by itself; use Adam, or method="lm"')
-        places = {id(x): i for i, x in enumerate(given)}
+        places = {id(x): i for i, x in enumerate(tensors)}
         held = [p for group in method.param_groups for p in group["params"]]
         if not held or any(id(p) not in places for p in held):
             raise InputError(
                 "method is an optimiser of other tensors than those in parameters; make it of the same tensors, such "
                 'as torch.optim.Adam([parameters["vertices"]], lr=0.01)'
             )
-        own = copy.deepcopy(method)
-        copies = [p for group in own.param_groups for p in group["params"]]
+        optimizer = copy.deepcopy(method)
+        copies = [p for group in optimizer.param_groups for p in group["params"]]
         for new, old in zip(copies, held, strict=True):
             place = places[id(old)]
             new.requires_grad_(False).copy_(self._variables[place])
             self._variables[place] = new
-        return own
+        return optimizer
 
     def __call__(self, _: Tree, gradient: Tree) -> Tree:
         """The parameters after a step from those returned last; the first argument is not read."""
@@ -102,8 +102,8 @@ class Optimizer:
                 p.grad = torch.zeros_like(p)
         with torch.no_grad():
             stepped.step()
-        own = stepped.state_dict()
-        left, groups = own["state"], own["param_groups"]
+        state = stepped.state_dict()
+        left, groups = state["state"], state["param_groups"]
         return (
             len(known["param_groups"]) == len(groups)
             and all(map(_is_group_like, known["param_groups"], groups))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rts import Camera, Part, fit, plugin, render, rigid
-from rts.diagnostics.command_tools import engine_named
+from rts.diagnostics.measuring_api import engine_named
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
 from rts.plugin_api.arrays import Array

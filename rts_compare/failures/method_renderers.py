@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rts import Engine, engine_of, render
-from rts.diagnostics.command_tools import engine_named
+from rts.diagnostics.measuring_api import engine_named
 from rts.errors import RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.derivative_scores import loss_weights

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.diagnostics.command_tools import output_folder, writing
+from rts.diagnostics.measuring_api import output_folder, writing
 from rts.diagnostics.progress import phases
 from rts.errors import InputError
 from rts.plugin_api.checks import is_count, quoted

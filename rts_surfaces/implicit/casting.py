@@ -6,12 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from rts import engine_of, namespace
 from rts.plugin_api.arrays import Array, map_leaves
 from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import RayHits
+from rts_surfaces.implicit.regions import Region
 
 STEPS, WITH_BOUND = 256, 512
 """The number of shortest steps across the region, without and with a Lipschitz constant."""
@@ -24,69 +23,6 @@ CROWDED = 0.75
 
 FLATTEST = 1e-6
 """Least squared slope by which a level is divided to move points, as a share of the usual one; this bounds motion."""
-
-
-MARCH, FIRST, GROWTH = 10, 1 / 12, 2.0
-"""Steps along a ray that seek its deepest point; the first, as a share of the reach; and their growth."""
-
-REACH = 3.0
-"""The reach in pixels at triangles' samples: farther outlines are of no interest; see `rts.RaySurface.deepest`."""
-
-HALVINGS = 14
-"""Halvings of the bracket of a deepest point."""
-
-APART = 1 / 1500
-"""Distance of the two samples from their deepest point, as a share of the reach: beyond rounding, lest both lie on one
-side of a kink."""
-
-
-class Region(NamedTuple):
-    """The region in which rays are followed: a `ball` or a `box`.
-
-    Attributes:
-        span: origins and directions (R, 3) → distances (R,) at which rays enter, 0 if they begin within, and (R,) at
-            which they leave, in units of their directions; both are 0 for rays that miss the region.
-        across: the length of the longest ray within the region.
-    """
-
-    span: Callable[[Array, Array], tuple[Array, Array]]
-    across: float
-
-
-def ball(center: np.ndarray, radius: float) -> Region:
-    """A ball; `center` is (3,)."""
-
-    def span(origins: Array, directions: Array) -> tuple[Array, Array]:
-        engine = engine_of(origins)
-        xp, off = engine.namespace, origins - engine.constant(center, origins)
-        square = xp.sum(directions * directions, axis=-1)
-        nearest = -xp.sum(off * directions, axis=-1) / square
-        off = off + nearest[:, None] * directions
-        left = radius * radius - xp.sum(off * off, axis=-1)
-        half = xp.sqrt(xp.where(left > 0, left, 0.0) / square)
-        return _ahead(nearest - half, nearest + half)
-
-    return Region(span, 2 * radius)
-
-
-def box(low: np.ndarray, high: np.ndarray) -> Region:
-    """A box along the axes, from its lower corner (3,) to the opposite one."""
-
-    def span(origins: Array, directions: Array) -> tuple[Array, Array]:
-        engine = engine_of(origins)
-        xp, along = engine.namespace, directions == 0
-        ends = [
-            (engine.constant(corner, origins) - origins) / xp.where(along, 1.0, directions) for corner in (low, high)
-        ]
-        # Rays along a plane are between it and the opposite one for ever, or never.
-        between = (ends[0] <= 0) & (ends[1] >= 0)
-        far = xp.full_like(directions, xp.inf)
-        never = xp.where(between, -far, far)
-        first = xp.where(along, never, xp.minimum(*ends))
-        last = xp.where(along, -never, xp.maximum(*ends))
-        return _ahead(xp.max(first, axis=-1), xp.min(last, axis=-1))
-
-    return Region(span, float(np.linalg.norm(high - low)))
 
 
 def moving(level: Callable[[Array], Array], points: Array, hit: Array) -> Array:
@@ -161,101 +97,10 @@ def cast(
         xp.zeros_like(length) if lipschitz is None else 1 / (lipschitz * length),
     )
     most = steps + 1  # The shortest steps need no more to cross the region.
-    free = partial(_without_derivative, level)
+    free = partial(without_derivative, level)
     if engine.padded(origins):
         return _cast_all(level, free, describe, rays, enter, layers, most)
     return _cast_some(level, free, describe, rays, enter, layers, most)
-
-
-def deepest(
-    level: Callable[[Array], Array],
-    free: Callable[[Array], Array],
-    points: Array,
-    directions: Array,
-    reach: Array,
-) -> tuple[Array, Array]:
-    """Pairs of samples beside the deepest points of rays; see `rts.RaySurface.deepest`.
-
-    Let s₋ ≤ 0 and s₊ ≥ 0 be the slopes of the level f along the ray just before and just behind the deepest point, and
-    λ = s₊ / (s₊ − s₋). Then G = λ ∇f₋ + (1 − λ) ∇f₊ is perpendicular to the ray, and the outline moves by
-    −(λ ∂f₋/∂θ + (1 − λ) ∂f₊/∂θ) G / |G|² (envelope theorem). The mean of a pair's motions is to be this: they
-    are 2 λ G / |G|² and 2 (1 − λ) G / |G|² for each unit by which the level falls.
-    Near an outline its distance from the ray is −f / |G|.
-
-    Args:
-        level: points (M, 3) → (M,), negative inside.
-        free: points (M, 3) → marks (M,) bool of points whose level follows θ; others have no motion.
-        points: (R, 3), points of the surface at which rays enter.
-        directions: (R, 3).
-        reach: (R,), the farthest distance of outlines.
-
-    Returns:
-        Parameters (R, 2, 7): points, motions for each unit of level, and levels; and marks (R,) bool of rays with a
-        pair.
-    """
-    engine = engine_of(points)
-    xp = engine.namespace
-    along = directions / xp.sqrt(xp.sum(directions * directions, axis=-1, keepdims=True))
-    value_at = partial(_without_derivative, level)
-
-    def at(t: Array) -> Array:
-        return points + t[:, None] * along
-
-    def slope_at(t: Array) -> Array:
-        return engine.stop_gradient(gradient(level, at(t)))
-
-    def march(state: dict[str, Array]) -> dict[str, Array]:
-        t, low, high = state["t"], state["low"], state["high"]
-        further = t + state["step"]
-        value = value_at(at(further))
-        passed = (value > state["value"]) & (high == 0)
-        return {
-            "low": xp.where(passed, state["before"], low),
-            "high": xp.where(passed, further, high),
-            "before": t,
-            "t": further,
-            "step": GROWTH * state["step"],
-            "value": value,
-        }
-
-    def halve(state: dict[str, Array]) -> dict[str, Array]:
-        middle = (state["low"] + state["high"]) / 2
-        falls = xp.sum(slope_at(middle) * along, axis=-1) < 0
-        return {"low": xp.where(falls, middle, state["low"]), "high": xp.where(falls, state["high"], middle)}
-
-    zero, first = xp.zeros_like(reach), FIRST * reach
-    # The root of a bracket with a kink may lie behind the deepest point, where the field rises: then before it, too.
-    begin = xp.where(xp.sum(slope_at(zero) * along, axis=-1) > 0, -first, zero)
-    state = {"low": zero, "high": zero, "before": begin, "t": zero, "step": first, "value": value_at(points)}
-    state = engine.repeat(march, lambda state: xp.any(state["high"] == 0), state, MARCH)
-    passed = state["high"] > 0
-    state = {"low": state["low"], "high": state["high"]}
-    state = engine.repeat(halve, lambda state: xp.any(state["high"] > state["low"]), state, HALVINGS)
-    apart = APART * reach + 4 * xp.finfo(points.dtype).eps * xp.max(xp.abs(points), axis=-1)
-    sides = xp.maximum(state["low"] - apart, begin), state["high"] + apart
-    slopes, levels = [slope_at(t) for t in sides], [value_at(at(t)) for t in sides]
-    # Squares of small slopes are no numbers of single precision.
-    largest = xp.max(xp.abs(xp.concat(slopes, axis=-1)), axis=-1)
-    largest = xp.where((largest > 0) & xp.isfinite(largest), largest, 1.0)
-    slopes = [s / largest[:, None] for s in slopes]
-    falls, rises = (xp.sum(s * along, axis=-1) for s in slopes)
-    falls, rises = xp.clip(-falls, 0.0, None), xp.clip(rises, 0.0, None)
-    bend = falls + rises
-    share = xp.where(bend > 0, rises / xp.where(bend > 0, bend, 1.0), 0.5)
-    across = share[:, None] * slopes[0] + (1 - share)[:, None] * slopes[1]
-    across = across - xp.sum(across * along, axis=-1, keepdims=True) * along
-    square = xp.sum(across * across, axis=-1)
-    far = -(levels[0] + levels[1]) / 2 / largest
-    near = passed & (square > 0) & (far * far < reach * reach * square)
-    move = across / (xp.where(near, square, 1.0) * largest)[:, None]
-    pair = []
-    for t, part, value in zip(sides, (2 * share, 2 - 2 * share), levels, strict=True):
-        place = at(t)
-        part = xp.where(near & free(place), part, 0.0)
-        pair.append(xp.concat([place, part[:, None] * move, value[:, None]], axis=-1))
-    params = xp.stack(pair, axis=1)
-    near = near & xp.all(xp.isfinite(params), axis=(1, 2))
-    return engine.stop_gradient(xp.where(near[:, None, None], params, 0.0)), near
 
 
 class _Rays(NamedTuple):
@@ -401,13 +246,6 @@ def _change_sign(before: Array, after: Array) -> Array:
     return ((before < 0) & (after >= 0)) | ((before >= 0) & (after < 0))
 
 
-def _without_derivative(level: Callable[[Array], Array], points: Array) -> Array:
+def without_derivative(level: Callable[[Array], Array], points: Array) -> Array:
+    """The level at points, as a constant."""
     return engine_of(points).stop_gradient(level(points))
-
-
-def _ahead(enter: Array, leave: Array) -> tuple[Array, Array]:
-    """The part of a span ahead of the origin of a ray; 0 and 0 if it is empty."""
-    xp = engine_of(enter).namespace
-    enter = xp.clip(enter, 0, None)
-    met = leave > enter
-    return xp.where(met, enter, 0.0), xp.where(met, leave, 0.0)

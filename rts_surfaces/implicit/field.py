@@ -62,7 +62,7 @@ class ScalarField(abc.ABC):
         """The gradient (M, 3) of `level` at points (M, 3), towards the outside."""
 
     @abc.abstractmethod
-    def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
+    def in_theta_dtype(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The points in the dtype of the entries of θ that are read, float32 at least."""
 
 
@@ -141,7 +141,7 @@ class Field(ScalarField):
         """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `gradient`."""
         return gradient(partial(self.level, theta), points)
 
-    def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
+    def in_theta_dtype(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The points in the widest floating dtype among the entries that `f` reads, float32 at least.
 
         Unchanged if `f` reads no floating entry.
@@ -193,7 +193,7 @@ class Implicit(Surface):
             theta: θ.
             samples: samples with the parameters (N, 7) of `rts_surfaces.implicit.casting.moving`: x₀, w and f₀.
         """
-        params = self.field.suited(theta, samples.params)
+        params = self.field.in_theta_dtype(theta, samples.params)
         xp = namespace(params)
         # Rows that only pad would lie at the origin, where many functions have no derivative: they copy the first row.
         used = xp.any(params != 0, axis=1, keepdims=True)
@@ -211,11 +211,11 @@ class Implicit(Surface):
 
         All are differentiable in θ and in the positions. A normal is zero where the field has no slope.
         """
-        gbuffer = GBuffer(position=position)
-        gbuffer.defer("normal", lambda: self.normal(theta, position))
+        entries = GBuffer(position=position)
+        entries.defer("normal", lambda: self.normal(theta, position))
         for name, g in self.attributes.items():
-            gbuffer.defer(name, partial(_attribute, name, g, theta, position))
-        return gbuffer
+            entries.defer(name, partial(_attribute, name, g, theta, position))
+        return entries
 
 
 def check_isovalue(isovalue: Any) -> float:
@@ -267,10 +267,10 @@ def check_result(name: str, value: Any, points: Array, columns: bool = False) ->
     engine, count = engine_of(points), points.shape[0]
     expected = f"({count}, C)" if columns else f"({count},)"
     try:
-        own = hasattr(value, "dtype") and engine_of(value) is engine
+        owned = hasattr(value, "dtype") and engine_of(value) is engine
     except EngineError:
-        own = False
-    if not own:
+        owned = False
+    if not owned:
         what = "None" if value is None else f"a {type(value).__name__}"
         raise InputError(f"{name} gave {what} for points of {engine.name}; expected its array {expected}")
     shape = shape_of(value)

@@ -89,7 +89,7 @@ class FunctionOnLattice(Field):
     def at(self, theta: Mapping[str, Tree], numbers: Array) -> Array:
         """The level (M,) at lattice points by number (M,) int32."""
         places = self._lattice.places(numbers, namespace(numbers).float32)
-        return self.level(theta, self.suited(theta, places))
+        return self.level(theta, self.in_theta_dtype(theta, places))
 
     def look(self, theta: Mapping[str, Tree], closed: bool, inner: bool) -> Looked:
         """The level at all lattice points, or at the band's; without derivative. For `inner` see `NarrowBand.find`."""
@@ -112,7 +112,7 @@ class FunctionOnLattice(Field):
             count = len(places)
             if few_shapes:  # Lest each be compiled.
                 places = np.resize(places, (1 << max(0, count - 1).bit_length(), 3))
-            points = self.suited(theta, engine.constant(places.astype(np.float32), like))
+            points = self.in_theta_dtype(theta, engine.constant(places.astype(np.float32), like))
             return np.asarray(engine.known(engine.stop_gradient(self.level(theta, points))))[:count]
 
         band = self.band.find(level, self._lattice, closed, inner)
@@ -125,7 +125,7 @@ class FunctionOnLattice(Field):
         axes = [float(low[0]) + float(step[0]) * xp.astype(planes, xp.float32)]
         axes += [engine.constant((low[i] + step[i] * np.arange(shape[i])).astype(np.float32), axes[0]) for i in (1, 2)]
         places = xp.stack(xp.meshgrid(*axes, indexing="ij"), axis=-1)
-        levels = self.level(theta, self.suited(theta, xp.reshape(places, (-1, 3))))
+        levels = self.level(theta, self.in_theta_dtype(theta, xp.reshape(places, (-1, 3))))
         return xp.reshape(levels, (-1, *shape[1:]))
 
     # ------------------------------------------------------------------------------------------------ samples

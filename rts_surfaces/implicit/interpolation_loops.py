@@ -123,14 +123,14 @@ def _share_slopes(i, near, slopes, out):
 def _push_points(start, stop, values, points, tangents, low, step, out):
     """Add to `out` (N, 3) the derivatives of the differences along tangents (N, 3) of points; NaN as in `forward`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
-    own = np.empty(3)
+    share_slope = np.empty(3)
     for n in range(start, stop):
         if not _place(points[n], values.shape, low, step, lowest, near, slopes):
             out[n] = np.nan
             continue
         for i in range(8):
-            _share_slopes(i, near, slopes, own)
-            change = own[0] * tangents[n, 0] + own[1] * tangents[n, 1] + own[2] * tangents[n, 2]
+            _share_slopes(i, near, slopes, share_slope)
+            change = share_slope[0] * tangents[n, 0] + share_slope[1] * tangents[n, 1] + share_slope[2] * tangents[n, 2]
             for axis in range(3):
                 at[axis] = lowest[axis] + (i >> axis & 1)
             for axis in range(3):
@@ -144,7 +144,7 @@ def _pull_points(start, stop, values, points, g, low, step, results):
     0 where a point is not finite.
     """
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
-    own = np.empty(3)
+    share_slope = np.empty(3)
     for n in range(start, stop):
         results[n] = 0
         if not _place(points[n], values.shape, low, step, lowest, near, slopes):
@@ -155,9 +155,9 @@ def _pull_points(start, stop, values, points, g, low, step, results):
             along = 0.0
             for axis in range(3):
                 along += g[n, axis] * _difference(values, at, axis, step)
-            _share_slopes(i, near, slopes, own)
+            _share_slopes(i, near, slopes, share_slope)
             for axis in range(3):
-                results[n, axis] += along * own[axis]
+                results[n, axis] += along * share_slope[axis]
 
 
 @loop

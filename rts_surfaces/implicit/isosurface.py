@@ -22,7 +22,8 @@ from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import ArraySpec, Proxy, Rate, RayHits, Rays, Samples
 from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import marching_cubes
-from rts_surfaces.implicit.casting import box, cast, deepest, per_level
+from rts_surfaces.implicit.casting import cast, per_level
+from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.field import SIDES, Implicit, check_isovalue, known_number
 from rts_surfaces.implicit.function_on_lattice import FunctionOnLattice
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
@@ -30,6 +31,7 @@ from rts_surfaces.implicit.lattice_field import LatticeField
 from rts_surfaces.implicit.marching_cubes import Triangles
 from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
 from rts_surfaces.implicit.narrow_band import Band, NarrowBand, rows_by_place
+from rts_surfaces.implicit.regions import box
 
 NEAR_SINGULAR = 1e-3
 """An edge is near-singular if its ends differ by less than this share of the median over the edges that are crossed."""
@@ -163,12 +165,12 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """The surface on coarser lattices, and, if it is of a function, on a finer one."""
-        count, rates = self.field.lattice(theta).count, []
+        count, offered = self.field.lattice(theta).count, []
         for shape, field, change in self.field.resampled(theta):
             other = copy.copy(self)
             other.field, other._usual = field, {}
-            rates.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
-        return rates
+            offered.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
+        return offered
 
     # ----------------------------------------------------------------------------------- triangles and samples
 
@@ -273,9 +275,9 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         if "corners" in inputs:
             corners = np.concatenate([inputs["corners"], inputs["inner"]])
             band = corners, *rows_by_place(inputs["numbers"][corners[:, 0]], lattice.shape)
-        given = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
-        given = *given, *rays[:2], *beside[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
-        parallel(lattice_outlines_loops.outlines, count, *given, *results, work=4000 * count)
+        arguments = values, band, float(values.dtype.type(isovalue)), sign, self.closed, *where
+        arguments = *arguments, *rays[:2], *beside[:2], depth.astype(np.float64), np.asarray(rays.spread, np.float64)
+        parallel(lattice_outlines_loops.outlines, count, *arguments, *results, work=4000 * count)
         points, params, there = results
         ids, tables = self.field.in_tables(points, tables)
         return ids, params, there, tables
@@ -302,8 +304,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return cast(
             partial(self._capped if self.closed else self.field.level, theta),
             partial(self._moving, theta),
-            self.field.suited(theta, origins),
-            self.field.suited(theta, directions),
+            self.field.in_theta_dtype(theta, origins),
+            self.field.in_theta_dtype(theta, directions),
             layers,
             within=box(low - margin, high + margin),
             lipschitz=self.lipschitz,
@@ -312,7 +314,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; caps do not move."""
-        points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
+        points, directions, reach = (self.field.in_theta_dtype(theta, x) for x in (points, directions, reach))
         level = partial(self._capped if self.closed else self.field.level, theta)
         return deepest(level, lambda x: level(x) <= self.field.level(theta, x), points, directions, reach)
 

@@ -88,14 +88,14 @@ class LatticeField(ScalarField):
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
         """All values (M,), float32 at least, and the indices (N, 6) among them of each sample's six values."""
-        values = self.suited(theta, theta["values"])
+        values = self.in_theta_dtype(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 
     def numbers(self, samples: Samples) -> Array:
         """The numbers (N, 6) of the samples' lattice points."""
         return samples.ids
 
-    def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
+    def in_theta_dtype(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The points in the dtype of the values, float32 at least."""
         xp = namespace(points)
         wide = namespace(theta["values"]).finfo(theta["values"].dtype).bits == 64

@@ -76,12 +76,12 @@ def tetrahedron(values, band, isovalue, base, cell, shape, at, near, points, par
             continue
         # The next corner lies along the axis with the largest place of those that remain.
         axis = 0 if near[0] >= near[1] and near[0] >= near[2] else 1 if near[1] >= near[2] else 2
-        own = near[axis] if k < 3 else 0.0
-        params[3 + k] = left - own
-        level += (left - own) * (corner(values, band, base, cell, last, shape) - isovalue)
+        part = near[axis] if k < 3 else 0.0
+        params[3 + k] = left - part
+        level += (left - part) * (corner(values, band, base, cell, last, shape) - isovalue)
         if k < 3:
             number += shape[1] * shape[2] if axis == 0 else shape[2] if axis == 1 else 1
-            last, left, near[axis] = last | 1 << axis, own, -1.0
+            last, left, near[axis] = last | 1 << axis, part, -1.0
     for i in range(3):
         params[9 + i] = at[i]
     params[15] = level

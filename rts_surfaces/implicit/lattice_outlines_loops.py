@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
-from rts_surfaces.implicit.casting import APART, FIRST, GROWTH, HALVINGS, MARCH, REACH
+from rts_surfaces.implicit.deepest import APART, FIRST, GROWTH, HALVINGS, MARCH, REACH
 from rts_surfaces.implicit.lattice_levels_loops import level_at, step_along, tetrahedron
 from rts_surfaces.implicit.lattice_samples_loops import LARGEST
 
@@ -77,7 +77,7 @@ def _mixed(field, first, unit, ends, at, near, slopes, levels, mixed):
     """Fill the levels (2,) and slopes (2, 3) at both ends of a kink, and their mean (3,) perpendicular to the ray.
 
     Returns:
-        The share of the first end, as `casting.deepest` has it, and the square of the mean slope.
+        The share of the first end, as `deepest.deepest` has it, and the square of the mean slope.
     """
     for k in range(2):
         step_along(first, unit, ends[k], at)
@@ -206,7 +206,7 @@ def outlines(
     """Fill pairs of samples that tell how the outlines beside rays [start, stop) move.
 
     They stand at the least levels of the ray and of a neighbour that misses the surface, see `_crossing`; where there
-    is no such neighbour, beside the ray's deepest point, see `casting.deepest`.
+    is no such neighbour, beside the ray's deepest point, see `deepest.deepest`.
 
     Args:
         start: the first ray.
@@ -247,8 +247,8 @@ def outlines(
         if np.isnan(t):
             continue
         # A kink of the field spreads over a cell; where cells are wider than pixels it is a face.
-        apart = max(APART * reach, min(0.5 * min(step), reach / 6))
-        ends[0], ends[1] = max(t - apart, 0.0), t + apart
+        margin = max(APART * reach, min(0.5 * min(step), reach / 6))
+        ends[0], ends[1] = max(t - margin, 0.0), t + margin
         share, square = _mixed(field, first, unit, ends, at, near, slopes, levels, slope)
         step_along(first, unit, t, place)
         z = depth[n] + t / length

@@ -170,8 +170,8 @@ def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray
         (C,) uint8, a bit each; and `Triangles.caps` of the cell's triangles (C,) int8.
     """
     count = len(band.corners)
-    own = np.arange(count, dtype=np.int32)
-    groups = [(own, band.corners, np.zeros(count, np.uint8), np.zeros(count, np.int8))]
+    band_rows = np.arange(count, dtype=np.int32)
+    groups = [(band_rows, band.corners, np.zeros(count, np.uint8), np.zeros(count, np.int8))]
     last = np.array(lattice.shape) - 2
     for side in np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) if closed else ():
         at_side = np.flatnonzero(((side == 0) | (band.cells == np.where(side < 0, 0, last))).all(axis=1))
@@ -182,5 +182,5 @@ def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray
         outer = ((side != 0) & (CORNERS == (side > 0))).any(axis=1) @ (1 << np.arange(8))
         cap = (side != 0) @ (1, 2, 4)
         of_all = np.full(len(at_side), outer, np.uint8), np.full(len(at_side), cap, np.int8)
-        groups.append((own[at_side], band.corners[at_side][:, beside], *of_all))
+        groups.append((band_rows[at_side], band.corners[at_side][:, beside], *of_all))
     return tuple(np.concatenate(x) for x in zip(*groups, strict=True))

@@ -28,9 +28,9 @@ def _signs(values, isovalue, sign, closed, x, out):
     x = min(x, shape_x - 1)
     shift = 1 if closed else 0
     for y in range(shape_y):
-        row, given = out[y + shift], values[x, y]
+        row, line = out[y + shift], values[x, y]
         for z in range(shape_z):
-            row[z + shift] = sign * (given[z] - isovalue) < 0
+            row[z + shift] = sign * (line[z] - isovalue) < 0
         if closed:
             row[0], row[shape_z + 1] = 0, 0
         else:  # Beyond an open end all stays as it is, which crosses no edge.
@@ -42,30 +42,30 @@ def _signs(values, isovalue, sign, closed, x, out):
 
 
 @compiled(inline="always")
-def _codes(low, high, y, count, out):
-    """Write the cases, see `marching_cubes.cases`, of row y of cells to the first `count` places of `out` uint8.
+def _codes(low, high, y, cells, out):
+    """Write the cases, see `marching_cubes.cases`, of row y of cells to the first `cells` places of `out` uint8.
 
     The cells lie between the planes `low` and `high`, results of `_signs` for one x and the next.
     """
     a, b, c, d = low[y], high[y], low[y + 1], high[y + 1]
-    for z in range(count):
+    for z in range(cells):
         below = a[z] | b[z] << 1 | c[z] << 2 | d[z] << 3
         above = a[z + 1] | b[z + 1] << 1 | c[z + 1] << 2 | d[z + 1] << 3
         out[z] = below | above << 4
 
 
 @compiled
-def _mixed(codes, count, found):
+def _mixed(codes, cells, found):
     """List in `found[:n]` the places, along a row, of the n cells whose corners differ in sign. Returns n.
 
-    `codes` uint8 holds the cases of `count` cells, and zeros up to a multiple of eight: eight are tested at once. The
-    rest of `found`, which has `count` places, may be overwritten.
+    `codes` uint8 holds the cases of `cells` cells, and zeros up to a multiple of eight: eight are tested at once. The
+    rest of `found`, which has `cells` places, may be overwritten.
     """
     words, full, many = codes.view(np.uint64), np.uint64(0xFFFFFFFFFFFFFFFF), 0
     for w in range(len(words)):
         if words[w] == 0 or words[w] == full:
             continue
-        for z in range(8 * w, min(8 * w + 8, count)):
+        for z in range(8 * w, min(8 * w + 8, cells)):
             found[many] = z
             many += codes[z] != 0 and codes[z] != 255
     return many
@@ -74,8 +74,8 @@ def _mixed(codes, count, found):
 @compiled
 def _crossed(code):
     """The crossed ones of the three edges that a cell owns, as bits 0 to 2 for x, y, z; from the cell's case `code`."""
-    own = code & 1
-    return (own != code >> 1 & 1) | np.int64(own != code >> 2 & 1) << 1 | np.int64(own != code >> 4 & 1) << 2
+    lowest = code & 1
+    return (lowest != code >> 1 & 1) | np.int64(lowest != code >> 2 & 1) << 1 | np.int64(lowest != code >> 4 & 1) << 2
 
 
 @compiled(inline="always")
@@ -105,7 +105,7 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
     planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
     cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
     codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    listed = np.empty(cells_z, np.int64)
+    mixed_places = np.empty(cells_z, np.int64)
     first = -1 if closed else 0
     _signs(values, isovalue, sign, closed, start + first, planes[0])
     for x in range(start, stop):
@@ -114,7 +114,7 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
         mixed = crossed = triangles = 0
         for y in range(cells_y):
             _codes(low, high, y, cells_z, codes)
-            for z in listed[: _mixed(codes, cells_z, listed)]:
+            for z in mixed_places[: _mixed(codes, cells_z, mixed_places)]:
                 mixed += 1
                 crossed += _bit_count(_crossed(codes[z]))
                 if _is_real(x, y, z, shape, closed):
@@ -124,7 +124,21 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
 
 @loop
 def vertices(
-    start, stop, values, isovalue, sign, closed, origin, step, offsets, cells, codes_of, first_of, ends, places, apart
+    start,
+    stop,
+    values,
+    isovalue,
+    sign,
+    closed,
+    origin,
+    step,
+    offsets,
+    cells,
+    codes_of,
+    first_of,
+    ends,
+    places,
+    differences,
 ):
     """List the mixed cells of layers `start` to `stop` − 1, and the vertices on the edges that they own.
 
@@ -144,14 +158,14 @@ def vertices(
             first vertex that the cell owns, plus the bits of `_crossed`.
         ends: (V, 2) to be filled, see `Triangles`.
         places: (V, 3) to be filled with `Triangles.vertices`.
-        apart: (V,) to be filled with `Triangles.differences`.
+        differences: (V,) to be filled with `Triangles.differences`.
     """
     shape = values.shape
     border = 2 if closed else 1
     planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
     cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
     codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
-    listed = np.empty(cells_z, np.int64)
+    mixed_places = np.empty(cells_z, np.int64)
     shift = 1 if closed else 0
     _signs(values, isovalue, sign, closed, start - shift, planes[0])
     for x in range(start, stop):
@@ -160,32 +174,32 @@ def vertices(
         cell, vertex = offsets[x, 0], offsets[x, 1]
         for y in range(cells_y):
             _codes(low, high, y, cells_z, codes)
-            for z in listed[: _mixed(codes, cells_z, listed)]:
+            for z in mixed_places[: _mixed(codes, cells_z, mixed_places)]:
                 crossed = _crossed(codes[z])
                 cells[cell], codes_of[cell] = y * cells_z + z, codes[z]
                 cell += 1
                 first_of[x, y, z] = 8 * vertex + crossed
-                own = x - shift, y - shift, z - shift
-                vertex = _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart)
+                corner = x - shift, y - shift, z - shift
+                vertex = _place(vertex, crossed, corner, values, isovalue, origin, step, ends, places, differences)
 
 
 @compiled
-def _place(vertex, crossed, own, values, isovalue, origin, step, ends, places, apart):
-    """Write rows of `ends`, `places` and `apart` for the vertices on the edges that a cell owns, from `vertex` on.
+def _place(vertex, crossed, corner, values, isovalue, origin, step, ends, places, differences):
+    """Write rows of `ends`, `places` and `differences` for the vertices on the edges of a cell, from `vertex` on.
 
-    `crossed` are the bits of `_crossed`; `own` is the point (x, y, z) of the cell's lowest corner, −1 along an axis
+    `crossed` are the bits of `_crossed`; `corner` is the point (x, y, z) of the cell's lowest corner, −1 along an axis
     before the lattice. Other arguments are those of `vertices`. Returns the next free row.
     """
     shape = values.shape
-    ax, ay, az = max(own[0], 0), max(own[1], 0), max(own[2], 0)
+    ax, ay, az = max(corner[0], 0), max(corner[1], 0), max(corner[2], 0)
     for axis in range(3):
         if not crossed >> axis & 1:
             continue
-        bx, by = min(own[0] + (axis == 0), shape[0] - 1), min(own[1] + (axis == 1), shape[1] - 1)
-        bz = min(own[2] + (axis == 2), shape[2] - 1)
+        bx, by = min(corner[0] + (axis == 0), shape[0] - 1), min(corner[1] + (axis == 1), shape[1] - 1)
+        bz = min(corner[2] + (axis == 2), shape[2] - 1)
         ends[vertex, 0], ends[vertex, 1] = (ax * shape[1] + ay) * shape[2] + az, (bx * shape[1] + by) * shape[2] + bz
         f_a, f_b = np.float64(values[ax, ay, az]), np.float64(values[bx, by, bz])
-        apart[vertex] = abs(f_b - f_a)
+        differences[vertex] = abs(f_b - f_a)
         along = (isovalue - f_a) / (f_b - f_a) if f_a != f_b else 0.0
         places[vertex, 0] = origin[0] + step[0] * (ax + along * (bx - ax))
         places[vertex, 1] = origin[1] + step[1] * (ay + along * (by - ay))

@@ -91,11 +91,11 @@ def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
     `least` (N,), derivatives are as if they differed by that.
     """
     engine = engine_of(f_a)
-    xp, apart = engine.namespace, f_b - f_a
-    same = apart == 0
-    exact = -f_a / xp.where(same, xp.ones_like(apart), apart)
+    xp, difference = engine.namespace, f_b - f_a
+    same = difference == 0
+    exact = -f_a / xp.where(same, xp.ones_like(difference), difference)
     exact = xp.where(same, xp.zeros_like(exact), exact)
-    known = engine.stop_gradient(apart)
+    known = engine.stop_gradient(difference)
     singular = xp.abs(known) < least
     bounded = xp.where(known < 0, -least, least)
     along = engine.stop_gradient(exact)

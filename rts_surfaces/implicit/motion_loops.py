@@ -22,24 +22,24 @@ def along(
 
 
 def push_along(
-    values: np.ndarray, params: np.ndarray, rows: np.ndarray, moved: np.ndarray, out: np.ndarray, **given: float
+    values: np.ndarray, params: np.ndarray, rows: np.ndarray, moved: np.ndarray, out: np.ndarray, **options: float
 ) -> None:
     """Fill `out` (N, 3) with the derivatives of the positions of `along`; `moved` (M,) are tangents of the values.
 
-    `given` are the keywords of `along`.
+    `options` are the keywords of `along`.
     """
-    sign = values.dtype.type(given["sign"])
+    sign = values.dtype.type(options["sign"])
     parallel(_push, len(rows), moved, params, rows, sign, out, work=30 * len(rows))
 
 
 def pull_along(
-    values: np.ndarray, params: np.ndarray, rows: np.ndarray, g: np.ndarray, result: np.ndarray, **given: float
+    values: np.ndarray, params: np.ndarray, rows: np.ndarray, g: np.ndarray, result: np.ndarray, **options: float
 ) -> None:
     """Add to `result` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `along`.
 
-    `given` are the keywords of `along`.
+    `options` are the keywords of `along`.
     """
-    _pull(g, params, rows, values.dtype.type(given["sign"]), result)
+    _pull(g, params, rows, values.dtype.type(options["sign"]), result)
 
 
 def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
@@ -47,9 +47,9 @@ def crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tu
 
     Before it are params, rows and numbers. The corners lie where values reach `isovalue` on edges of the `lattice`.
     """
-    *given, out = rest
+    *operands, out = rest
     count, level = len(out), values.dtype.type(isovalue)
-    parallel(_cross, count, values, *given, level, *lattice, out, work=60 * count)
+    parallel(_cross, count, values, *operands, level, *lattice, out, work=60 * count)
 
 
 def push_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
@@ -57,9 +57,9 @@ def push_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattic
 
     Before it are params, rows, numbers, and the tangents (M,) of the values.
     """
-    *given, moved, out = rest
+    *operands, moved, out = rest
     count, level = len(out), values.dtype.type(isovalue)
-    parallel(_push_crossings, count, values, moved, *given, level, *lattice, out, work=60 * count)
+    parallel(_push_crossings, count, values, moved, *operands, level, *lattice, out, work=60 * count)
 
 
 def pull_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattice: tuple) -> None:
@@ -67,8 +67,8 @@ def pull_crossing(values: np.ndarray, *rest: np.ndarray, isovalue: float, lattic
 
     Before it are params, rows, numbers, and the gradient (N, 3) of the positions of `crossing`.
     """
-    *given, g, result = rest
-    _pull_crossings(values, g, *given, values.dtype.type(isovalue), *lattice, result)
+    *operands, g, result = rest
+    _pull_crossings(values, g, *operands, values.dtype.type(isovalue), *lattice, result)
 
 
 @loop
@@ -97,10 +97,10 @@ def _push(start, stop, tangents, params, rows, sign, out):
 def _pull(g, params, rows, sign, results):
     """Add to `results` (M,), the gradient of the values, from g (N, 3), the gradient of the positions of `_move`."""
     for n in range(len(rows)):
-        along = g[n, 0] * params[n, 12] + g[n, 1] * params[n, 13] + g[n, 2] * params[n, 14]
-        if along != 0:
+        slope = g[n, 0] * params[n, 12] + g[n, 1] * params[n, 13] + g[n, 2] * params[n, 14]
+        if slope != 0:
             for i in range(6):
-                results[rows[n, i]] -= sign * along * params[n, 3 + i]
+                results[rows[n, i]] -= sign * slope * params[n, 3 + i]
 
 
 @compiled(inline="always")
@@ -116,15 +116,15 @@ def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
     if a == b:
         return 0, 0.0, 0.0, 0.0
     f_a, f_b = values[rows[n, 2 * k]] - isovalue, values[rows[n, 2 * k + 1]] - isovalue
-    apart = f_b - f_a
+    difference = f_b - f_a
     ahead = b - a
     axis = 2 if abs(ahead) == 1 else 1 if abs(ahead) == shape[2] else 0
     length = step[axis] if ahead > 0 else -step[axis]
-    along = -f_a / apart if apart != 0 else 0.0
+    place = -f_a / difference if difference != 0 else 0.0
     least = params[n, 3]
-    if abs(apart) < least:
-        apart = -least if apart < 0 else least
-    return axis, length, along, apart
+    if abs(difference) < least:
+        difference = -least if difference < 0 else least
+    return axis, length, place, difference
 
 
 @loop
@@ -133,11 +133,11 @@ def _cross(start, stop, values, params, rows, numbers, isovalue, shape, low, ste
     for n in range(start, stop):
         x = y = z = 0.0
         for k in range(3):
-            axis, length, along, _ = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
+            axis, length, place, _ = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
             number, share = np.int64(numbers[n, 2 * k]), params[n, k]
-            x += share * (low[0] + step[0] * (number // (shape[1] * shape[2])) + (along * length if axis == 0 else 0))
-            y += share * (low[1] + step[1] * (number // shape[2] % shape[1]) + (along * length if axis == 1 else 0))
-            z += share * (low[2] + step[2] * (number % shape[2]) + (along * length if axis == 2 else 0))
+            x += share * (low[0] + step[0] * (number // (shape[1] * shape[2])) + (place * length if axis == 0 else 0))
+            y += share * (low[1] + step[1] * (number // shape[2] % shape[1]) + (place * length if axis == 1 else 0))
+            z += share * (low[2] + step[2] * (number % shape[2]) + (place * length if axis == 2 else 0))
         out[n, 0], out[n, 1], out[n, 2] = x, y, z
 
 
@@ -147,10 +147,10 @@ def _push_crossings(start, stop, values, tangents, params, rows, numbers, isoval
     for n in range(start, stop):
         out[n] = 0
         for k in range(3):
-            axis, length, along, apart = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
-            if apart != 0:
-                change = (1 - along) * tangents[rows[n, 2 * k]] + along * tangents[rows[n, 2 * k + 1]]
-                out[n, axis] -= params[n, k] * length * change / apart
+            axis, length, place, difference = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
+            if difference != 0:
+                change = (1 - place) * tangents[rows[n, 2 * k]] + place * tangents[rows[n, 2 * k + 1]]
+                out[n, axis] -= params[n, k] * length * change / difference
 
 
 @loop
@@ -160,8 +160,8 @@ def _pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step
         if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
             continue
         for k in range(3):
-            axis, length, along, apart = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
-            if apart != 0:
-                change = g[n, axis] * params[n, k] * length / apart
-                results[rows[n, 2 * k]] -= (1 - along) * change
-                results[rows[n, 2 * k + 1]] -= along * change
+            axis, length, place, difference = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
+            if difference != 0:
+                change = g[n, axis] * params[n, k] * length / difference
+                results[rows[n, 2 * k]] -= (1 - place) * change
+                results[rows[n, 2 * k + 1]] -= place * change

@@ -12,6 +12,7 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.checks import check_positive, is_count, quoted
 from rts.plugin_api.threads import parallel
+from rts_surfaces.implicit import blocks_loops
 from rts_surfaces.implicit import narrow_band_loops as loops
 from rts_surfaces.implicit.lattice import Lattice
 
@@ -153,8 +154,8 @@ class _Evaluate:
 
     def at_centres(self, blocks: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (B,) of the centres of blocks (B, 3), −1 where a block is cropped, and the levels there (B,)."""
-        numbers = loops.centre_numbers(blocks, side, self.shape)
-        return numbers, self._levels(loops.centres, numbers, blocks, side, self.shape, self.low, self.step)
+        numbers = blocks_loops.centre_numbers(blocks, side, self.shape)
+        return numbers, self._levels(blocks_loops.centres, numbers, blocks, side, self.shape, self.low, self.step)
 
     def slack(self, values: np.ndarray, lipschitz: float) -> float:
         """The largest rounding error of levels (M,), from their dtype and the lattice's coordinates."""
@@ -239,11 +240,11 @@ def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> 
     while side > 1:
         numbers, levels = evaluate.at_centres(blocks, side)
         slack = evaluate.slack(levels, lipschitz)
-        near = loops.near(blocks, levels, side, evaluate.shape, evaluate.step, lipschitz, slack, closed)
+        near = blocks_loops.near(blocks, levels, side, evaluate.shape, evaluate.step, lipschitz, slack, closed)
         blocks = blocks[near]
         centres.append((numbers[near], levels[near]))
         if side > 2:
-            blocks = loops.halved(blocks, evaluate.counts(side // 2))
+            blocks = blocks_loops.halved(blocks, evaluate.counts(side // 2))
         side //= 2
     grid = _Grid(evaluate, 1)
     if centres:
@@ -266,14 +267,14 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
     rows = grid.corners(blocks)
     blocks, rows = loops.crossed(blocks, rows, grid.values, grid.counts, closed)
     if side > 1 and margin > 0:
-        blocks = loops.widened(blocks, margin, grid.counts)
+        blocks = blocks_loops.widened(blocks, margin, grid.counts)
         rows = grid.corners(blocks)
     while side > 1:
         side //= 2
         known = loops.compact(rows, grid.numbers, grid.values)
         grid = _Grid(evaluate, side)
         grid.give(*known)
-        blocks = loops.halved(blocks, grid.counts)
+        blocks = blocks_loops.halved(blocks, grid.counts)
         blocks, rows = _complete(grid, blocks, closed)
     return grid, blocks, rows
 

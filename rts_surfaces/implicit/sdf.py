@@ -12,9 +12,11 @@ from rts import GBuffer, InputError, Part, RaySurface, namespace
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_numbers, check_positive, is_count, quoted
 from rts.plugin_api.records import RayHits, Samples
-from rts_surfaces.implicit.casting import ball, cast, deepest, moving
+from rts_surfaces.implicit.casting import cast, moving
+from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.field import Field, Function, Implicit, known_number
 from rts_surfaces.implicit.fields import swept_sphere
+from rts_surfaces.implicit.regions import ball
 
 
 class Sdf(Implicit, RaySurface):
@@ -52,6 +54,7 @@ class Sdf(Implicit, RaySurface):
         center: ArrayLike = (0.0, 0.0, 0.0),
         isovalue: float = 0.0,
         inside: str = "below",
+        *,
         lipschitz: float | None = 1.0,
         reads: Sequence[str] | None = None,
         attributes: Mapping[str, Function] | None = None,
@@ -85,8 +88,8 @@ class Sdf(Implicit, RaySurface):
         return cast(
             level,
             partial(moving, level),
-            self.field.suited(theta, origins),
-            self.field.suited(theta, directions),
+            self.field.in_theta_dtype(theta, origins),
+            self.field.in_theta_dtype(theta, directions),
             layers,
             within=ball(self.center, self.radius),
             lipschitz=self.lipschitz,
@@ -99,6 +102,6 @@ class Sdf(Implicit, RaySurface):
 
     def deepest(self, theta: Mapping[str, Tree], points: Array, directions: Array, reach: Array) -> tuple[Array, Array]:
         """See `rts.RaySurface`; in θ's dtype."""
-        points, directions, reach = (self.field.suited(theta, x) for x in (points, directions, reach))
+        points, directions, reach = (self.field.in_theta_dtype(theta, x) for x in (points, directions, reach))
         level, xp = partial(self.field.level, theta), namespace(points)
         return deepest(level, lambda x: xp.ones_like(x[:, 0], dtype=xp.bool), points, directions, reach)

@@ -326,16 +326,16 @@ class Points:
         return faces, params, depth, met
 
 
-def _leave(library: ctypes.CDLL, left: list[int], points: int) -> None:
+def _leave(functions: ctypes.CDLL, left: list[int], points: int) -> None:
     """Keep the memory of one `Points` for the next; free it if some is kept already."""
     if left:
-        library.rts_points_free(points)
+        functions.rts_points_free(points)
     else:
         left.append(points)
 
 
-def _free(library: ctypes.CDLL, cage: int, left: list[int]) -> None:
+def _free(functions: ctypes.CDLL, cage: int, left: list[int]) -> None:
     for points in left:
-        library.rts_points_free(points)
+        functions.rts_points_free(points)
     left[:] = [0]  # So that `_leave` frees points that are collected later, in a cycle, and keeps none.
-    library.rts_cage_free(cage)
+    functions.rts_cage_free(cage)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rts_surfaces.patches.tiles import Tiles
 from rts_surfaces.subdivision.binding import NONE, QUAD, SUBFACES, Limit
-from rts_surfaces.tiles import Tiles
 
 
 def tiles_of(limit: Limit) -> Tiles:

@@ -86,12 +86,12 @@ def find() -> Tools:
         old = f", and that in {prefix} is older than {'.'.join(map(str, OLDEST))}"
     else:
         raise PluginError(f"subdivision surfaces need OpenSubdiv, whose headers are not found{old}; {HELP}")
-    chosen = shlex.split(os.environ.get("CXX", ""))
-    for command in [chosen] if chosen else [[name] for name in COMPILERS]:
+    compiler = shlex.split(os.environ.get("CXX", ""))
+    for command in [compiler] if compiler else [[name] for name in COMPILERS]:
         program = shutil.which(command[0])
         if program:
             return Tools((program, *command[1:]), prefix, version)
-    missing = f"that CXX names, {chosen[0]!r}, is not found" if chosen else "is not found"
+    missing = f"that CXX names, {compiler[0]!r}, is not found" if compiler else "is not found"
     raise PluginError(f"subdivision surfaces need a C++ compiler, and one {missing}; {HELP}")
 
 

@@ -21,10 +21,19 @@ from rts.plugin_api.operations import combine, filled_up, take, with_room
 from rts.plugin_api.records import ArraySpec, Rays, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
-from rts_surfaces.parametric import BEYOND, CROSSINGS, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
+from rts_surfaces.patches.parametric import (
+    BEYOND,
+    CROSSINGS,
+    LARGEST_STEP,
+    RESIDUAL,
+    STEPS,
+    TOLERANCE,
+    Geometry,
+    Parametric,
+)
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
-from rts_surfaces.subdivision.cage import checked_cage, checked_lists
+from rts_surfaces.subdivision.cage_checks import checked_cage, checked_lists
 from rts_surfaces.subdivision.face_tiles import tiles_of
 
 library.find()  # Without OpenSubdiv there is no such plugin.
@@ -245,8 +254,8 @@ class Subdivision(Parametric):
             return unit(engine.namespace.linalg.cross(along_u, along_v))
 
         def varying() -> Array:
-            (own,) = at(UV, False)
-            return combine(theta["uv"], ids_of(self.limit.uv_table), own)
+            (uv_weights,) = at(UV, False)
+            return combine(theta["uv"], ids_of(self.limit.uv_table), uv_weights)
 
         gbuffer.defer("normal", normal)
         for name in self.reads(theta)[1:]:

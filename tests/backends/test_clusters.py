@@ -22,7 +22,7 @@ pytest.importorskip("numba")
 from rts_backends.raster import sampler as raster_sampler  # noqa: E402
 from rts_backends.raster.clusters import Clusters  # noqa: E402
 from rts_backends.raster.sampler import Raster  # noqa: E402
-from rts_backends.triangles import facing, pixel_matrix  # noqa: E402
+from rts_backends.triangles import pixel_matrix  # noqa: E402
 
 KINDS = ("ball", "bumpy", "copies", "rounded", "with NaN", "soup", "nasty")
 
@@ -104,7 +104,7 @@ def test_a_cone_holds_the_normals_of_its_cluster():
 def seen(made, camera, cull):
     """(C,) bool, the clusters that may show triangles."""
     size, every = (64, 64), np.zeros(made.boxes.shape[1], bool)
-    every[made.seen(pixel_matrix(camera, size), size, facing(camera, cull))[0]] = True
+    every[made.seen(pixel_matrix(camera, size), size, camera.kept_sign(cull))[0]] = True
     return every
 
 
@@ -151,7 +151,7 @@ def test_fragments_of_clusters_are_those_of_the_triangles(kind):
         for layers, cull in ((1 + n % 3, "none"), (1 + n % 2, "back")):
             view = camera, size, layers, cull
             assert_same(sampler.rasterize(made, *view), sampler.rasterize(proxy, *view))
-            found, _ = made.seen(pixel_matrix(camera, size), size, facing(camera, cull))
+            found, _ = made.seen(pixel_matrix(camera, size), size, camera.kept_sign(cull))
             refused += made.boxes.shape[1] - len(found)
     assert refused > 50
 

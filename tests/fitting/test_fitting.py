@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 import rts
 from rts.errors import InputError, PluginError
-from rts.fitting.least_squares import _Linear, _Model
+from rts.fitting.least_squares import _Model
+from rts.fitting.normal_equations import Linearization
 
 pytestmark = pytest.mark.fitting
 
@@ -263,7 +264,7 @@ def test_lm_stops_where_steps_gain_little_or_nothing_can(target):
 
 
 def test_no_step_goes_where_the_matrix_is_not_definite():
-    model = _Model(_Linear(1.0, np.array([[1.0, 1.5], [1.5, 1.0]]), np.array([1.0, 0.0]), 1e-7), [2])
+    model = _Model(Linearization(1.0, np.array([[1.0, 1.5], [1.5, 1.0]]), np.array([1.0, 0.0]), 1e-7), [2])
     step, predicted = model.step(1e-3)
     assert step[0] == pytest.approx(step[1]) and step[0] < 0 and predicted > 0
 

@@ -10,7 +10,7 @@ import rts
 import rts.fitting.least_squares
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
-from rts.fitting.least_squares import normal_equations
+from rts.fitting.normal_equations import normal_equations
 from rts.rendering import settings
 from rts.splatting.edges import weights as edges_weights
 
@@ -99,7 +99,7 @@ def check(residuals, parameters, tolerance, *, compiling=False):
         kind = to_numpy(parameters["pose"]).dtype
         parameters = arrays("torch-cpu", {k: to_numpy(v) for k, v in parameters.items()}, kind)
         engine = engine_of(parameters)
-    flat, unflatten = rts.fitting.least_squares.flatten(parameters)
+    flat, unflatten = rts.fitting.normal_equations.flatten(parameters)
     xp = engine.namespace
     r, rows = map(to_numpy, engine.jit(engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,))))(flat))
     r, rows = r.astype(np.float64), rows.astype(np.float64)

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 import rts
 from rts.arrays.engines import engine_of
 from rts.errors import InputError
-from rts.fitting.least_squares import normal_equations
+from rts.fitting.normal_equations import normal_equations
 
 pytestmark = pytest.mark.fitting
 

@@ -8,7 +8,7 @@ from helpers import TORCH, arrays, quick, to_numpy
 
 import rts
 from rts import Camera, Part
-from rts_surfaces.implicit.casting import deepest
+from rts_surfaces.implicit.deepest import deepest
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
 pytestmark = pytest.mark.rendering

@@ -138,7 +138,7 @@ def test_measuring_imports_public_names_alone():
         **toolkit(),
     }
     public |= {name: defined(FILES[name]) for name in modules}
-    public["rts.diagnostics.command_tools"] = import_module("rts.diagnostics.command_tools").__all__
+    public["rts.diagnostics.measuring_api"] = import_module("rts.diagnostics.measuring_api").__all__
     own = [path for name, path in FILES.items() if name.startswith("rts_compare")]
     assert len(own) > 30
     for path in own:

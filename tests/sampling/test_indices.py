@@ -16,7 +16,7 @@ from rts.operations.take import take
 from rts.plugin_api.records import Fragments, Proxy
 from rts.rendering.samples import sample
 from rts.sampling.merging import merge
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 from rts.scene.rigid import RIGID
 
 pytestmark = pytest.mark.sampling
@@ -183,7 +183,7 @@ def test_triangles_that_are_not_there_are_refused(wrong):
 def test_triangles_that_are_not_there_are_refused_when_they_are_packed():
     ids = np.full((1, 1, 2), -7, np.int32)
     with refused("triangle -7 to a cell"):
-        lift(Fragments(ids, np.zeros((*ids.shape, 2)), np.zeros(ids.shape)), Proxy(*quad()))
+        pack_fragments(Fragments(ids, np.zeros((*ids.shape, 2)), np.zeros(ids.shape)), Proxy(*quad()))
 
 
 def shifted(samples, by):

@@ -10,7 +10,7 @@ from strategies import PROPERTIES, grids, masks, rows_of, steps, table, told_apa
 
 from rts.compiling import threads
 from rts.plugin_api.records import Fragments, Proxy
-from rts.sampling.packing import lift, repack
+from rts.sampling.packing import pack_fragments, repack
 
 pytestmark = pytest.mark.sampling
 
@@ -66,14 +66,14 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(values, expected.tables[name], err_msg=name)
 
 
-# ---------------------------------------------------------------------------------------------------- lift
+# ---------------------------------------------------------------------------------------------------- pack_fragments
 
 
 @PROPERTIES
 @given(hits())
 def test_kept_cells_have_their_rows_in_reading_order_as_far_as_there_is_room(given):
     fragments, proxy, capacity, kept = given
-    found = lift(fragments, proxy, capacity, kept)
+    found = pack_fragments(fragments, proxy, capacity, kept)
     kept = cells_kept(fragments, kept)
     rows = max(1, kept.sum()) if capacity is None else capacity
     assert len(found.ids) == len(found.params) == rows
@@ -85,7 +85,7 @@ def test_kept_cells_have_their_rows_in_reading_order_as_far_as_there_is_room(giv
 @given(hits())
 def test_overflow_counts_the_kept_cells_without_a_row(given):
     fragments, proxy, capacity, kept = given
-    found = lift(fragments, proxy, capacity, kept)
+    found = pack_fragments(fragments, proxy, capacity, kept)
     assert found.overflow == (cells_kept(fragments, kept) & (found.row < 0)).sum()
     assert found.overflow.shape == () and found.overflow.dtype == np.int32
 
@@ -94,7 +94,7 @@ def test_overflow_counts_the_kept_cells_without_a_row(given):
 @given(hits())
 def test_depths_are_those_of_the_hits_and_zero_where_there_is_no_row(given):
     fragments, proxy, capacity, kept = given
-    found = lift(fragments, proxy, capacity, kept)
+    found = pack_fragments(fragments, proxy, capacity, kept)
     np.testing.assert_array_equal(found.depth, np.where(found.row >= 0, fragments.depth, 0))
     assert found.depth.dtype == np.float32
 
@@ -103,7 +103,7 @@ def test_depths_are_those_of_the_hits_and_zero_where_there_is_no_row(given):
 @given(hits())
 def test_ids_and_params_are_those_of_the_triangle_that_was_hit(given):
     fragments, proxy, capacity, kept = given
-    found = lift(fragments, proxy, capacity, kept)
+    found = pack_fragments(fragments, proxy, capacity, kept)
     cells = found.row >= 0
     triangle, (a, b) = fragments.triangle_ids[cells], np.moveaxis(fragments.barycentrics[cells], -1, 0)
     ids = proxy.faces if proxy.ids is None else proxy.ids
@@ -119,7 +119,7 @@ def test_ids_and_params_are_those_of_the_triangle_that_was_hit(given):
 @given(hits())
 def test_rows_that_no_cell_has_are_zero(given):
     fragments, proxy, capacity, kept = given
-    found = lift(fragments, proxy, capacity, kept)
+    found = pack_fragments(fragments, proxy, capacity, kept)
     unused = np.setdiff1d(np.arange(len(found.ids)), found.row)
     assert not found.ids[unused].any() and not found.params[unused].any()
 
@@ -128,18 +128,18 @@ def test_rows_that_no_cell_has_are_zero(given):
 @given(hits())
 def test_lifting_some_cells_is_lifting_all_and_repacking(given):
     fragments, proxy, capacity, kept = given
-    whole = lift(fragments, proxy)
-    assert_same(lift(fragments, proxy, capacity, kept), repack(whole, cells_kept(fragments, kept), capacity))
+    whole = pack_fragments(fragments, proxy)
+    assert_same(pack_fragments(fragments, proxy, capacity, kept), repack(whole, cells_kept(fragments, kept), capacity))
 
 
 @PROPERTIES
 @given(hits(), st.integers(2, 5))
 def test_any_number_of_threads_packs_alike(given, count):
-    alone = lift(*given)
+    alone = pack_fragments(*given)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(threads, "LITTLE_WORK", 0)
         patch.setenv("RTS_NUM_THREADS", str(count))
-        assert_same(lift(*given), alone)
+        assert_same(pack_fragments(*given), alone)
 
 
 # -------------------------------------------------------------------------------------------------- repack

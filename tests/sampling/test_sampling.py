@@ -10,7 +10,7 @@ from rts.arrays.engines import engine_of, namespace
 from rts.contracts.records import ArraySpec, Cells
 from rts.plugin_api.records import Fragments, Proxy, Samples
 from rts.sampling.merging import merge
-from rts.sampling.packing import lift
+from rts.sampling.packing import pack_fragments
 
 pytestmark = pytest.mark.sampling
 
@@ -93,7 +93,7 @@ def test_lift_numbers_samples_layer_by_layer_and_interpolates_corner_parameters(
     depth = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
     faces = np.array([[0, 1, 2], [2, 1, 3]], np.int32)
     corners = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
-    samples = lift(Fragments(ids, barycentrics, depth), Proxy(np.zeros((4, 3)), faces, None, corners))
+    samples = pack_fragments(Fragments(ids, barycentrics, depth), Proxy(np.zeros((4, 3)), faces, None, corners))
     np.testing.assert_array_equal(samples.row, [[[0, -1], [1, 2]], [[3, -1], [-1, -1]]])
     np.testing.assert_array_equal(samples.ids, faces[[0, 1, 0, 1]])
     weights = np.array([0.5, 0.25, 0.25])
@@ -104,7 +104,7 @@ def test_lift_numbers_samples_layer_by_layer_and_interpolates_corner_parameters(
 def test_lift_drops_the_deepest_layers_first_where_capacity_ends():
     ids = np.zeros((2, 1, 3), np.int32)
     fragments = Fragments(ids, np.zeros((2, 1, 3, 2), np.float32), np.ones((2, 1, 3), np.float32))
-    samples = lift(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)), capacity=4)
+    samples = pack_fragments(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)), capacity=4)
     np.testing.assert_array_equal(samples.row, [[[0, 1, 2]], [[3, -1, -1]]])
     assert samples.overflow == 2 and len(samples.ids) == 4
 
@@ -112,7 +112,7 @@ def test_lift_drops_the_deepest_layers_first_where_capacity_ends():
 def test_there_is_a_row_even_where_nothing_is_hit():
     ids = np.full((1, 2, 2), -1, np.int32)
     fragments = Fragments(ids, np.zeros((1, 2, 2, 2), np.float32), np.zeros((1, 2, 2), np.float32))
-    samples = lift(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)))
+    samples = pack_fragments(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)))
     assert len(samples.ids) == 1 and (samples.row == -1).all()
 
 

@@ -8,7 +8,7 @@ import rts
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
 from rts_surfaces.subdivision.binding import Limit, Rules
-from rts_surfaces.subdivision.cage import checked_cage
+from rts_surfaces.subdivision.cage_checks import checked_cage
 from rts_surfaces.subdivision.face_tiles import tiles_of
 
 

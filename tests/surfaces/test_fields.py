@@ -142,9 +142,9 @@ def test_points_come_in_the_dtype_of_what_is_read():
     field = Field(lambda theta, p: p[:, 0], reads=("a",))
     single, double = np.zeros((4, 3), np.float32), np.zeros((4, 3))
     for points in (single, double):
-        assert field.suited({"a": np.float32([1]), "b": double}, points).dtype == np.float32
-        assert field.suited({"a": {"x": single, "y": [double]}}, points).dtype == np.float64
-        assert field.suited({"a": np.arange(3)}, points).dtype == points.dtype
+        assert field.in_theta_dtype({"a": np.float32([1]), "b": double}, points).dtype == np.float32
+        assert field.in_theta_dtype({"a": {"x": single, "y": [double]}}, points).dtype == np.float64
+        assert field.in_theta_dtype({"a": np.arange(3)}, points).dtype == points.dtype
 
 
 @pytest.mark.parametrize(

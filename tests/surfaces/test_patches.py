@@ -17,7 +17,7 @@ from rts.plugin_api.records import Samples
 from rts.sampling import layer_order
 from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON
-from rts_surfaces import bicubic, tiles
+from rts_surfaces.patches import bicubic, tile_triangles
 
 pytestmark = pytest.mark.sampling
 
@@ -96,7 +96,7 @@ def test_tiles_of_a_closed_surface_have_no_boundary_whatever_their_rates(shape, 
     for cut in (surface.tiles, surface.whole):
         edges = rng.integers(1, 8, len(cut.edge_tiles)).astype(np.int32)
         inner = rng.integers(2, 8, (len(cut.patch), 2)).astype(np.int32)
-        proxy = tiles.triangles(cut, surface.geometry(points).points, edges, inner)
+        proxy = tile_triangles.triangles(cut, surface.geometry(points).points, edges, inner)
         assert boundary(proxy.faces) == []
         assert len(np.unique(proxy.faces)) == len(proxy.vertices)
         # Vertices are where the parameters of triangles say.

@@ -9,8 +9,9 @@ import rts
 from rts.plugin_api.records import Samples
 from rts.rendering import settings
 from rts.testing import SurfaceConformance
-from rts_surfaces.implicit.casting import ball, box, cast, moving
+from rts_surfaces.implicit.casting import cast, moving
 from rts_surfaces.implicit.fields import sphere, swept_sphere, union
+from rts_surfaces.implicit.regions import ball, box
 from rts_surfaces.implicit.sdf import Sdf
 
 pytestmark = pytest.mark.sampling

@@ -9,8 +9,8 @@ from rts import Camera, InputError, Part
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
 from rts.testing.compatibility import APRON
-from rts_surfaces import tiles
-from rts_surfaces.bspline import extraction
+from rts_surfaces.patches import tile_triangles
+from rts_surfaces.patches.bspline import extraction
 
 pytestmark = pytest.mark.sampling
 
@@ -238,8 +238,8 @@ def test_tessellated_triangles_are_off_by_no_more_than_was_asked(rate):
     # Normal to the surface, at the parameters of the point.
     geometry = part.surface.geometry(part.theta["points"].astype(np.float64))
     found = part.surface.shapes(geometry)
-    cuts = tiles.by_error(part.surface.tiles, found, tiles.Allowed.everywhere(len(found.bends), rate))
-    proxy = tiles.triangles(part.surface.tiles, geometry.points, *cuts)
+    cuts = tile_triangles.by_error(part.surface.tiles, found, tile_triangles.Allowed.everywhere(len(found.bends), rate))
+    proxy = tile_triangles.triangles(part.surface.tiles, geometry.points, *cuts)
     params = np.einsum("nk,nkc->nc", weights[: len(proxy.faces)], proxy.corner_params[: len(weights)])
     places = np.einsum("nk,nkc->nc", weights[: len(proxy.faces)], proxy.vertices[proxy.faces][: len(weights)])
     there = at(part.surface, part.theta["points"], proxy.ids[: len(params), 0], params)

@@ -24,7 +24,7 @@ except rts.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
 from rts_surfaces.subdivision.binding import Limit, Rules  # noqa: E402
-from rts_surfaces.subdivision.cage import checked_cage  # noqa: E402
+from rts_surfaces.subdivision.cage_checks import checked_cage  # noqa: E402
 
 COUNT = int(os.environ.get("RTS_CAGES", "600"))
 STEP = 200

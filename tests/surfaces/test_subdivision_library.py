@@ -19,7 +19,7 @@ PROGRAM = """
 import numpy as np
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import Limit
-from rts_surfaces.subdivision.cage import checked_cage
+from rts_surfaces.subdivision.cage_checks import checked_cage
 limit = Limit(checked_cage([[0, 1, 2, 3]], "catmark"))
 assert np.allclose(limit.stencils([0], [[0.5, 0.5]]).sum(), 1)
 print(library.load()._name)

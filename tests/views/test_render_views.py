@@ -414,8 +414,8 @@ def test_pictures_are_bounded_and_more_views_make_more_of_them(monkeypatch):
     parts = [part.replace(theta={"vertices": torch.tensor(part.theta["vertices"])}) for part in scene()[:2]]
     expected = rts.render_views(parts, CAMERAS, SIZE)
     made = []
-    apart = Picture.apart
-    monkeypatch.setattr(Picture, "apart", lambda self, *given: made.append(self.views) or apart(self, *given))
+    split = Picture.split
+    monkeypatch.setattr(Picture, "split", lambda self, *given: made.append(self.views) or split(self, *given))
     monkeypatch.setattr(side_by_side, "SIDE", 60)  # Views of 28 × 35 cells, two above one another.
     torch.testing.assert_close(rts.render_views(parts, CAMERAS, SIZE), expected, rtol=0, atol=2e-5)
     assert made == [2, 1]

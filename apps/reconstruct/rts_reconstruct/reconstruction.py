@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 import rts
-from rts.diagnostics.command_tools import output_folder, writing
+from rts.diagnostics.measuring_api import output_folder, writing
 from rts_reconstruct import files, job, measures, pictures, posing, stages, texturing
 from rts_reconstruct.light import decoded
 from rts_reconstruct.model import Model

@@ -161,8 +161,8 @@ def _splatter(case: _Case, touched: Touched) -> None:
     if before is None:
         return
     if case.subject.opaque:
-        told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
-        kind, because = "outlines", f"{told} lacks derivatives of outlines that 'auto' has"
+        current = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
+        kind, because = "outlines", f"{current} lacks derivatives of outlines that 'auto' has"
     else:
         kind, because = "transparent", "shaders are not opaque, but the splatter loses what shines through layers"
     case.findings.append(Finding(kind, because, "Leave out splatter=.", case.strong(before), case.gained(before)))

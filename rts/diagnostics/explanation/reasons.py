@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.files.srgb import decode_srgb
-from rts.fitting.parameter_names import listed
+from rts.fitting.parameter_names import names_in_words
 
 KINDS = {
     "constant": ("orange", (255, 150, 0)),
@@ -110,9 +110,9 @@ def merged(findings: Sequence[tuple[str, Finding]], size: tuple[int, int]) -> li
             low, high = min(shares), max(shares)
             span = f"{high:.0%}" if f"{low:.0%}" == f"{high:.0%}" else f"{low:.0%} to {high:.0%}"
             figures.append(f"{span} of the disagreement")
-        told = f" ({', '.join(figures)})" if figures else ""
-        about = listed(names) if names[0] else ""
-        text = " ".join(filter(None, [f"{about}{': ' if about else ''}{because}{told}.", advice]))
+        in_brackets = f" ({', '.join(figures)})" if figures else ""
+        about = names_in_words(names) if names[0] else ""
+        text = " ".join(filter(None, [f"{about}{': ' if about else ''}{because}{in_brackets}.", advice]))
         reasons.append((max(shares, default=1.0), Reason(kind, names if about else [], text, pixels)))
     return [reason for _, reason in sorted(reasons, key=lambda r: -r[0])]
 
@@ -133,8 +133,8 @@ def marked(image: np.ndarray, reasons: Sequence[Reason]) -> np.ndarray:
 
 def legend(reasons: Sequence[Reason]) -> str:
     """The legend of the picture, such as "red = outlines"; empty if no pixel is marked."""
-    told: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for reason in reasons:
         if reason.pixels.any() and reason.color != "none":
-            told[reason.kind] = told.get(reason.kind, 0) + int(reason.pixels.sum())
-    return ", ".join(f"{KINDS[kind][0]} = {kind}" for kind in told)
+            counts[reason.kind] = counts.get(reason.kind, 0) + int(reason.pixels.sum())
+    return ", ".join(f"{KINDS[kind][0]} = {kind}" for kind in counts)

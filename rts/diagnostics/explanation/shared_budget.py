@@ -11,7 +11,7 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import is_real
-from rts.diagnostics.explanation.slopes import Number, chosen, differenced, measured, unit
+from rts.diagnostics.explanation.slopes import Number, differenced, largest_and_random, measured, unit
 from rts.diagnostics.explanation.subject import Subject
 from rts.diagnostics.progress import Phase
 from rts.errors import InputError
@@ -72,7 +72,7 @@ def looked_at(subject: Subject, entries: int, samples: int, clock: Clock, phase:
     planned = []
     for number, ((name, value), slope) in enumerate(zip(named_leaves(parameters), leaves(gradient), strict=True)):
         flat = engine.to_numpy(slope).reshape(-1)
-        for rank, index in enumerate(chosen(flat, entries)):
+        for rank, index in enumerate(largest_and_random(flat, entries)):
             place = ", ".join(map(str, np.unravel_index(index, value.shape)))
             label = f"{name}[{place}]" if value.shape else name
             planned.append((rank, number, index, label, float(flat[index])))

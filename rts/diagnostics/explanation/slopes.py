@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.engines import Engine, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.diagnostics.explanation.subject import DEEP, Subject
 from rts.diagnostics.smoothing import low_pass
@@ -73,7 +74,7 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
     try:
         pushed, forward = subject.push(direction) * step, True
     except (RuntimeError, TypeError):  # Of torch and of jax, for a user's own operation.
-        pushed, forward = np.full_like(subject.seen, np.nan), False
+        pushed, forward = np.full_like(subject.rendered, np.nan), False
     if slope is None:
         slope = float((subject.weights * pushed.astype(np.float64)).sum() / step)
     nothing = Slope(name, slope, math.nan, math.nan, step)
@@ -122,7 +123,7 @@ def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
     )
 
 
-def chosen(gradient: np.ndarray, count: int) -> list[int]:
+def largest_and_random(gradient: np.ndarray, count: int) -> list[int]:
     """Sorted indices of `count` entries of (n,), or all: half the largest or NaN, others random, by a fixed seed."""
     if gradient.size <= count:
         return list(range(gradient.size))

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.arrays.array_functions import kind_of
-from rts.arrays.engines import Engine, is_constant, namespace
+from rts.arrays.engine_base import Engine
+from rts.arrays.engines import is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.contracts.checks import CheckedPart, check_colors, check_scene, check_splatter
+from rts.contracts.checked_parts import CheckedPart, check_colors, check_scene
+from rts.contracts.checks import check_splatter
 from rts.diagnostics.finite_difference_steps import pixel_step
 from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves
@@ -160,7 +162,13 @@ class Subject:
         return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
 
     def step(
-        self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **given: Any
+        self,
+        direction: Tree,
+        change: Change | None = None,
+        *,
+        connect: bool = False,
+        deep: bool = False,
+        **fixed: Any,
     ) -> float | None:
         """The result of `pixel_step` for a changed scene: a factor of the direction, or None where nothing changes.
 
@@ -169,12 +177,12 @@ class Subject:
             change: a change of the scene.
             connect: True to move arrays that no derivative reaches, too.
             deep: True to look at hidden layers, too.
-            **given: options of `rts.render`.
+            **fixed: options of `rts.render`.
         """
         one, unit, at = self._line(direction, connect)
 
         def image(t: Array, **options: Any) -> Array:
-            return self.drawn(at(t), change, **{**given, **options})
+            return self.drawn(at(t), change, **{**fixed, **options})
 
         return pixel_step(self.engine, image, one * 0, unit, deep=deep)
 
@@ -312,8 +320,8 @@ class Subject:
     @cached_property
     def parts(self) -> list[CheckedPart]:
         """The checked parts of the scene at the current parameters."""
-        parts, camera = self.shown(self.parameters)
-        return check_scene(listed_parts(parts), camera)[0]
+        scene_parts, camera = self.shown(self.parameters)
+        return check_scene(listed_parts(scene_parts), camera)[0]
 
     @cached_property
     def supersample(self) -> int:
@@ -335,7 +343,7 @@ class Subject:
         return self.engine.to_numpy(self.engine.value_and_grad(self.loss)(self.image(self.parameters))[1])
 
     @cached_property
-    def seen(self) -> np.ndarray:
+    def rendered(self) -> np.ndarray:
         """(H, W, 4), the image."""
         return self.engine.to_numpy(self.image(self.parameters))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.advice.empty_images import out_of_view
 from rts.arrays.trees import leaves, map_leaves
-from rts.contracts.checks import check_scene
+from rts.contracts.checked_parts import check_scene
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
@@ -134,9 +134,9 @@ def why_constant(subject: Subject, touched: Touched) -> list[Finding]:
         ),
     ):
         if places:
-            told = " and ".join(map(str, places[:2])) + (" and others" if places[2:] else "")
+            named = " and ".join(map(str, places[:2])) + (" and others" if places[2:] else "")
             verbs = ("changes", "is") if len(places) == 1 else ("change", "are")
-            findings.append(Finding("constant", f"{told} {verbs[0]} with it, but {verbs[1]} {why}", advice))
+            findings.append(Finding("constant", f"{named} {verbs[0]} with it, but {verbs[1]} {why}", advice))
     return findings
 
 
@@ -169,10 +169,10 @@ class _Trial:
         return self._changed(None)
 
     def _changed(self, change: Change | None, **options: Any) -> np.ndarray:
-        given = {"splatter": "auto", "background": None, "capacity": None, "supersample": 1, **options}
+        all_options = {"splatter": "auto", "background": None, "capacity": None, "supersample": 1, **options}
         direction = self.number.direction
-        step = self.subject.step(direction, change, deep=True, **given) or self.number.slope.step
-        pushed = self.subject.push(direction, change, **given) * step
+        step = self.subject.step(direction, change, deep=True, **all_options) or self.number.slope.step
+        pushed = self.subject.push(direction, change, **all_options) * step
         return np.abs(pushed).max(axis=-1) > QUIET
 
 
@@ -256,8 +256,10 @@ def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str,
     if not combinations:
         return []
     basis = np.stack(combinations, axis=1)
-    told = directions_in_words(basis, units, [n.slope.name for n in numbers], [()] * len(numbers))
-    because = f"the image does not determine {told}: along it each number changes the image, and all together do not"
+    combination = directions_in_words(basis, units, [n.slope.name for n in numbers], [()] * len(numbers))
+    because = (
+        f"the image does not determine {combination}: along it each number changes the image, and all together do not"
+    )
     advice = "Fix one of them, add a term that prefers one, or fit the combination that the image shows."
     return [("", Finding("undetermined", because, advice))]
 

@@ -1,6 +1,6 @@
 """Rates at which tiles are cut, from their shapes and from where outlines may be. Compiled.
 
-Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
+Tiles, their tables and their local coordinates are those of `rts_surfaces.patches.tiles.Tiles`. It imports numba.
 """
 
 from __future__ import annotations
@@ -116,10 +116,10 @@ def curves(start, stop, found, frames, along, out):
             for c in range(3):
                 tangent[c] = way[0] * found[e, k, 1, c] + way[1] * found[e, k, 2, c]
                 bend[c] = _second(found[e, k], way, way, c)
-            square, own = _dot(tangent, tangent), _dot(bend, bend)
+            square, across_squared = _dot(tangent, tangent), _dot(bend, bend)
             if square > 0:
-                own -= _dot(tangent, bend) ** 2 / square
-            out[e] = max(out[e], math.sqrt(max(own, 0.0)))
+                across_squared -= _dot(tangent, bend) ** 2 / square
+            out[e] = max(out[e], math.sqrt(max(across_squared, 0.0)))
 
 
 # ----------------------------------------------------------------------------------------------- how fine
@@ -131,8 +131,8 @@ def outlines(
 ):
     """Fill `chord`, `edge` and `facing`: allowed distances of triangles from the surface, in units of space.
 
-    The view is a `View` of `rts_surfaces.view_cells`. Out of a perspective view distances are infinite, and `facing`
-    is 0. No distance is below 1e-4 of the tile's radius.
+    The view is a `View` of `rts_surfaces.patches.view_cells`. Out of a perspective view distances are infinite, and
+    `facing` is 0. No distance is below 1e-4 of the tile's radius.
 
     Args:
         start: first tile.
@@ -204,14 +204,14 @@ def outlines(
 
 
 @loop
-def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
+def rates(bends, curvature, chord, edge, facing, sides, least, most, inner, edges):
     """Fill the numbers of pieces into which tiles and edges are cut: inner (n, 2) along s and t, edges (E,).
 
     All are 1 to `most`. Tiles out of view have 1, or `least` if a neighbour cuts one of their edges.
 
     Args:
         bends: (n, 3), as in `shapes`.
-        curves: (E,), the result of `curves`.
+        curvature: (E,), the result of `curvature`.
         chord: (n,), how far triangles of a tile may be off the surface; infinity out of view.
         edge: (n,), how far triangles may be off at those edges of a tile that are outlines.
         facing: (n,) int8, as in `outlines`.
@@ -235,8 +235,8 @@ def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
         if beside[e] == 1 or (front[e] and back[e]):
             fine[e] = min(fine[e], finest[e])
         edges[e] = 1
-        if fine[e] < np.inf and curves[e] > 0:
-            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(curves[e] / (8 * fine[e]))))))
+        if fine[e] < np.inf and curvature[e] > 0:
+            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(curvature[e] / (8 * fine[e]))))))
     for t in range(len(bends)):
         allowed = chord[t]
         ru, rv = 1.0, 1.0

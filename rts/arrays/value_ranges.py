@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 
-def largest(x: np.ndarray) -> float:
+def largest_absolute(x: np.ndarray) -> float:
     """The largest absolute value in an array of floats; 0 if it is empty, NaN if any value is NaN."""
     # Not of |x|, which would be a copy.
     return float(np.maximum(x.max(initial=0), -x.min(initial=0)))
 
 
-def extent(x: np.ndarray) -> tuple[int, int]:
+def value_range(x: np.ndarray) -> tuple[int, int]:
     """The least and the largest number in a non-empty array of integers."""
     return int(x.min()), int(x.max())
 
 
-def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
+def nonnegative(x: np.ndarray) -> tuple[np.ndarray, int, int]:
     """A bool mask, true where integers `x` are not negative; and the least and the largest number in `x` and −1."""
     return x >= 0, int(x.min(initial=-1)), int(x.max(initial=-1))

@@ -1,13 +1,13 @@
 """Hits of rays with bicubic patches, compiled: Newton's method, which may cross the edges of patches.
 
-Patches are in the form of powers, see `rts_surfaces.bicubic_loops`. It imports numba.
+Patches are in the form of powers, see `rts_surfaces.patches.bicubic_loops`. It imports numba.
 """
 
 from __future__ import annotations
 
 import math
 
-from rts_surfaces.bicubic_loops import compiled, first, loop
+from rts_surfaces.patches.bicubic_loops import compiled, first, loop
 
 
 @loop
@@ -76,8 +76,8 @@ def _crossed(across, flips, patch, u, v, inside):
 
 
 @loop
-def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, origins, directions, spread, limits):
-    """Newton's method: move params so that points lie on their rays; see `LIMITS` in `rts_surfaces.parametric`.
+def meet(start, stop, powers, bends, across, flips, ids, params, row, depth, origins, directions, spread, limits):
+    """Newton's method: move params so that points lie on their rays; see `LIMITS` in `rts_surfaces.patches.parametric`.
 
     If the method ends beyond the edge of a patch, it goes on in the patch across this edge: triangles may be off the
     surface by more than thin patches are wide.
@@ -86,10 +86,10 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
         start: first of the L lines of cells, those of all layers.
         stop: one after the last.
         powers: (n, 3, 4, 4), the patches.
-        bounds: (n, 3), the result of `bounds`. Where they prove that a step ends near enough to the ray, the surface is
+        bends: (n, 3), the result of `bends`. Where they prove that a step ends near enough to the ray, the surface is
             not evaluated again.
         across: (n, 4) int32, see `rts_surfaces.patches.across`.
-        flips: (n, 4) bool, as in `rts_surfaces.tiles.Tiles`.
+        flips: (n, 4) bool, as in `rts_surfaces.patches.tiles.Tiles`.
         ids: (N, 1) int32, the patch of each sample; changed where the hit is on another patch.
         params: (N, 2) float32, the samples' start; changed, to 0 without a hit.
         row: (L, W) int32, the sample in each cell, −1 for none; becomes −1 where the sample's ray does not meet the
@@ -107,14 +107,14 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
             n = row[y, x]
             if n < 0:
                 continue
-            met, z = _meet(n, powers, bounds, across, flips, ids, params, origins, directions, spread, limits)
+            met, z = _meet(n, powers, bends, across, flips, ids, params, origins, directions, spread, limits)
             row[y, x], depth[y, x] = n if met else -1, z
             if not met:
                 params[n, 0], params[n, 1] = 0, 0
 
 
 @compiled
-def _meet(n, powers, bounds, across, flips, ids, params, origins, directions, spread, limits):
+def _meet(n, powers, bends, across, flips, ids, params, origins, directions, spread, limits):
     """Move the patch `ids` and the params of sample n until its point lies on its ray; arguments as for `meet`.
 
     Returns True and the depth; or False and 0 without a hit, with `ids` and params unchanged.
@@ -125,7 +125,7 @@ def _meet(n, powers, bounds, across, flips, ids, params, origins, directions, sp
     square, step, crossed = dx * dx + dy * dy + dz * dz, 0, 0
     out_u, out_v = u, v
     while True:
-        p, bound = powers[patch], bounds[patch]
+        p, bound = powers[patch], bends[patch]
         sx, ax, bx = first(p[0], u, v)
         sy, ay, by = first(p[1], u, v)
         sz, az, bz = first(p[2], u, v)

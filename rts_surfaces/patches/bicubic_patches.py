@@ -12,10 +12,10 @@ from rts import GBuffer, engine_of
 from rts.plugin_api.arrays import Array, Tree, constants
 from rts.plugin_api.records import Rays, Samples
 from rts.plugin_api.threads import parallel, read_only
-from rts_surfaces.bicubic import normals, values
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, WIDTHS, check_entry
-from rts_surfaces.parametric import LIMITS, Geometry, Parametric
-from rts_surfaces.tiles import Tiles
+from rts_surfaces.patches.bicubic import normals, values
+from rts_surfaces.patches.parametric import LIMITS, Geometry, Parametric
+from rts_surfaces.patches.tiles import Tiles
 
 ATTRIBUTES = ("colors", "uv")
 """Entries of θ for control points."""
@@ -31,14 +31,14 @@ class Bicubic(Geometry):
     """
 
     def __init__(self, nets: np.ndarray, across: np.ndarray, flips: np.ndarray):
-        from rts_surfaces import bicubic_loops
+        from rts_surfaces.patches import bicubic_loops
 
         self.nets, self.powers = nets, bicubic_loops.powers(nets)
         self.across, self.flips = across, flips
 
     def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
         """See `Geometry`."""
-        from rts_surfaces import bicubic_loops
+        from rts_surfaces.patches import bicubic_loops
 
         loop, width = (bicubic_loops.expansions, 6) if order else (bicubic_loops.points, 1)
         out = np.empty((len(patch), width, 3))
@@ -47,7 +47,7 @@ class Bicubic(Geometry):
 
     def meet(self, samples: Samples, rays: Rays) -> Samples:
         """See `Geometry`."""
-        from rts_surfaces import ray_patch_loops
+        from rts_surfaces.patches import ray_patch_loops
 
         bounds = np.empty((len(self.nets), 3))
         ray_patch_loops.bounds(self.nets, bounds)
@@ -80,10 +80,10 @@ class Patches(Parametric):
         self.across = read_only(across(self.whole.sides))
 
     @abc.abstractmethod
-    def bezier_rows(self, values: Array) -> Array:
-        """Values (M, C) at the control points of the Bézier patches, linear in `values`.
+    def bezier_rows(self, controls: Array) -> Array:
+        """Values (M, C) at the control points of the Bézier patches, linear in `controls`.
 
-        `values` (…, C) are those of an entry of θ, in any engine, or NumPy in float64.
+        `controls` (…, C) are those of an entry of θ, in any engine, or NumPy in float64.
         """
 
     @abc.abstractmethod

@@ -12,8 +12,8 @@ from rts import InputError, Part
 from rts.plugin_api.arrays import Array
 from rts.plugin_api.checks import index_table
 from rts.plugin_api.threads import read_only
-from rts_surfaces.parametric import TOLERANCE
-from rts_surfaces.patches import Patches
+from rts_surfaces.patches.bicubic_patches import Patches
+from rts_surfaces.patches.parametric import TOLERANCE
 
 
 class Bezier(Patches):
@@ -83,9 +83,9 @@ class Bezier(Patches):
         used, table = np.unique(table, return_inverse=True)
         return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
 
-    def bezier_rows(self, values: Array) -> Array:
+    def bezier_rows(self, controls: Array) -> Array:
         """The values unchanged, since control points are those of Bézier patches already."""
-        return values
+        return controls
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
         """See `Patches`: one axis, with at least as many rows as the indices need."""

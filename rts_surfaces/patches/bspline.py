@@ -12,8 +12,8 @@ from rts import InputError, Part, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, from_numbers, shape_of
 from rts.plugin_api.checks import check_numbers, is_count, quoted
 from rts.plugin_api.threads import read_only
-from rts_surfaces.parametric import TOLERANCE
-from rts_surfaces.patches import Patches
+from rts_surfaces.patches.bicubic_patches import Patches
+from rts_surfaces.patches.parametric import TOLERANCE
 
 ENDS = ("open", "clamped", "periodic")
 
@@ -65,15 +65,15 @@ class BSpline(Patches):
             cls((6, 8), ("clamped", "periodic")), {"points": points, "colors": colors.astype(np.float32)}, "lambert"
         )
 
-    def bezier_rows(self, values: Array) -> Array:
+    def bezier_rows(self, controls: Array) -> Array:
         """Values (M, C) at the Bézier control points of all patches, from those at control points, (nu, nv, C).
 
         They come by knot insertion, whose weights are ≥ 0.
         """
-        xp, engine = namespace(values), engine_of(values)
-        a, b = (engine.constant(m, values) for m in self._along)
-        (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
-        rows = xp.reshape(_product(a, xp.reshape(values, (nu, nv * width))), (mu, nv, width))
+        xp, engine = namespace(controls), engine_of(controls)
+        a, b = (engine.constant(m, controls) for m in self._along)
+        (nu, nv, width), (mu, mv) = controls.shape, (len(m) for m in self._along)
+        rows = xp.reshape(_product(a, xp.reshape(controls, (nu, nv * width))), (mu, nv, width))
         rows = xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (nv, mu * width))
         rows = xp.reshape(_product(b, rows), (mv, mu, width))
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))

@@ -87,7 +87,7 @@ def _value_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, 
 
 
 def _value_loops() -> tuple[Callable, Callable, Callable]:
-    from rts_surfaces import bicubic_loops as loops
+    from rts_surfaces.patches import bicubic_loops as loops
 
     return loops.values, loops.push_values, loops.pull_values
 
@@ -97,10 +97,10 @@ def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int,
 
 
 def _normal_loops() -> tuple[Callable, Callable, Callable]:
-    from rts_surfaces import bicubic_loops as loops
+    from rts_surfaces.patches import bicubic_normals_loops as loops
 
-    normals, push, pull = loops.normals, loops.push_normals, loops.pull_normals
-    return partial(normals, COLLAPSED), partial(push, COLLAPSED), partial(pull, COLLAPSED)
+    forward, push, pull = loops.normals, loops.push_normals, loops.pull_normals
+    return partial(forward, COLLAPSED), partial(push, COLLAPSED), partial(pull, COLLAPSED)
 
 
 _PACKED: dict[str, Any] = {"packed": (1, 2), "packed_result": True}

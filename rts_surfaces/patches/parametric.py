@@ -16,8 +16,9 @@ from rts import Camera, InputError, TriangleSurface, engine_of
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_positive, is_count
 from rts.plugin_api.records import Proxy, Rate, Rays, Samples
-from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_error, shapes, split, triangles, uniform
-from rts_surfaces.view_cells import view_key, view_of
+from rts_surfaces.patches.tile_triangles import Allowed, Shapes, allowed_in, by_error, shapes, triangles, uniform
+from rts_surfaces.patches.tiles import MOST, Tiles, split
+from rts_surfaces.patches.view_cells import view_key, view_of
 
 TOLERANCE = 0.1
 """The largest distance of a triangle from the surface where there may be an outline, pixels."""
@@ -36,7 +37,7 @@ class Geometry(abc.ABC):
 
     @abc.abstractmethod
     def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
-        """Points of the surface, with derivatives if `order` is 2; see `rts_surfaces.tiles.Points`."""
+        """Points of the surface, with derivatives if `order` is 2; see `rts_surfaces.patches.tiles.Points`."""
 
     @abc.abstractmethod
     def meet(self, samples: Samples, rays: Rays) -> Samples:
@@ -87,13 +88,13 @@ class Parametric(TriangleSurface):
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """The surface at each of `TOLERANCES` but its own."""
-        rates = []
+        offered = []
         for tolerance in TOLERANCES:
             if tolerance != self.tolerance:
                 other = copy.copy(self)
                 other.tolerance = tolerance
-                rates.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
-        return rates
+                offered.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
+        return offered
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
         """Rates of the edges (E,) and the insides (n, 2) of `whole`, for sides of patches cut into `rate` pieces."""

@@ -1,6 +1,6 @@
 """The triangles of tiles that are cut, compiled.
 
-Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
+Tiles, their tables and their local coordinates are those of `rts_surfaces.patches.tiles.Tiles`. It imports numba.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _count(rates, sides, edges):
 def counted(inner, sides, edges):
     """The total number of triangles of n tiles with k sides.
 
-    `inner` (n, 2) and `edges` (E,) are rates as in `tiles.triangles`; `sides` (n, k) are indices into `edges`.
+    `inner` (n, 2) and `edges` (E,) are rates as in `tile_triangles.triangles`; `sides` (n, k) are indices into `edges`.
     """
     total = 0
     for n in range(len(inner)):

@@ -1,7 +1,7 @@
 """Names for programs that measure scenes, such as `rts compare`: scenes checked, default cameras, options, files."""
 
 from rts.arrays.engines import engine_named
-from rts.contracts.checks import check_scene
+from rts.contracts.checked_parts import check_scene
 from rts.errors import InputError
 from rts.files.paths import output_folder, writing
 from rts.scene.default_camera import default_camera

@@ -1,0 +1,88 @@
+"""Options that commands share, and how their texts are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """(height, width) of "256" or "480x640"."""
+    parts = text.lower().split("x")
+    if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
+        raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")
+    return int(parts[0]), int(parts[-1])
+
+
+def layers_of(text: str) -> Any:
+    """The `layers` written as "4" or "auto"."""
+    if text != "auto" and not text.lstrip("-").isdecimal():
+        raise typer.BadParameter(
+            f"{text!r} is no number of layers; expected an integer, or auto", param_hint="'--layers'"
+        )
+    return text if text == "auto" else int(text)
+
+
+def view_of(text: str) -> tuple[float, ...]:
+    """Azimuth, elevation and optional distance, from comma-separated numbers."""
+    try:
+        numbers = tuple(float(x) for x in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (2, 3):
+        raise typer.BadParameter(f'{text!r} is no camera; expected "azimuth,elevation" or "azimuth,elevation,distance"')
+    return numbers
+
+
+def color_of(text: str) -> tuple[float, ...] | None:
+    """The linear colour (3,), 0 to 1, of a colour's name or "#rrggbb"; None for "none", which is transparent."""
+    from PIL import ImageColor
+
+    from rts.files.srgb import decode_srgb
+
+    if text == "none":
+        return None
+    try:
+        return tuple(decode_srgb(np.array(ImageColor.getrgb(text)[:3]) / 255))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no colour; expected a name, #rrggbb, or none") from None
+
+
+def is_given(context: typer.Context, option: str) -> bool:
+    """True if an option was given, and not left at its default."""
+    source = context.get_parameter_source(option)
+    return source is not None and source.name != "DEFAULT"
+
+
+def refuse_beside(option: str, context: typer.Context, others: Sequence[str]) -> None:
+    """Refuse other options that were given beside one that says the same."""
+    for other in others:
+        if is_given(context, other):
+            raise typer.BadParameter(f"--{other} beside {option}, which says it already; leave one of them out")
+
+
+SurfaceName = Annotated[
+    str, typer.Option(help="Name of the surface that reads the model: mesh, or such as bezier for patches.")
+]
+
+
+OrbitAngles = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        help="Azimuth,elevation[,distance] about the middle of the object: degrees, and world units. "
+        "Without a distance the whole object is in view.",
+    ),
+]
+
+
+FieldOfView = Annotated[float, typer.Option(help="Vertical field of view in degrees.")]
+
+
+UpAxis = Annotated[str, typer.Option(help="The axis that is upright: y or z.")]
+
+
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; may stand anywhere.")]

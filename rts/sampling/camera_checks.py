@@ -1,0 +1,89 @@
+"""Checks of the cameras that surfaces and samplers get on the host."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from rts.arrays.argument_checks import is_invertible
+from rts.errors import InputError
+from rts.scene.camera import Camera
+
+WELL_CONDITIONED = 1e-6
+"""The `_spread` of rows from which on a matrix is far from singular."""
+
+
+def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
+    """The camera of host matrices, refused where it makes no image.
+
+    Its matrices must be finite and invertible. The last row of the view must be 0, 0, 0, 1, and that of the projection
+    0, 0, c ≤ 0, d.
+
+    Args:
+        camera: float64; its view is that of the camera times the part's transform.
+        transform: the part's transform, if it has one, which an error may blame.
+
+    Returns:
+        The camera, the last row of its view without rounding.
+    """
+    for name, matrix in (("view", camera.view), ("projection", camera.projection)):
+        if not np.isfinite(matrix).all():
+            bad = name == "view" and transform is not None and not np.isfinite(transform).all()
+            what = "transform of a part" if bad else f"camera's {name} matrix"
+            raise InputError(f"the {what} holds NaN or infinity; check how it was made")
+    # Most are far from singular; singular values take longer.
+    well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
+    if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
+        _check_invertible(camera)
+    x, y, z, w = camera.view[3].tolist()
+    if max(abs(x), abs(y), abs(z), abs(w - 1)) > ROUNDING:
+        raise InputError(
+            f"the last row of the camera's view times the part's transform is {[x, y, z, w]}; expected 0, 0, 0, 1"
+        )
+    a, b, c, d = camera.projection[3].tolist()
+    if max(abs(a), abs(b)) > ROUNDING * max(abs(c), abs(d)):
+        raise InputError(
+            f"the last row of the camera's projection is {[a, b, c, d]}; expected (0, 0, ±c, d): if it is the product "
+            f"of projection and view, use Camera.from_mvp(matrix)"
+        )
+    if c > 0:
+        raise InputError(
+            f"the last row of the camera's projection is {[a, b, c, d]}: it looks along +z, which cannot be turned "
+            f"while it is traced; use Camera.from_mvp(projection @ view)"
+        )
+    if x == y == z == 0 and w == 1:
+        return camera
+    return camera.replace(view=np.concatenate([camera.view[:3], [[0.0, 0.0, 0.0, 1.0]]]))
+
+
+ROUNDING = 1e-6
+"""Tolerance of the entries of a matrix's last row, relative to its largest."""
+
+
+def _spread(m: np.ndarray) -> float:
+    """The squared determinant of a (3, 3) matrix over the product of its rows' squared lengths.
+
+    It is 1 for orthogonal rows, 0 for dependent rows.
+    """
+    a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
+    square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
+    return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
+
+
+@functools.lru_cache(maxsize=64)
+def _spread_of_projection(data: bytes) -> float:
+    """The `_spread` of a (4, 4) float64 matrix, given as bytes; cached, since calls often repeat it."""
+    matrix = np.frombuffer(data).reshape(4, 4)
+    square = float((matrix * matrix).sum(axis=1).prod())
+    return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
+
+
+def _check_invertible(camera: Camera) -> None:
+    # A view must not flatten, at whatever scale; the rows of a projection may differ in scale.
+    singular = np.linalg.svd(camera.view[:3, :3], compute_uv=False)
+    sound = {"view": singular[-1] > 1e-12 * singular[0], "projection": is_invertible(camera.projection)}
+    for name in (name for name, ok in sound.items() if not ok):
+        raise InputError(
+            f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
+        )

@@ -1,0 +1,39 @@
+"""Entries of θ that shaders read, refused where they are wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rts.arrays.array_functions import described, is_finite, shape_of
+from rts.arrays.engines import namespace, value_of
+from rts.arrays.trees import Array, Tree
+from rts.contracts.checks import BRIGHTEST, check_bounded
+from rts.errors import InputError
+
+
+def entry_of(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Array:
+    """An entry of θ, refused where it has none of these shapes."""
+    value = theta[name]
+    check_entry(f"[{name!r}]", value, " or ".join(map(str, shapes)), shape_of(value) in shapes)
+    return value
+
+
+def check_entry(entry: str, value: Any, expected: str, ok: bool) -> None:
+    """Refuse an entry of θ that is no finite number or floating array; `ok` says that it has the expected shape."""
+    number = isinstance(value, (bool, int, float))
+    if not ok or not (number or hasattr(value, "dtype")):
+        raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
+    if not number and not namespace(value).isdtype(value.dtype, "real floating"):
+        raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
+    check_bounded(f"theta{entry}", np.asarray(value, float) if number else value)
+
+
+def check_base(name: str, base: Array) -> None:
+    """Refuse base colours (N, C) of `BRIGHTEST` or more; NaN is refused with the shader's result, by its cause."""
+    if not is_finite(base, below=BRIGHTEST):
+        values = value_of(base)
+        if values is not None and not np.isnan(values).any():
+            raise InputError(f"{name} holds a number of {BRIGHTEST:g} or more; expected smaller colours")

@@ -1,0 +1,79 @@
+"""Calls of host functions with torch's tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from rts.plugin_api.records import ArraySpec
+from rts_backends.torch_engine.functions import foreign, transformed
+
+
+def to_tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
+    """A tensor of an array or a number, without a copy where torch can share its memory."""
+    array = np.asarray(value)
+    if not (array.flags.c_contiguous and array.flags.writeable):
+        array = array.copy("C")  # torch warns of read-only memory, since it cannot mark a tensor so.
+    tensor = torch.from_numpy(array)
+    return tensor if device is None or device.type == "cpu" else tensor.to(device)
+
+
+def to_host(x: torch.Tensor) -> np.ndarray:
+    """The detached value as NumPy, without a copy where it is on the host; both half precisions as float32."""
+    x = x.detach().cpu()
+    return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
+
+
+class _HostCall(torch.autograd.Function):
+    """A call of a host function, without derivative, that works under every torch transform."""
+
+    @staticmethod
+    def forward(fn, specs, *args):
+        device, values = None, []
+        for a in args:
+            tensor = isinstance(a, torch.Tensor)
+            device = a.device if tensor and device is None else device
+            values.append(to_host(a) if tensor else a)
+        return tuple([to_tensor(r, device) for r in fn(*values)])
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.mark_non_differentiable(*output)
+        ctx.counts = len(inputs), len(output)
+
+    @staticmethod
+    def backward(ctx, *_):
+        return (None,) * ctx.counts[0]
+
+    @staticmethod
+    def jvp(ctx, *_):
+        return (None,) * ctx.counts[1]
+
+    # torch's own signature has no named arguments, though its manual has.
+    @staticmethod
+    def vmap(info, in_dims, fn, specs, *args):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
+        def select(b):
+            return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
+
+        items = [_HostCall.apply(fn, specs, *select(b)) for b in range(info.batch_size)]
+        outputs = []
+        for spec, values in zip(specs, zip(*items, strict=True), strict=True):
+            if spec.packed:
+                rows = max(v.shape[0] for v in values)
+                values = [torch.cat([v, v.new_zeros((rows - v.shape[0], *v.shape[1:]))]) for v in values]
+            outputs.append(torch.stack(tuple(values)))
+        return tuple(outputs), (0,) * len(outputs)
+
+
+def call_host(fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
+    """The results of a host function, as tensors without derivative; see `Engine.call_host`."""
+    if torch.compiler.is_compiling():
+        # torch annotates nothing of what `disable` returns.
+        return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)  # pyright: ignore[reportCallIssue]
+    if transformed() or foreign(*(a for a in args if isinstance(a, torch.Tensor))):
+        return _HostCall.apply(fn, specs, *args)
+    with torch.no_grad():
+        return _HostCall.forward(fn, specs, *args)

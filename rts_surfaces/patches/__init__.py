@@ -1,0 +1,1 @@
+"""Surfaces of parametric patches: tiles, triangles by error, and bicubic patches."""
