@@ -26,7 +26,7 @@ class Bicubic(Geometry):
 
     Args:
         nets: (n, 4, 4, 3) float64, the control points, first along u, then along v.
-        across: (n, 4) int32, the result of the function `across`.
+        across: (n, 4) int32, the result of `sides_across`.
         flips: (n, 4) bool, the `flips` of the patches as `Tiles`.
     """
 
@@ -77,7 +77,7 @@ class Patches(Parametric):
     def __init__(self, table: np.ndarray, tolerance: float, used: np.ndarray | None = None):
         self.table = read_only(np.array(table, np.int32))
         super().__init__(_tiles(self.table), tolerance, used)
-        self.across = read_only(across(self.whole.sides))
+        self.across = read_only(sides_across(self.whole.sides))
 
     @abc.abstractmethod
     def bezier_rows(self, controls: Array) -> Array:
@@ -139,7 +139,7 @@ class Patches(Parametric):
         return values(self.bezier_rows(attribute), *where)
 
 
-def across(sides: np.ndarray) -> np.ndarray:
+def sides_across(sides: np.ndarray) -> np.ndarray:
     """The side beyond each side, (n, 4) int32, by its number 4 × patch + side; −1 at the border of the surface.
 
     Where m > 2 sides share an edge, in order of their numbers, each leads to the one ⌊m / 2⌋ after it, cyclically. So

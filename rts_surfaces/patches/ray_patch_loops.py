@@ -88,7 +88,7 @@ def meet(start, stop, powers, bends, across, flips, ids, params, row, depth, ori
         powers: (n, 3, 4, 4), the patches.
         bends: (n, 3), the result of `bends`. Where they prove that a step ends near enough to the ray, the surface is
             not evaluated again.
-        across: (n, 4) int32, see `rts_surfaces.patches.across`.
+        across: (n, 4) int32, the result of `sides_across` of `rts_surfaces.patches.bicubic_patches`.
         flips: (n, 4) bool, as in `rts_surfaces.patches.tiles.Tiles`.
         ids: (N, 1) int32, the patch of each sample; changed where the hit is on another patch.
         params: (N, 2) float32, the samples' start; changed, to 0 without a hit.

@@ -15,7 +15,7 @@ try:
 except rts.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
-from rts_surfaces.patches import tiles as tiling  # noqa: E402
+from rts_surfaces.patches import tile_triangles as tiling  # noqa: E402
 from rts_surfaces.subdivision.face_tiles import tiles_of  # noqa: E402
 from rts_surfaces.subdivision.surface import BESIDE, LIMITS  # noqa: E402
 
