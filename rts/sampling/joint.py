@@ -17,6 +17,7 @@ from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
+from rts.plugin_base import overrides
 from rts.sampling.camera_checks import check_camera
 from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
 from rts.sampling.packing import pack_fragments
@@ -187,7 +188,8 @@ def _is_suited(part: CheckedPart, sampler: object) -> bool:
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
         return False
-    return sampler.joins_parts and surface.centered and not surface.refines and not surface.depends_on_view
+    joins = sampler.joins_parts and not overrides(sampler, "sample", TriangleSampler)
+    return joins and surface.centered and not surface.refines and not surface.depends_on_view
 
 
 def _moved(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:
