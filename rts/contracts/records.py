@@ -261,7 +261,7 @@ class Sampled(_OnCells):
     the image's, times `supersample`, plus twice the apron.
 
     Attributes:
-        samples: one `Samples` for each part.
+        samples: one `Samples` for each part. Parts that were sampled at once have no cells of their own.
         cells: the index of the sample in each cell, counted over all parts in order.
         overflow: () int32, number of samples dropped for want of capacity, or beyond the limit of `layers="auto"`.
             Should be 0.

@@ -67,11 +67,17 @@ def sample(
 
 
 def sampled_scene(
-    scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings, one_shader: bool = True
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    settings: RenderSettings,
+    one_shader: bool = True,
+    joins: bool = True,
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window; see `sample`.
 
-    With `one_shader` they serve the shaders of the scene alone, so that cells of one colour may name one sample.
+    With `one_shader` they serve the shaders of the scene alone, so that cells of one colour may name one sample. With
+    `joins`, parts that are sampled at once have no cells of their own in `Samples`.
     """
     settings = settings.of(scene)
     factor, capacity = settings.supersample, settings.capacity
@@ -79,7 +85,7 @@ def sampled_scene(
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     scene = with_entries(scene, grid) if outlines else scene
-    scene = with_joints(scene, grid) if capacity is None else scene
+    scene = with_joints(scene, grid) if joins and capacity is None else scene
     # Inside of one colour nothing depends on where a sample lies.
     uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
     taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines, uniform=uniform))

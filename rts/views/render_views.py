@@ -153,7 +153,7 @@ def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: R
     """The samples of each view; every core samples one view at a time, if threads may."""
 
     def sample_view(view_scene: Scene) -> Sampled:
-        return sampled_scene(view_scene, view_scene.camera, size, settings)
+        return sampled_scene(view_scene, view_scene.camera, size, settings, joins=False)
 
     return each(sample_view, scenes) if _concurrent(scenes[0]) else list(map(sample_view, scenes))
 
