@@ -1,0 +1,133 @@
+"""Scenes of many parts beside one merged mesh: the time of an image and the gradient of a step of all parts.
+
+    python -m benchmarks.many_parts
+    python -m benchmarks.many_parts --parts 10 100 --links 11
+
+A part is a closed cylinder of 512 faces, with a matrix of its own, seen as a silhouette. Both ways take turns in one
+run; memory is the most that one step takes. With `--links`, a chain of so many parts is fitted by Levenberg–Marquardt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import tracemalloc
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+import trimesh
+
+import rts
+from benchmarks.timing import in_turn
+
+CAMERA = rts.Camera.look_at((0.3, 0.8, 4), (0, 0, 0), fov_y=40)
+PARTS, SIDE, ROUNDS = (1, 3, 10, 30, 100), 256, 7
+
+
+def link() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a part."""
+    cylinder = trimesh.creation.cylinder(radius=0.08, height=0.3, sections=128)
+    return np.asarray(cylinder.vertices, np.float32), np.asarray(cylinder.faces, np.int32)
+
+
+def rigid_each(poses: torch.Tensor) -> list[torch.Tensor]:
+    """The matrix of each pose (count, 6)."""
+    return [rts.rigid(pose) for pose in poses]
+
+
+def ways(
+    count: int, shader: str, matrices: Callable[[torch.Tensor], list[torch.Tensor]] = rigid_each
+) -> dict[str, Callable[[torch.Tensor], rts.Part | list[rts.Part]]]:
+    """Two scenes of one picture, as functions of parameters, which `matrices` turns into a matrix a part."""
+    vertices, faces = link()
+    one, table = rts.Mesh(faces), torch.from_numpy(vertices)
+    every = rts.Mesh(np.concatenate([faces + i * len(vertices) for i in range(count)]))
+
+    def parts(parameters: torch.Tensor) -> list[rts.Part]:
+        return [rts.Part(one, {"vertices": vertices}, shader, transform=m) for m in matrices(parameters)]
+
+    def merged(parameters: torch.Tensor) -> rts.Part:
+        moved = [table @ m[:3, :3].T + m[:3, 3] for m in matrices(parameters)]
+        return rts.Part(every, {"vertices": torch.cat(moved)}, shader)
+
+    return {"parts": parts, "merged": merged}
+
+
+def poses_of(count: int) -> torch.Tensor:
+    """Poses (count, 6) at random."""
+    random = np.random.default_rng(0)
+    poses = np.concatenate([random.normal(size=(count, 3)), random.uniform(-1, 1, (count, 3))], axis=1)
+    return torch.tensor(poses, dtype=torch.float32)
+
+
+def steps(count: int, shader: str) -> dict[str, Callable[[], object]]:
+    """An image and its gradient in all poses, both ways."""
+
+    def step(scene: Callable) -> Callable[[], object]:
+        def run() -> None:
+            poses = poses_of(count).requires_grad_(True)
+            rts.render(scene(poses), CAMERA, (SIDE, SIDE)).square().mean().backward()
+
+        return run
+
+    return {name: step(scene) for name, scene in ways(count, shader).items()}
+
+
+def most_memory(step: Callable[[], object]) -> float:
+    """The most memory of NumPy's arrays in a step, MB."""
+    step()
+    tracemalloc.start()
+    step()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return most / 1e6
+
+
+def chain(count: int) -> None:
+    """Print the time of Levenberg–Marquardt on the angles of a chain, as parts and merged."""
+    truth = torch.tensor(np.random.default_rng(1).uniform(-0.3, 0.3, count), dtype=torch.float32)
+    upright = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)).astype(np.float32)
+
+    def matrices(angles: torch.Tensor) -> list[torch.Tensor]:
+        # Each link turns about the end of the last one; the axis of a cylinder is laid along it.
+        turn, at, found = torch.zeros(()), torch.tensor([-0.15 * count, 0.0]), []
+        for angle in angles:
+            turn = turn + angle
+            ahead = torch.stack([torch.cos(turn), torch.sin(turn)])
+            middle, at = at + 0.15 * ahead, at + 0.3 * ahead
+            zero = 0 * turn
+            pose = torch.stack([zero, zero, turn, middle[0], middle[1], zero])
+            found.append(rts.rigid(pose) @ torch.from_numpy(upright))
+        return found
+
+    for name, scene in ways(count, "silhouette", matrices).items():
+        target = rts.render(scene(truth), CAMERA, (SIDE, SIDE)).detach()
+        residuals = rts.ImageResiduals(scene, CAMERA, (SIDE, SIDE), target)
+        before = time.process_time()
+        result = rts.fit(residuals, torch.zeros(count), method="lm", steps=20, progress=False)
+        off = float((result.parameters - truth).abs().max())
+        seconds, number = time.process_time() - before, len(result.history)
+        print(f"| {name} | {seconds:.1f} | {number} | {off:.1e} |", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", type=int, default=PARTS)
+    parser.add_argument("--shader", default="silhouette")
+    parser.add_argument("--links", type=int, default=0)
+    args = parser.parse_args(arguments)
+    print(f"| parts | each, ms | merged, ms | ratio | each, MB | merged, MB |\n{'| --- ' * 6}|")
+    for count in args.parts:
+        functions = steps(count, args.shader)
+        times = {name: t["ms"] for name, t in in_turn(functions, ROUNDS).items()}
+        memory = {name: most_memory(step) for name, step in functions.items()}
+        row = times["parts"], times["merged"], times["parts"] / times["merged"], memory["parts"], memory["merged"]
+        print(f"| {count} | {row[0]:.1f} | {row[1]:.1f} | {row[2]:.2f} | {row[3]:.1f} | {row[4]:.1f} |", flush=True)
+    if args.links:
+        print("\n| chain | CPU s | steps | error of angles |\n| --- | --- | --- | --- |")
+        chain(args.links)
+
+
+if __name__ == "__main__":
+    main()
