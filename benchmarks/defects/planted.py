@@ -355,14 +355,14 @@ ARRAYS = [
         "rts/outlines/gaps.py",
         "(depths[1] < depths[0]).astype(np.int32)",
         "(depths[1] > depths[0]).astype(np.int32)",
-        "field_outlines gaps",
+        "field_outlines breaks_of_fields",
     ),
     Defect(
         "slopes are taken beyond a crossing",
         "rts/outlines/gaps.py",
         "inward, across = way * BESIDE * step,",
         "inward, across = -way * BESIDE * step,",
-        "gaps",
+        "breaks_of_fields",
     ),
     Defect(
         "rows beside outlines of earlier parts are not counted",

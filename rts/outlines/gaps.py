@@ -69,6 +69,34 @@ class Oracle(NamedTuple):
         return self.width[0] + self.width[1] * depth
 
 
+class Gaps(NamedTuple):
+    """Gaps to look at: those of each row of centres, one row after the other, then those of each column.
+
+    Attributes:
+        gap: (M, 3) int32, y and x of the first centre; 1 for a gap along a row, 0 along a column.
+        rows: (H, W) int32, how many of them come before each centre of a row.
+        columns: (W, H) int32, and of a column.
+        around: (H, W) int8, the cells of gaps and those beside; see `spans_loops.around`.
+    """
+
+    gap: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    around: np.ndarray
+
+    @classmethod
+    def of(cls, marks: np.ndarray) -> Gaps:
+        """The gaps that are marked (2, H, W), along rows and along columns."""
+        from rts.outlines import spans_loops
+
+        (height, width), gap = marks.shape[1:], np.empty((np.count_nonzero(marks), 3), np.int32)
+        rows, columns = np.empty((height, width), np.int32), np.empty((width, height), np.int32)
+        spans_loops.number(marks, gap, rows, columns)
+        cells = np.zeros((height, width), np.int8)
+        spans_loops.around(gap, cells)
+        return cls(gap, rows, columns, cells)
+
+
 class Breaks(NamedTuple):
     """Breaks, those of a gap in order along it. Host arrays; see `rts.contracts.records.Outlines`.
 

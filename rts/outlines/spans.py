@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.outlines.gaps import INNER, Breaks, Fronts, lines_of_crossing
-from rts.outlines.sheets import Gaps, Sheets
+from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, lines_of_crossing
+from rts.outlines.sheets import Sheets
 
 
 def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndarray) -> Breaks:

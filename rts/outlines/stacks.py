@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.compiling.threads import parallel
-from rts.outlines.gaps import INNER, Breaks, Fronts, Stacks
-from rts.outlines.sheets import Gaps, Sheets
+from rts.outlines.gaps import INNER, Breaks, Fronts, Gaps, Stacks
+from rts.outlines.sheets import Sheets
 from rts.outlines.spans import crossings, spans_on, tangents
 
 

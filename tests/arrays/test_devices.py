@@ -245,7 +245,7 @@ def test_images_and_derivatives_are_those_of_the_cpu(place, name):
     value, slopes = place.gradient(loss_of(case, weights), tree)
     # The host gets inputs of the sampler, and nothing else; loops along rays ask whether any ray is not done.
     assert elsewhere.copies or place.name != "torch-elsewhere"
-    assert all(line.endswith(" _to_host") for line in elsewhere.copies), elsewhere.copies
+    assert all(line.endswith(" to_host") for line in elsewhere.copies), elsewhere.copies
     loops = ("_repeated", "_cast_some") if name in ("sdf", "rays") else ()
     assert all(line.endswith(loops) for line in elsewhere.waits) if loops else not elsewhere.waits, elsewhere.waits
     assert abs(float(place.take(value)) - (image * WEIGHTS).sum()) < 1e-3

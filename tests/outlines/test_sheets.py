@@ -6,8 +6,8 @@ import pytest
 from rts.compiling.threads import read_only
 from rts.contracts.records import Proxy
 from rts.outlines import sheets, spans_loops
-from rts.outlines.gaps import Fronts
-from rts.outlines.sheets import Gaps, Sheets
+from rts.outlines.gaps import Fronts, Gaps
+from rts.outlines.sheets import Sheets
 from rts.scene.camera import Camera
 
 pytestmark = pytest.mark.sampling

