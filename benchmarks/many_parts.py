@@ -86,7 +86,7 @@ def most_memory(step: Callable[[], object]) -> float:
 
 def chain(count: int) -> None:
     """Print the time of Levenberg–Marquardt on the angles of a chain, as parts and merged."""
-    truth = torch.tensor(np.random.default_rng(1).uniform(-0.3, 0.3, count), dtype=torch.float32)
+    truth = torch.tensor(np.random.default_rng(1).uniform(-0.1, 0.1, count), dtype=torch.float32)
     upright = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)).astype(np.float32)
 
     def matrices(angles: torch.Tensor) -> list[torch.Tensor]:
@@ -104,6 +104,7 @@ def chain(count: int) -> None:
     for name, scene in ways(count, "silhouette", matrices).items():
         target = rts.render(scene(truth), CAMERA, (SIDE, SIDE)).detach()
         residuals = rts.ImageResiduals(scene, CAMERA, (SIDE, SIDE), target)
+        rts.fit(residuals, torch.zeros(count), method="lm", steps=2, progress=False)  # What is imported at first.
         before = time.process_time()
         result = rts.fit(residuals, torch.zeros(count), method="lm", steps=20, progress=False)
         off = float((result.parameters - truth).abs().max())

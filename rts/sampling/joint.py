@@ -104,8 +104,8 @@ class Joint:
         real = np.float64 if context.like is not None and floating_bits(context.like) == 64 else np.float32
         arrays: list[np.ndarray] = [row, packed.depth, ids, packed.overflow]
         names = []
-        for part, (own, params) in zip(self.parts, tables, strict=True):
-            used = np.arange(len(own), dtype=np.int32)[None, None]
+        for part, (own, params, seen) in zip(self.parts, tables, strict=True):
+            used = np.arange(len(own), dtype=np.int32)[None, None] - np.int32(not seen)
             known = _evaluated(part, own, params, context.engine.differentiates)
             names.append(None if known is None else list(known))
             arrays += [own, params, used, *(np.asarray(x, real) for x in (known or {}).values())]
@@ -121,8 +121,13 @@ class Joint:
             samples.append(Samples(own, params, cells, overflow, gbuffer=gbuffer, gbuffer_names=part.reads))
         return Sampled(tuple(samples), Cells(row, depth, triangle), overflow)
 
-    def _by_part(self, packed: Samples, triangles: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-        """The cells' rows, and ids and params of each part, at least one row; `triangles` (N,) are those of samples."""
+    def _by_part(
+        self, packed: Samples, triangles: np.ndarray
+    ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, bool]]]:
+        """The cells' rows; of each part ids and params, at least one row, and whether it is seen at all.
+
+        `triangles` (N,) are those of samples.
+        """
         count = len(self.proxies)
         part = (np.searchsorted(self.starts, triangles, side="right") - 1).astype(np.int16)
         order, counts = np.argsort(part, kind="stable"), np.bincount(part, minlength=count)
@@ -136,7 +141,7 @@ class Joint:
             ids[place], params[place] = packed.ids, packed.params
         row = np.where(packed.row >= 0, place[packed.row], np.int32(-1))
         bounds = itertools.pairwise([0, *ends.tolist()])
-        return row, [(ids[a:b], params[a:b]) for a, b in bounds]
+        return row, [(ids[a:b], params[a:b], bool(seen)) for (a, b), seen in zip(bounds, counts, strict=True)]
 
 
 def with_joints(scene: Scene, grid: Grid) -> Scene:

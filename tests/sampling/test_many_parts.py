@@ -126,7 +126,8 @@ def test_a_part_that_nothing_is_seen_of_keeps_a_row(singly):
     transforms, parts = crowd(5)
     transforms[1, :3, 3] += 100
     own = parts(transforms)
-    assert rts.sample(own, CAMERA, SIZE, engine="torch").samples[1].ids.shape[0] >= 1
+    samples = rts.sample(own, CAMERA, SIZE, engine="torch").samples
+    assert samples[1].ids.shape[0] >= 1 and (samples[1].row == -1).all() and (samples[0].row >= 0).all()
     np.testing.assert_allclose(image_of(own), singly(image_of, own), rtol=0, atol=1e-5)
 
 
