@@ -33,7 +33,7 @@ def step(faces: str) -> list[str]:
         f"{deodr:.3g} ms",
         LOST,
         ratio(ours, [deodr]),
-        "the former default, torch, K = 2, 256²",
+        "the default, torch, 256²",
     ]
 
 

@@ -155,14 +155,14 @@ def speed(numbers: dict[str, Any]) -> list[Row]:
             "16 → 26 ms (1.6×), 2.5K to 2M, V100",
             told(full),
             verdict(growth(full) < 4),
-            f"by the former default; {meshes}",
+            f"{meshes}",
         ),
         Row(
             "RtS-pose hardly depends on the mesh",
             "16 → 17 ms (1.06×)",
             told(pose),
             verdict(growth(pose) < 1.25),
-            "by the former default; finding the points does depend on it, on two cores",
+            "finding the points does depend on it, on two cores",
         ),
     ]
     if "DEODR" in ms:
