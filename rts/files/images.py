@@ -142,13 +142,13 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
             "mp4 needs imageio-ffmpeg: pip install 'rasterize-then-splat[video]'; or write a .gif"
         ) from None
     # The usual pixel format of mp4 halves the resolution of colour: sides must be even.
-    even = [
+    even_sized = [
         np.pad(p, ((0, p.shape[0] % 2), (0, p.shape[1] % 2), *[(0, 0)] * (p.ndim - 2)), mode="edge") for p in pictures
     ]
-    kind = "rgb24" if even[0].ndim == 3 else "gray"
-    writer = write_frames(path, even[0].shape[1::-1], pix_fmt_in=kind, fps=fps, macro_block_size=2)
+    kind = "rgb24" if even_sized[0].ndim == 3 else "gray"
+    writer = write_frames(path, even_sized[0].shape[1::-1], pix_fmt_in=kind, fps=fps, macro_block_size=2)
     writer.send(None)
-    for picture in even:
+    for picture in even_sized:
         writer.send(np.ascontiguousarray(picture))
     writer.close()
 

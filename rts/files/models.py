@@ -73,11 +73,11 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     if not isinstance(surface, str):
         raise InputError(f"surface is {quoted(surface)}; expected a name, such as 'mesh' or 'bezier'")
     if surface != "mesh":
-        reader = registry.plugin("rts.surfaces", surface)
+        plugin = registry.plugin("rts.surfaces", surface)
         if merge or not weld:
             raise InputError(f"merge and weld are for meshes; the surface {surface!r} reads its files without them")
         check_exists(path)
-        return list(reader.load(path))
+        return list(plugin.load(path))
     with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # Checks refuse overflow by name.
         pieces = [_linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):

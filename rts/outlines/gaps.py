@@ -226,9 +226,9 @@ def lines_of_crossing(slope: np.ndarray) -> np.ndarray:
     Args:
         slope: (B, 2, 2), see `Breaks.slope`.
     """
-    apart = slope[:, 1] - slope[:, 0]
-    length = np.hypot(*apart.T)
-    return np.column_stack([apart[:, 1], -apart[:, 0]]) / np.where(length > 0, length, 1.0)[:, None]
+    difference = slope[:, 1] - slope[:, 0]
+    length = np.hypot(*difference.T)
+    return np.column_stack([difference[:, 1], -difference[:, 0]]) / np.where(length > 0, length, 1.0)[:, None]
 
 
 def _ends(gap: np.ndarray, layers: Fronts) -> tuple[Fronts, Fronts, np.ndarray, np.ndarray]:
@@ -304,8 +304,8 @@ class _Change(NamedTuple):
         """The changes in intervals."""
         sides, index = (found.before, found.behind), np.arange(len(found.before.part))
         a, b = (Fronts(*(np.expand_dims(x, axis) for x in side)) for side, axis in zip(sides, (1, 0), strict=True))
-        apart = np.where(_level(a, b, oracle) & (a.part >= 0), np.abs(a.depth - b.depth), np.inf)
-        one = (apart == apart.min(0)) & (apart == apart.min(1)[:, None]) & np.isfinite(apart)
+        distance = np.where(_level(a, b, oracle) & (a.part >= 0), np.abs(a.depth - b.depth), np.inf)
+        one = (distance == distance.min(0)) & (distance == distance.min(1)[:, None]) & np.isfinite(distance)
         # Within the same parts the layer whose depth changes most ends, as others may be steep.
         count, alike = len(one), (found.before.part == found.behind.part).all(0)
         most = np.abs(found.before.depth - found.behind.depth).argmax(0)

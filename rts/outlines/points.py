@@ -46,9 +46,9 @@ def found_in_views(
         part = len(samples)
         joint = views[0].joint(part)
         stop = part + 1 if joint is None else joint.stop
-        asked = [(own.parts >= part) & (own.parts < stop) for own in broken]
-        points = [own.points[here] for own, here in zip(broken, asked, strict=True)]
-        known = [own.triangles[here] for own, here in zip(broken, asked, strict=True)]
+        inside = [(own.parts >= part) & (own.parts < stop) for own in broken]
+        points = [own.points[here] for own, here in zip(broken, inside, strict=True)]
+        known = [own.triangles[here] for own, here in zip(broken, inside, strict=True)]
         fragments = [view.on_sheets(part, *own) for view, *own in zip(views, points, known, strict=True)]
         together = None
         if None not in fragments:
@@ -58,13 +58,13 @@ def found_in_views(
             lifted = joint.lifted(together)
             firsts = np.cumsum([0, *(len(own.ids) for own in lifted.samples)], dtype=np.int32)
             samples += lifted.samples
-            rows[0][asked[0]] = host_value(lifted.row)[0, 0] - firsts[broken[0].parts[asked[0]] - part]
+            rows[0][inside[0]] = host_value(lifted.row)[0, 0] - firsts[broken[0].parts[inside[0]] - part]
             continue
-        numbers = np.concatenate([own.numbers[here] for own, here in zip(broken, asked, strict=True)])
+        numbers = np.concatenate([own.numbers[here] for own, here in zip(broken, inside, strict=True)])
         own, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
         ends = np.cumsum([len(x) for x in points])
         samples.append(own)
-        for own, here, number in zip(rows, asked, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
+        for own, here, number in zip(rows, inside, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
             own[here] = number
     return [view.found(own, at, samples) for view, own, at in zip(views, broken, rows, strict=True)], samples
 
@@ -157,9 +157,9 @@ class Points:
             drawn = isinstance(known[0], TriangleSampler)
             if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
                 continue
-            chosen = at, breaks.near[at]
-            fragments = self.on_sheets(own, points[chosen], triangles[chosen]) if drawn else None
-            more = self.sample(own, points[chosen], fragments, pairs=True)
+            ending = at, breaks.near[at]
+            fragments = self.on_sheets(own, points[ending], triangles[ending]) if drawn else None
+            more = self.sample(own, points[ending], fragments, pairs=True)
             if more.pair is not None:
                 found = host_value(more.pair).T
                 rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
@@ -257,10 +257,10 @@ class Points:
         scene, none = self._scene, (count, len(points))
         given = [part.theta for part in scene.parts], self._grid.camera
         more = engine_of(*given).room(len(points), exemplar(*given)) - len(points)
-        asked = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
+        padded = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
         part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
         for index, opaque in enumerate(scene.opaque):
-            samples = self.sample(index, asked, layers=1 if opaque else count)
+            samples = self.sample(index, padded, layers=1 if opaque else count)
             row, z = (host_value(x)[:, 0, : len(points)] for x in (samples.row, samples.depth))
             part = np.concatenate([part, np.where(row >= 0, np.int32(index), np.int32(-1))])
             depth = np.concatenate([depth, np.where(row >= 0, z, np.inf)])

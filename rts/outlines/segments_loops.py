@@ -83,8 +83,8 @@ def join(begins, ends, place, tangent, partner):
             continue
         if n < 2:
             continue
-        # least[i, m]: the cost of the m ends from i on; chosen[i, m]: the step from i to its partner, or −1.
-        least, chosen = np.zeros((n + 2, n + 1)), np.full((n + 2, n + 1), -1, np.int32)
+        # least[i, m]: the cost of the m ends from i on; step[i, m]: the step from i to its partner, or −1.
+        least, step = np.zeros((n + 2, n + 1)), np.full((n + 2, n + 1), -1, np.int32)
         for m in range(1, n + 1):
             for i in range(n - m + 1):
                 best, choice = LONE + least[i + 1, m - 1], -1
@@ -92,8 +92,8 @@ def join(begins, ends, place, tangent, partner):
                     cost = _cost(first + i, first + i + k, ends, place, tangent)
                     cost += least[i + 1, k - 1] + least[i + k + 1, m - k - 1]
                     best, choice = (cost, k) if cost < best else (best, choice)
-                least[i, m], chosen[i, m] = best, choice
-        _read(first, n, chosen, partner)
+                least[i, m], step[i, m] = best, choice
+        _read(first, n, step, partner)
 
 
 @compiled
@@ -119,8 +119,8 @@ def _cost(a, b, ends, place, tangent):
 
 
 @compiled
-def _read(first, n, chosen, partner):
-    """Fill in the partners of the n ends from `first` on, as `chosen` says of all runs of ends."""
+def _read(first, n, step, partner):
+    """Fill in the partners of the n ends from `first` on, as `step` says of all runs of ends."""
     stack, top = np.empty((2 * n + 2, 2), np.int32), 1
     stack[0] = 0, n
     while top > 0:
@@ -128,7 +128,7 @@ def _read(first, n, chosen, partner):
         i, m = stack[top]
         if m < 1:
             continue
-        k = chosen[i, m]
+        k = step[i, m]
         stack[top] = i + 1, m - 1 if k < 0 else k - 1
         top += 1
         if k >= 0:

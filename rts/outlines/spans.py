@@ -110,8 +110,8 @@ def crossings(
             if len(at):
                 found, slopes[at, side] = own.at(triangles[at, side], points[at])
                 depth[at] = found.depth[0, 0]
-    apart = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
-    flat = ~(apart > 1e-4 * (width[0] + width[1] * depth))
+    difference = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
+    flat = ~(difference > 1e-4 * (width[0] + width[1] * depth))
     near = np.where((near == 2) & flat, 0, near).astype(np.int32)
     slopes[near < 2] = 0
     return near, slopes

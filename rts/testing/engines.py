@@ -40,51 +40,51 @@ class EngineConformance(Conformance):
 
     def test_it_owns_its_arrays_alone(self, engine: Any) -> None:
         """`owns` holds for results of `constant`, but not for lists, numbers, None or another engine's NumPy arrays."""
-        chosen = _instance(engine)
-        claim(chosen.owns(chosen.constant(np.ones(3))), "it does not own the array that `constant` gives")
-        strangers = [1.0, [1.0], None, *([] if chosen.name == "numpy" else [np.ones(3)])]
+        instance = _instance(engine)
+        claim(instance.owns(instance.constant(np.ones(3))), "it does not own the array that `constant` gives")
+        strangers = [1.0, [1.0], None, *([] if instance.name == "numpy" else [np.ones(3)])]
         for x in strangers:
-            claim(not chosen.owns(x), f"it owns a {type(x).__name__}")
+            claim(not instance.owns(x), f"it owns a {type(x).__name__}")
 
     def test_constants_keep_their_values(self, engine: Any) -> None:
         """`constant` keeps values; floats get the dtype of `like`, integers and booleans stay such."""
-        chosen = _instance(engine)
-        single = chosen.constant(np.ones(2, np.float32))
+        instance = _instance(engine)
+        single = instance.constant(np.ones(2, np.float32))
         for value in (np.array([1.5, -2.0]), np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), 0.5):
-            result = chosen.constant(value, single)
-            host = chosen.to_numpy(result)
+            result = instance.constant(value, single)
+            host = instance.to_numpy(result)
             claim(np.array_equal(host, value), f"the constant of {value!r} is {host!r}")
             kind = np.asarray(value).dtype.kind
             claim(host.dtype.kind == kind, f"the constant of {value!r} has dtype {host.dtype}")
             claim(kind != "f" or host.dtype == np.float32, f"beside float32, {value!r} became {host.dtype}")
         backwards = np.arange(12.0).reshape(3, 4)[::-1, ::2]
-        claim_close(chosen.to_numpy(chosen.constant(backwards)), backwards, 0, "the constant of a strided array")
+        claim_close(instance.to_numpy(instance.constant(backwards)), backwards, 0, "the constant of a strided array")
 
     @pytest.mark.parametrize("name", NAMESPACE)
     def test_its_namespace_is_that_of_the_array_api(self, engine: Any, name: str) -> None:
         """Functions of `namespace` return NumPy's results, to 1e-5."""
-        chosen, x, f = _instance(engine), numbers(N, 4, seed=4), NAMESPACE[name]
+        instance, x, f = _instance(engine), numbers(N, 4, seed=4), NAMESPACE[name]
         from array_api_compat import numpy as xp
 
-        with owning(chosen), no_error(f"{name} in the namespace of {chosen.name}"):
-            result = chosen.to_numpy(f(chosen.namespace, chosen.constant(x)))
+        with owning(instance), no_error(f"{name} in the namespace of {instance.name}"):
+            result = instance.to_numpy(f(instance.namespace, instance.constant(x)))
         claim_close(result, f(xp, x), TOLERANCE, name)
 
     # ------------------------------------------------------------------------------------------ the host
 
     def test_host_functions_are_called_with_numpy(self, engine: Any) -> None:
         """`call_host` gives NumPy arrays to the function, and the engine's arrays back, compiled or not."""
-        chosen = _instance(engine)
+        instance = _instance(engine)
 
         def host(x: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, ...]:
             claim(isinstance(x, np.ndarray) and isinstance(ids, np.ndarray), "a host function gets other than NumPy")
             return (np.asarray(x) * 2).astype(np.float32), np.asarray(ids.sum(), np.int32), x[:2].astype(np.float32)
 
         specs = ArraySpec((N, 3), np.float32), ArraySpec((), np.int32), ArraySpec((N, 3), np.float32, packed=True)
-        x, ids = chosen.constant(numbers(N, 3)), chosen.constant(IDS)
-        for how, f in _both_ways(chosen, lambda x, i: chosen.call_host(host, specs, x, i)):
-            with owning(chosen), no_error(f"a host function{how}"):
-                twice, total, packed = (chosen.to_numpy(r) for r in f(x, ids))
+        x, ids = instance.constant(numbers(N, 3)), instance.constant(IDS)
+        for how, f in _both_ways(instance, lambda x, i: instance.call_host(host, specs, x, i)):
+            with owning(instance), no_error(f"a host function{how}"):
+                twice, total, packed = (instance.to_numpy(r) for r in f(x, ids))
             claim_close(twice, 2 * numbers(N, 3), 0, f"the result of a host function{how}")
             claim(total.dtype.kind == "i" and total == IDS.sum(), f"an integer result{how} is {total!r}")
             claim_close(packed[:2], numbers(N, 3)[:2], 0, f"a packed result{how}")
@@ -92,128 +92,128 @@ class EngineConformance(Conformance):
 
     def test_host_functions_have_no_derivative(self, engine: Any) -> None:
         """The result of `call_host` is a constant for derivatives, in both modes."""
-        chosen = _differentiating(engine)
-        xp, spec = chosen.namespace, ArraySpec((N, 3), np.float32)
+        instance = _differentiating(engine)
+        xp, spec = instance.namespace, ArraySpec((N, 3), np.float32)
 
         def f(x: Any) -> Any:
-            (constant,) = chosen.call_host(lambda v: (np.asarray(v) * 2,), (spec,), x)
+            (constant,) = instance.call_host(lambda v: (np.asarray(v) * 2,), (spec,), x)
             return xp.sum(constant * x)
 
-        with owning(chosen), no_error("the gradient through a host function"):
-            gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(numbers(N, 3)))[1])
-            along = chosen.jvp(f, chosen.constant(numbers(N, 3)), chosen.constant(np.ones((N, 3))))[1]
+        with owning(instance), no_error("the gradient through a host function"):
+            gradient = instance.to_numpy(instance.value_and_grad(f)(instance.constant(numbers(N, 3)))[1])
+            along = instance.jvp(f, instance.constant(numbers(N, 3)), instance.constant(np.ones((N, 3))))[1]
         claim_close(gradient, 2 * numbers(N, 3), TOLERANCE, "the gradient of c x, c from the host,")
-        claim_close(chosen.to_numpy(along), 2 * numbers(N, 3).sum(), 1e-4, "its derivative in forward mode")
+        claim_close(instance.to_numpy(along), 2 * numbers(N, 3).sum(), 1e-4, "its derivative in forward mode")
 
     def test_what_is_decided_by_the_device_is_the_same(self, engine: Any) -> None:
         """`by_host` returns the result of one of its functions, compiled or not."""
-        chosen = _instance(engine)
-        for how, call in _both_ways(chosen, lambda x: chosen.by_host(lambda v: (v * 2,), lambda v: (v + v,), x)[0]):
-            with owning(chosen), no_error(f"by_host{how}"):
-                result = chosen.to_numpy(call(chosen.constant(numbers(N))))
+        instance = _instance(engine)
+        for how, call in _both_ways(instance, lambda x: instance.by_host(lambda v: (v * 2,), lambda v: (v + v,), x)[0]):
+            with owning(instance), no_error(f"by_host{how}"):
+                result = instance.to_numpy(call(instance.constant(numbers(N))))
             claim_close(result, 2 * numbers(N), 0, f"the result of by_host{how}")
 
     # ------------------------------------------------------------------------------------------- sums, loops
 
     def test_segments_are_summed(self, engine: Any) -> None:
         """`segment_sum` returns the sums, zero for an empty segment, and has their gradient."""
-        chosen, values, segments = _instance(engine), numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
+        instance, values, segments = _instance(engine), numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
         expected = np.zeros((5, 3), np.float32)
         np.add.at(expected, segments, values)
-        sums = chosen.to_numpy(chosen.segment_sum(chosen.constant(values), segments, 5))
+        sums = instance.to_numpy(instance.segment_sum(instance.constant(values), segments, 5))
         claim_close(sums, expected, TOLERANCE, "segment_sum")
-        if chosen.differentiates:
-            weights = chosen.constant(numbers(5, 3, seed=2))
-            f = lambda v: chosen.namespace.sum(chosen.segment_sum(v, segments, 5) * weights)  # noqa: E731
-            gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(values))[1])
+        if instance.differentiates:
+            weights = instance.constant(numbers(5, 3, seed=2))
+            f = lambda v: instance.namespace.sum(instance.segment_sum(v, segments, 5) * weights)  # noqa: E731
+            gradient = instance.to_numpy(instance.value_and_grad(f)(instance.constant(values))[1])
             claim_close(gradient, numbers(5, 3, seed=2)[segments], TOLERANCE, "the gradient of segment_sum")
 
     def test_loops_end_early(self, engine: Any) -> None:
         """`repeat` stops when its condition fails, or after the most times, compiled or not."""
-        chosen = _instance(engine)
-        xp = chosen.namespace
+        instance = _instance(engine)
+        xp = instance.namespace
 
         def halved(most: int) -> Callable:
             def f(x: Any) -> Any:
                 state = {"x": x, "count": x[:1] * 0}
                 body = lambda s: {"x": s["x"] / 2, "count": s["count"] + 1}  # noqa: E731
-                state = chosen.repeat(body, lambda s: xp.any(s["x"] > 1), state, most)
+                state = instance.repeat(body, lambda s: xp.any(s["x"] > 1), state, most)
                 return xp.concat([state["x"], state["count"]])
 
             return f
 
         for most, expected in ((50, [1.0, 0.125, 3]), (2, [2.0, 0.25, 2])):
-            for how, call in _both_ways(chosen, halved(most)):
-                with owning(chosen), no_error(f"repeat{how}"):
-                    result = chosen.to_numpy(call(chosen.constant(np.array([8.0, 1.0], np.float32))))
+            for how, call in _both_ways(instance, halved(most)):
+                with owning(instance), no_error(f"repeat{how}"):
+                    result = instance.to_numpy(call(instance.constant(np.array([8.0, 1.0], np.float32))))
                 claim_close(result, np.array(expected), 0, f"what repeat of at most {most} times{how} gives")
 
     def test_loops_have_no_derivative(self, engine: Any) -> None:
         """The result of `repeat` is a constant for the gradient, compiled or not."""
-        chosen = _differentiating(engine)
-        xp, x = chosen.namespace, chosen.constant(np.array([8.0, 1.0], np.float32))
+        instance = _differentiating(engine)
+        xp, x = instance.namespace, instance.constant(np.array([8.0, 1.0], np.float32))
 
         def f(v: Any) -> Any:
-            halved = chosen.repeat(lambda s: s / 2, lambda s: xp.any(s > 1), v, 50)
+            halved = instance.repeat(lambda s: s / 2, lambda s: xp.any(s > 1), v, 50)
             return xp.sum(halved * v)
 
-        for how, gradient in _both_ways(chosen, lambda v: chosen.value_and_grad(f)(v)[1]):
-            with owning(chosen), no_error(f"the gradient of what repeat gives{how}"):
-                slopes = chosen.to_numpy(gradient(x))
+        for how, gradient in _both_ways(instance, lambda v: instance.value_and_grad(f)(v)[1]):
+            with owning(instance), no_error(f"the gradient of what repeat gives{how}"):
+                slopes = instance.to_numpy(gradient(x))
             claim_close(slopes, np.array([1.0, 0.125]), 0, f"the gradient of repeat(x) x{how}")
 
     def test_unused_rows_are_filled(self, engine: Any) -> None:
         """`fill_unused` replaces rows that no cell of `row` refers to by the first row, and leaves the others."""
-        chosen, x = _instance(engine), numbers(N, 3)
+        instance, x = _instance(engine), numbers(N, 3)
         row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
-        with owning(chosen):
-            if not chosen.padded(chosen.constant(row)):
+        with owning(instance):
+            if not instance.padded(instance.constant(row)):
                 pytest.skip("outside of transforms it allots no more rows than are used")
-            filled = chosen.to_numpy(chosen.fill_unused(chosen.constant(x), chosen.constant(row)))
+            filled = instance.to_numpy(instance.fill_unused(instance.constant(x), instance.constant(row)))
         claim_close(filled, np.concatenate([x[:3], x[[0, 0, 0]]]), 0, "fill_unused")
 
     def test_functions_of_rows_in_use_are_those_of_all_rows(self, engine: Any) -> None:
         """`by_rows_in_use` returns the function's result for rows that a cell refers to, compiled or not."""
-        chosen, x = _instance(engine), numbers(N, 3)
+        instance, x = _instance(engine), numbers(N, 3)
         row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
 
         def f(rows: Any) -> Any:
             return rows["x"] * 2
 
         def call(x: Any, row: Any) -> Any:
-            return chosen.by_rows_in_use(f, {"x": x}, row, f({"x": x}))
+            return instance.by_rows_in_use(f, {"x": x}, row, f({"x": x}))
 
-        for how, function in _both_ways(chosen, call):
-            with owning(chosen), no_error(f"by_rows_in_use{how}"):
-                result = chosen.to_numpy(function(chosen.constant(x), chosen.constant(row)))
+        for how, function in _both_ways(instance, call):
+            with owning(instance), no_error(f"by_rows_in_use{how}"):
+                result = instance.to_numpy(function(instance.constant(x), instance.constant(row)))
             claim_close(result[:3], 2 * x[:3], 0, f"what by_rows_in_use gives{how}")
 
     def test_compiled_functions_are_the_same(self, engine: Any) -> None:
         """`jit` of a function of a record returns the function's result; `block` returns its argument."""
-        chosen = _instance(engine)
-        xp = chosen.namespace
+        instance = _instance(engine)
+        xp = instance.namespace
 
         def f(samples: Samples) -> Any:
             return xp.sum(samples.params, axis=1) + xp.astype(samples.ids[:, 0], samples.params.dtype)
 
         samples = Samples(IDS, numbers(N, 2), Cells(np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1)), np.int32(0))
-        with owning(chosen), no_error("a compiled function of Samples"):
-            constants = map_leaves(chosen.constant, samples)
-            result = chosen.block(chosen.jit(f)(constants))
-        claim_close(chosen.to_numpy(result), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")
+        with owning(instance), no_error("a compiled function of Samples"):
+            constants = map_leaves(instance.constant, samples)
+            result = instance.block(instance.jit(f)(constants))
+        claim_close(instance.to_numpy(result), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")
 
     # -------------------------------------------------------------------------------------- derivatives
 
     def test_without_derivatives_it_says_so(self, engine: Any) -> None:
         """An engine that does not differentiate raises an `rts.errors.EngineError`."""
-        chosen = _instance(engine)
-        if chosen.differentiates:
+        instance = _instance(engine)
+        if instance.differentiates:
             pytest.skip("it differentiates")
         calls = {
-            "value_and_grad": lambda: chosen.value_and_grad(lambda x: x)(chosen.constant(1.0)),
-            "jvp": lambda: chosen.jvp(lambda x: x, chosen.constant(1.0), chosen.constant(1.0)),
-            "jacobian": lambda: chosen.jacobian(lambda x: x)(chosen.constant(np.ones(1))),
-            "optimizer": lambda: chosen.optimizer("adam", 0.1, chosen.constant(1.0)),
+            "value_and_grad": lambda: instance.value_and_grad(lambda x: x)(instance.constant(1.0)),
+            "jvp": lambda: instance.jvp(lambda x: x, instance.constant(1.0), instance.constant(1.0)),
+            "jacobian": lambda: instance.jacobian(lambda x: x)(instance.constant(np.ones(1))),
+            "optimizer": lambda: instance.optimizer("adam", 0.1, instance.constant(1.0)),
         }
         for name, call in calls.items():
             try:
@@ -228,120 +228,120 @@ class EngineConformance(Conformance):
 
     def test_gradients_are_those_of_closed_forms(self, engine: Any) -> None:
         """`value_and_grad` takes nested parameters, and returns zeros for unused ones."""
-        chosen = _differentiating(engine)
-        xp = chosen.namespace
+        instance = _differentiating(engine)
+        xp = instance.namespace
         tree = {"a": numbers(3), "b": [numbers(2, seed=1), numbers(4, seed=2)]}
-        with owning(chosen):
-            value, gradient = chosen.value_and_grad(lambda t: xp.sum(t["a"] ** 2) + 3 * xp.sum(t["b"][0]))(
-                map_leaves(chosen.constant, tree)
+        with owning(instance):
+            value, gradient = instance.value_and_grad(lambda t: xp.sum(t["a"] ** 2) + 3 * xp.sum(t["b"][0]))(
+                map_leaves(instance.constant, tree)
             )
-            gradients = derivatives.host(chosen, gradient)
-        claim_close(chosen.to_numpy(value), (tree["a"] ** 2).sum() + 3 * tree["b"][0].sum(), TOLERANCE, "the value")
+            gradients = derivatives.host(instance, gradient)
+        claim_close(instance.to_numpy(value), (tree["a"] ** 2).sum() + 3 * tree["b"][0].sum(), TOLERANCE, "the value")
         claim_close(gradients["a"], 2 * tree["a"], TOLERANCE, "the gradient of a square")
         claim_close(gradients["b"][0], np.full(2, 3.0), TOLERANCE, "the gradient of a multiple")
         claim_close(gradients["b"][1], np.zeros(4), 0, "the gradient in what is not used")
 
     def test_forward_mode_can_be_differentiated(self, engine: Any) -> None:
         """`jvp` is right for x³ along d, and has a gradient in a captured factor."""
-        chosen = _differentiating(engine)
-        xp, x, d = chosen.namespace, numbers(4), numbers(4, seed=1)
-        at, along = chosen.constant(x), chosen.constant(d)
-        with owning(chosen), no_error("the gradient of a derivative in forward mode"):
-            value, slope = chosen.jvp(lambda v: v**3, at, along)
-            second = chosen.value_and_grad(lambda k: xp.sum(chosen.jvp(lambda v: k * v**3, at, along)[1]))(
-                chosen.constant(np.float32(2))
+        instance = _differentiating(engine)
+        xp, x, d = instance.namespace, numbers(4), numbers(4, seed=1)
+        at, along = instance.constant(x), instance.constant(d)
+        with owning(instance), no_error("the gradient of a derivative in forward mode"):
+            value, slope = instance.jvp(lambda v: v**3, at, along)
+            second = instance.value_and_grad(lambda k: xp.sum(instance.jvp(lambda v: k * v**3, at, along)[1]))(
+                instance.constant(np.float32(2))
             )[1]
-        claim_close(chosen.to_numpy(value), x**3, TOLERANCE, "the value")
-        claim_close(chosen.to_numpy(slope), 3 * x**2 * d, TOLERANCE, "the derivative of x³")
-        claim_close(chosen.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
+        claim_close(instance.to_numpy(value), x**3, TOLERANCE, "the value")
+        claim_close(instance.to_numpy(slope), 3 * x**2 * d, TOLERANCE, "the derivative of x³")
+        claim_close(instance.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
 
     def test_rows_have_gradients(self, engine: Any) -> None:
         """`gradient_of_rows` is right for k |x|², and has a gradient in the factor k; within `checkpoint`, too."""
-        chosen = _differentiating(engine)
-        xp, x = chosen.namespace, numbers(N, 3)
-        at = chosen.constant(x)
+        instance = _differentiating(engine)
+        xp, x = instance.namespace, numbers(N, 3)
+        at = instance.constant(x)
 
         def slopes(k: Any, points: Any = at) -> Any:
-            return chosen.gradient_of_rows(lambda rows: k * xp.sum(rows**2, axis=1), points)
+            return instance.gradient_of_rows(lambda rows: k * xp.sum(rows**2, axis=1), points)
 
         def kept(k: Any) -> Any:
-            return chosen.checkpoint(lambda: chosen.constant(x), lambda points: xp.sum(slopes(k, points)))
+            return instance.checkpoint(lambda: instance.constant(x), lambda points: xp.sum(slopes(k, points)))
 
-        with owning(chosen), no_error("the gradient of rows"):
-            gradient = chosen.to_numpy(slopes(chosen.constant(np.float32(2))))
-            second = chosen.value_and_grad(lambda k: xp.sum(slopes(k)))(chosen.constant(np.float32(2)))[1]
-            again = chosen.value_and_grad(kept)(chosen.constant(np.float32(2)))[1]
+        with owning(instance), no_error("the gradient of rows"):
+            gradient = instance.to_numpy(slopes(instance.constant(np.float32(2))))
+            second = instance.value_and_grad(lambda k: xp.sum(slopes(k)))(instance.constant(np.float32(2)))[1]
+            again = instance.value_and_grad(kept)(instance.constant(np.float32(2)))[1]
         claim_close(gradient, 4 * x, TOLERANCE, "the gradient of 2 |x|²")
-        claim_close(chosen.to_numpy(second), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows")
-        claim_close(chosen.to_numpy(again), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows within checkpoint")
+        claim_close(instance.to_numpy(second), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows")
+        claim_close(instance.to_numpy(again), 2 * x.sum(), 1e-4, "the gradient of a gradient of rows within checkpoint")
 
     def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
         """`jacobian` of a function with two results gives the Jacobian of each."""
-        chosen = _differentiating(engine)
-        xp, x = chosen.namespace, numbers(3)
-        with owning(chosen), no_error("jacobian"):
-            values, rows = chosen.jacobian(lambda v: (v**2, xp.sum(v)))(chosen.constant(x))
-            values, rows = derivatives.host(chosen, (values, rows))
+        instance = _differentiating(engine)
+        xp, x = instance.namespace, numbers(3)
+        with owning(instance), no_error("jacobian"):
+            values, rows = instance.jacobian(lambda v: (v**2, xp.sum(v)))(instance.constant(x))
+            values, rows = derivatives.host(instance, (values, rows))
         claim_close(values[0], x**2, TOLERANCE, "the first value of a function")
         claim_close(rows[0], np.diag(2 * x), TOLERANCE, "the Jacobian of squares")
         claim_close(rows[1], np.ones(3), TOLERANCE, "the Jacobian of a sum")
 
     def test_stop_gradient_stops_it(self, engine: Any) -> None:
         """`stop_gradient` keeps the value, without a derivative in either mode."""
-        chosen = _differentiating(engine)
-        xp, x = chosen.namespace, chosen.constant(numbers(4))
-        f = lambda v: xp.sum(chosen.stop_gradient(v) * v)  # noqa: E731
-        with owning(chosen):
-            value, gradient = chosen.value_and_grad(f)(x)
-            along = chosen.jvp(f, x, chosen.constant(np.ones(4)))[1]
-        claim_close(chosen.to_numpy(value), (numbers(4) ** 2).sum(), TOLERANCE, "the value")
-        claim_close(chosen.to_numpy(gradient), numbers(4), TOLERANCE, "the gradient of stop(x) x")
-        claim_close(chosen.to_numpy(along), numbers(4).sum(), TOLERANCE, "its derivative in forward mode")
+        instance = _differentiating(engine)
+        xp, x = instance.namespace, instance.constant(numbers(4))
+        f = lambda v: xp.sum(instance.stop_gradient(v) * v)  # noqa: E731
+        with owning(instance):
+            value, gradient = instance.value_and_grad(f)(x)
+            along = instance.jvp(f, x, instance.constant(np.ones(4)))[1]
+        claim_close(instance.to_numpy(value), (numbers(4) ** 2).sum(), TOLERANCE, "the value")
+        claim_close(instance.to_numpy(gradient), numbers(4), TOLERANCE, "the gradient of stop(x) x")
+        claim_close(instance.to_numpy(along), numbers(4).sum(), TOLERANCE, "its derivative in forward mode")
 
     def test_checkpoints_have_the_same_gradient(self, engine: Any) -> None:
         """`checkpoint(make, f)` has the value and the gradient of `f(make())`."""
-        chosen = _differentiating(engine)
-        xp, x = chosen.namespace, chosen.constant(numbers(4))
-        constant = chosen.constant(numbers(4, seed=1))
-        f = lambda v: chosen.checkpoint(lambda: constant, lambda c: xp.sum(c * v**2))  # noqa: E731
-        with owning(chosen), no_error("the gradient of a checkpoint"):
-            value, gradient = chosen.value_and_grad(f)(x)
+        instance = _differentiating(engine)
+        xp, x = instance.namespace, instance.constant(numbers(4))
+        constant = instance.constant(numbers(4, seed=1))
+        f = lambda v: instance.checkpoint(lambda: constant, lambda c: xp.sum(c * v**2))  # noqa: E731
+        with owning(instance), no_error("the gradient of a checkpoint"):
+            value, gradient = instance.value_and_grad(f)(x)
         expected = numbers(4, seed=1)
-        claim_close(chosen.to_numpy(value), (expected * numbers(4) ** 2).sum(), TOLERANCE, "the value")
-        claim_close(chosen.to_numpy(gradient), 2 * expected * numbers(4), TOLERANCE, "the gradient of a checkpoint")
+        claim_close(instance.to_numpy(value), (expected * numbers(4) ** 2).sum(), TOLERANCE, "the value")
+        claim_close(instance.to_numpy(gradient), 2 * expected * numbers(4), TOLERANCE, "the gradient of a checkpoint")
 
     def test_optimizers_step(self, engine: Any) -> None:
         """`optimizer` steps by rate × gradient (SGD), or first by the rate (Adam), and changes no array in place."""
-        chosen = _differentiating(engine)
+        instance = _differentiating(engine)
         start = {"x": numbers(3), "y": [numbers(2, seed=1)]}
         slopes = map_leaves(lambda v: np.sign(v) * 2, start)
-        with owning(chosen):
+        with owning(instance):
             for name, expected in (("sgd", lambda v: v - 0.2 * np.sign(v)), ("adam", lambda v: v - 0.1 * np.sign(v))):
-                parameters = map_leaves(chosen.constant, start)
-                step = chosen.optimizer(name, 0.1, parameters)
-                stepped = derivatives.host(chosen, step(parameters, map_leaves(chosen.constant, slopes)))
+                parameters = map_leaves(instance.constant, start)
+                step = instance.optimizer(name, 0.1, parameters)
+                stepped = derivatives.host(instance, step(parameters, map_leaves(instance.constant, slopes)))
                 for x, v in zip(leaves(stepped), leaves(start), strict=True):
                     claim_close(x, expected(v), 1e-4, f"the first step of {name}")
-                for x, v in zip(leaves(derivatives.host(chosen, parameters)), leaves(start), strict=True):
+                for x, v in zip(leaves(derivatives.host(instance, parameters)), leaves(start), strict=True):
                     claim_close(x, v, 0, f"what {name} was given")
 
     def test_optimizers_go_on_from_their_state(self, engine: Any) -> None:
         """An optimiser restored from another one's `state` takes the same step; one array may have its own rate."""
-        chosen = _differentiating(engine)
+        instance = _differentiating(engine)
         slopes = {"x": numbers(3, seed=2), "y": [numbers(2, seed=3)]}
-        with owning(chosen):
+        with owning(instance):
             for name in ("sgd", "adam"):
-                parameters = map_leaves(chosen.constant, {"x": numbers(3), "y": [numbers(2, seed=1)]})
-                first: Any = chosen.optimizer(name, [0.1, 0.3], parameters)
+                parameters = map_leaves(instance.constant, {"x": numbers(3), "y": [numbers(2, seed=1)]})
+                first: Any = instance.optimizer(name, [0.1, 0.3], parameters)
                 if not hasattr(first, "state"):
                     pytest.skip("its optimisers have no state to keep")
-                once = first(parameters, map_leaves(chosen.constant, slopes))
+                once = first(parameters, map_leaves(instance.constant, slopes))
                 state = first.state()
-                other = map_leaves(lambda v: chosen.constant(-3 * v), slopes)
-                expected = derivatives.host(chosen, first(once, other))
-                second: Any = chosen.optimizer(name, [0.1, 0.3], parameters)
+                other = map_leaves(lambda v: instance.constant(-3 * v), slopes)
+                expected = derivatives.host(instance, first(once, other))
+                second: Any = instance.optimizer(name, [0.1, 0.3], parameters)
                 second.restore(state, once)
-                stepped = derivatives.host(chosen, second(once, other))
+                stepped = derivatives.host(instance, second(once, other))
                 for x, v in zip(leaves(stepped), leaves(expected), strict=True):
                     claim_close(x, v, 0, f"the step of {name} after `restore`")
 
@@ -350,19 +350,19 @@ class EngineConformance(Conformance):
     @pytest.mark.parametrize("name", OPERATIONS)
     def test_operations_are_their_specification(self, engine: Any, name: str) -> None:
         """Operations have the specification's value, compiled or not; derivatives in both modes and twice are right."""
-        chosen, (f, operands) = _instance(engine), OPERATIONS[name]
+        instance, (f, operands) = _instance(engine), OPERATIONS[name]
         with mock.patch.object(type(engine_named("numpy")), "apply", Engine.apply):
             expected = np.asarray(f(*operands))  # The value of the specification.
-        for how, call in _both_ways(chosen, lambda *x: f(*x)):
-            with owning(chosen), no_error(f"{name}{how}"):
-                value = chosen.to_numpy(call(*map(chosen.constant, operands)))
+        for how, call in _both_ways(instance, lambda *x: f(*x)):
+            with owning(instance), no_error(f"{name}{how}"):
+                value = instance.to_numpy(call(*map(instance.constant, operands)))
             claim_close(value, expected, TOLERANCE, f"{name}{how}")
-        if not chosen.differentiates:
+        if not instance.differentiates:
             return
         weights, along = numbers(*expected.shape, seed=3), derivatives.directions(operands)
-        with owning(chosen), no_error(f"the derivatives of {name}"):
-            both = derivatives.derivatives(chosen, lambda x: f(*x), operands, along, weights)
-            curvature = _curvature(chosen, f, operands, along, weights)
+        with owning(instance), no_error(f"the derivatives of {name}"):
+            both = derivatives.derivatives(instance, lambda x: f(*x), operands, along, weights)
+            curvature = _curvature(instance, f, operands, along, weights)
         derivatives.claim_consistent(both, along, weights, name)
         wide = [x.astype(np.float64) for x in operands]
         ends = [f(*(x + s * 1e-6 * d for x, d in zip(wide, along, strict=True))) for s in (1, -1)]
@@ -381,7 +381,7 @@ class EngineConformance(Conformance):
 
     def test_a_render_is_numpys(self, engine: Any) -> None:
         """The image of an unlit ball is NumPy's, to 1e-4; forward and reverse mode agree, with a gradient in θ."""
-        chosen = _instance(engine)
+        instance = _instance(engine)
         part = scenes.ball(transform=np.asarray(rigid([0.2, 0.3, 0.1, 0.05, 0.1, 0.0]), np.float32))
         expected = scenes.render(part, scenes.CAMERA, scenes.SIZE, sampler="reference")
         values, join = derivatives.split(part.theta)
@@ -390,12 +390,12 @@ class EngineConformance(Conformance):
             moved = part.replace(theta=join(x))
             return scenes.render(moved, scenes.CAMERA, scenes.SIZE, sampler="reference", capacity=scenes.CAPACITY)
 
-        with owning(chosen), no_error(f"a render in {chosen.name}"):
-            shown = chosen.to_numpy(image([chosen.constant(v) for v in values]))
+        with owning(instance), no_error(f"a render in {instance.name}"):
+            shown = instance.to_numpy(image([instance.constant(v) for v in values]))
             claim_close(shown, expected, 1e-4, "the image of a ball")
-            if chosen.differentiates:
+            if instance.differentiates:
                 weights, along = numbers(*expected.shape, seed=5), derivatives.directions(values)
-                both = derivatives.derivatives(chosen, image, values, along, weights)
+                both = derivatives.derivatives(instance, image, values, along, weights)
                 derivatives.claim_consistent(both, along, weights, "the image of a ball")
                 claim(any(np.abs(g).max() > 1e-3 for g in both.gradient), "the image has no gradient in theta")
 
@@ -441,7 +441,7 @@ def _instance(engine: Any) -> Engine:
 
 
 def _differentiating(engine: Any) -> Engine:
-    chosen = _instance(engine)
-    if not chosen.differentiates:
+    instance = _instance(engine)
+    if not instance.differentiates:
         pytest.skip("the engine says that it does not differentiate")
-    return chosen
+    return instance
