@@ -16,7 +16,7 @@ import rts
 sys.path.append(str(Path(__file__).parents[2] / "viewer/tests"))
 pytest.importorskip("websockets")
 from browser import Browser, program, until  # noqa: E402
-from helpers import free_port  # noqa: E402
+from viewed import free_port  # noqa: E402
 
 pytestmark = [
     pytest.mark.skipif(program() is None, reason="no browser on PATH; expected Debian's package chromium"),

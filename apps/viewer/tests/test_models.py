@@ -13,12 +13,12 @@ from contextlib import closing
 import numpy as np
 import pytest
 import trimesh
-from helpers import RED, ball, free_port, view, watching
 from PIL import Image
 from rts_viewer.glb import Triangles, glb, smooth_normals
 from rts_viewer.model import triangles_of
 from rts_viewer.pictures import png
 from typer.testing import CliRunner
+from viewed import RED, ball, free_port, view, watching
 
 import rts
 from rts.cli.main import app

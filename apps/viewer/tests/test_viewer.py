@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import viser
 from browser import Browser, program, until
-from helpers import GREEN, RED, ball, free_port, view, watching
 from rts_viewer.front import Front
 from rts_viewer.history import History, State
 from rts_viewer.pictures import loss_curve, small
+from viewed import GREEN, RED, ball, free_port, view, watching
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
