@@ -102,7 +102,7 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:
     while number < len(scene.parts):
         joint = joints.get(number)
         if joint is not None:
-            tables.append(joint.sampled(grid.size, count))
+            tables.append(joint.sampled(grid.size, count, request.triangles))
             number = joint.stop
             continue
         part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]

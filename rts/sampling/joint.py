@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -82,12 +82,16 @@ class Joint:
         assert isinstance(sampler, TriangleSampler)
         return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler)
 
-    def sampled(self, size: tuple[int, int], layers: int) -> Sampled:
-        """The samples at the centres of all cells; `Cells.triangle` counts triangles over the parts."""
+    def sampled(self, size: tuple[int, int], layers: int, triangles: bool) -> Sampled:
+        """The samples at the centres of all cells.
+
+        With `triangles` there are `Cells.triangle`, which count triangles over the parts.
+        """
         grid = layers, *size
         fragments = self.sampler.rasterize(self.sampler.prepare(self.proxy), self.camera, size, layers, self.cull)
         covered = check_fragments(fragments, grid, len(self.proxy.faces), self.sampler)
-        return self.lifted(fragments, covered)
+        sampled = self.lifted(fragments, covered)
+        return sampled if triangles else replace(sampled, cells=replace(sampled.cells, triangle=None))
 
     def lifted(self, fragments: Fragments, covered: np.ndarray | None = None) -> Sampled:
         """The samples of fragments (K, H, W), whose triangles are counted over the parts.
@@ -129,7 +133,7 @@ class Joint:
         `triangles` (N,) are those of samples.
         """
         count = len(self.proxies)
-        part = (np.searchsorted(self.starts, triangles, side="right") - 1).astype(np.int16)
+        part = (np.searchsorted(self.starts, triangles, side="right") - 1).astype(np.min_scalar_type(count))
         order, counts = np.argsort(part, kind="stable"), np.bincount(part, minlength=count)
         rows = np.maximum(counts, 1)
         ends = np.cumsum(rows)
@@ -193,7 +197,7 @@ def _is_suited(part: CheckedPart, sampler: object) -> bool:
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):
         return False
-    joins = sampler.joins_parts and not overrides(sampler, "sample", TriangleSampler)
+    joins = sampler.joins_parts and sampler.draws_at_once and not overrides(sampler, "sample", TriangleSampler)
     return joins and surface.centered and not surface.refines and not surface.depends_on_view
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import partial
 
@@ -28,17 +29,16 @@ def merge(tables: Sequence[Samples | Sampled], layers: int) -> Sampled:
     overflow = tables[0].overflow
     for own in tables[1:]:
         overflow = overflow + own.overflow
-    samples = [own for table in tables for own in (table.samples if isinstance(table, Sampled) else [table])]
+    parts = [table.samples if isinstance(table, Sampled) else (table,) for table in tables]
+    samples = tuple(itertools.chain(*parts))
     if len(tables) == 1:
-        return Sampled(tuple(samples), tables[0].cells, overflow)
-    sizes = tuple(
-        sum(own.ids.shape[0] for own in (table.samples if isinstance(table, Sampled) else [table])) for table in tables
-    )
+        return Sampled(samples, tables[0].cells, overflow)
+    sizes = tuple(sum(own.ids.shape[0] for own in several) for several in parts)
     arrays = [*(own.row for own in tables), *(own.depth for own in tables)]
     if all(own.triangle is not None for own in tables):
         arrays += [own.triangle for own in tables]
     on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
-    return Sampled(tuple(samples), Cells(*engine_of(arrays).by_host(on_host, elsewhere, *arrays)), overflow)
+    return Sampled(samples, Cells(*engine_of(arrays).by_host(on_host, elsewhere, *arrays)), overflow)
 
 
 def _interleaved(layers: int, sizes: Sequence[int], *tables: Array) -> tuple[Array, ...]:

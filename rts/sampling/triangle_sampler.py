@@ -38,7 +38,8 @@ class TriangleSampler(Sampler):
         concurrent: True if several threads may call `rasterize` at once. Threads of a sampler with an `update` always
             wait for one another.
         joins_parts: True if `rasterize` takes the result of `prepare` for any proxy, with vertices in float64 too, as
-            soon as it is made. Neighbouring parts of few triangles are then drawn at once; see `rts.sampling.joint`.
+            soon as it is made. Neighbouring parts of few triangles are then drawn at once; see `rts.sampling.joint`. It
+            has to be `concurrent`.
     """
 
     joins_parts: bool = False

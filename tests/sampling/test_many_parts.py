@@ -137,6 +137,13 @@ def test_parts_beside_a_surface_without_triangles_are_drawn_alone():
     assert not any(kinds_of([*parts(transforms), ball]))
 
 
+def test_triangles_are_told_where_they_are_asked_for_alone():
+    transforms, parts = crowd(3)
+    own = parts(transforms)
+    assert all(kinds_of(own, splatter=None))
+    assert rts.sample(own, CAMERA, SIZE, engine="torch", splatter=None).triangle is None
+
+
 def test_samplers_that_do_not_join_draw_each_part(singly):
     transforms, parts = crowd(4)
     own = parts(transforms)
