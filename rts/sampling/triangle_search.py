@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,38 +25,12 @@ LEAST_LAYERS = 3
 outline both sides of a fold of triangles may lie beside the surface."""
 
 
-class TriangleDrawer(Protocol):
-    """The methods of a `TriangleSampler` that a search calls."""
-
-    def rasterize(self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
-        """See `TriangleSampler.rasterize`."""
-        ...
-
-    def rasterize_points(
-        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, points: np.ndarray
-    ) -> Fragments | None:
-        """See `TriangleSampler.rasterize_points`."""
-        ...
-
-    def working_on(
-        self,
-        surface: TriangleSurface,
-        inputs: Tree,
-        camera: Camera,
-        view: tuple[int, int],
-        entry: Entry | None,
-        work: Callable[[Entry], Any],
-    ) -> Any:
-        """See `TriangleSampler.working_on`."""
-        ...
-
-
 @dataclass(frozen=True)
 class TriangleSearch:
     """The search for the samples of one view, on the host.
 
     Attributes:
-        sampler: draws the triangles.
+        sampler: the `TriangleSampler` that draws the triangles.
         surface: the surface.
         cull: the part's `cull`.
         inputs: the result of the surface's `proxy_inputs`, on the host.
@@ -67,7 +41,7 @@ class TriangleSearch:
         points: (1, M, 2), the points to sample; None for the centres of all cells.
     """
 
-    sampler: TriangleDrawer
+    sampler: Any
     surface: TriangleSurface
     cull: str
     inputs: Tree
