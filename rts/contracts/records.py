@@ -304,7 +304,7 @@ class Splats(_OnCells):
         positions: (N, 3) x and y in cells from the corner of the grid, border included, and linear depth;
             differentiable.
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
-            channels, (N, C + 1): splatters are given three of them at a time, and alpha.
+            channels, (N, C + 1): splatters are given three of them at a time, and alpha, or all (`any_channels`).
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
         border: cells at each side that splat into the image but are no part of it.
         opaque: a promise that alpha is 1 at all samples.

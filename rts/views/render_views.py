@@ -17,7 +17,8 @@ from rts.contracts.checks import check_background
 from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
-from rts.rendering.image import image_of, over_background, splatted, warned_if_empty
+from rts.rendering.image import image_of, outputs_over, over_background, splatted, warned_if_empty
+from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
@@ -47,6 +48,7 @@ def render_views(
     background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
+    outputs: Sequence[str] | None = None,
 ) -> Array:
     """Render several views of a scene. The images equal the results of a loop of `render` up to rounding.
 
@@ -69,9 +71,10 @@ def render_views(
         background: as in `render`, of every view; or (B, H, W, ·), one for each.
         capacity: as in `render`; of each view.
         engine: as in `render`.
+        outputs: as in `render`. With an output of the sample in front, views are rendered one after another.
 
     Returns:
-        (B, H, W, 4), as in `render`.
+        (B, H, W, 4), as in `render`; with `outputs` a dict: name → array (B, H, W, ·).
 
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
@@ -82,7 +85,7 @@ def render_views(
         EmptyImageWarning: nothing is seen in a view; the warning says why.
         AspectWarning: a camera is for images of another ratio of width to height.
     """
-    camera_list = check_cameras(cameras)
+    wanted, camera_list = None if outputs is None else Outputs(outputs), check_cameras(cameras)
     scene = Scene.of(parts, camera_list[0], sampler, engine)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
     context = context_of_scene(scene.parts, camera_list, engine=engine)
@@ -90,10 +93,20 @@ def render_views(
     background = _check_backgrounds(background, len(camera_list), size, scene.channels)
     if not is_constant(background):
         context = scene.context_with(camera_list, background)
-    images = _images(scenes, size, context, settings)
-    for b, view_scene in enumerate(scenes):
-        warned_if_empty(images[b], view_scene, f"view {b}")
-    return over_background(images, background)
+    if wanted is not None and wanted.fronts:
+        each_view = [outputs_over(view_scene, size, None, settings, wanted) for view_scene in scenes]
+        found = {name: namespace(x).stack([view[name] for view in each_view]) for name, x in each_view[0].items()}
+    else:
+        shown = scenes if wanted is None else [wanted.of_scene(view_scene) for view_scene in scenes]
+        images = _images(shown, size, context, settings)
+        for b, view_scene in enumerate(scenes):
+            warned_if_empty(images[b], view_scene, f"view {b}")
+        if wanted is None:
+            return over_background(images, background)
+        found = wanted.taken(images, (), scene.channels)
+    if "color" in found:
+        found["color"] = over_background(found["color"], background)
+    return found
 
 
 def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:

@@ -52,6 +52,7 @@ class Edges(SummingSplatter):
     layers = 1
     reads = frozenset({"outlines"})
     translucent = True
+    any_channels = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
@@ -111,10 +112,11 @@ class Edges(SummingSplatter):
 
 
 def _without_outlines(splats: Splats) -> Array:
-    """The image (H, W, 4) as if all cells showed one surface, or stacks of the same layers."""
+    """The image (H, W, C) as if all cells showed one surface, or stacks of the same layers."""
     row = splats.row[:1, ...] if splats.opaque else splats.row
     cells = CELLS(splats.positions, splats.rgba, row, _all_joined(row[0, ...] >= 0))
-    return cells[..., :4] + (cells[..., 4:] - stopped(cells[..., 4:]))
+    colors, motion = cells[..., : splats.rgba.shape[1]], cells[..., splats.rgba.shape[1] :]
+    return colors + (motion - stopped(motion))
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:
