@@ -36,6 +36,7 @@ from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurfac
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradient_images import gradient_image
 from rts.diagnostics.gradients import check_gradient
+from rts.diagnostics.profile import profile
 from rts.errors import InputError, PluginError, RtsError, RtsWarning
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
@@ -97,6 +98,7 @@ __all__ = [
     "plugin",
     "plugins",
     "prepare",
+    "profile",
     "pyramid",
     "render",
     "render_samples",

@@ -122,7 +122,16 @@ def render(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The PNG to write, or a .npz of all --outputs.")
+    ] = Path("out.png"),
+    outputs: Annotated[
+        str,
+        typer.Option(
+            help="What to write, such as color,depth,normal; all but color as out.depth.png (16 bits) beside out.png. "
+            "rts.render says which there are."
+        ),
+    ] = "color",
     surface: SurfaceName = "mesh",
     size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
     camera: OrbitAngles = "30,20",
@@ -140,16 +149,22 @@ def render(
         Path | None,
         typer.Option(help="The pose.json of `rts fit-pose`: pose, camera and size are exactly those in it."),
     ] = None,
+    profile: Annotated[
+        bool, typer.Option("--profile", help="Show where the time goes, stage by stage, and what would help.")
+    ] = False,
 ) -> None:
     """Render a model to a picture."""
     import rts
+    from rts.cli.output_files import check_names, names_of, write_outputs
     from rts.cli.pose_file import posed, read_pose
     from rts.diagnostics.measuring_api import supersample_of
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
 
     shape, view, color = size_of(size), view_of(camera), color_of(background)
-    output_file(output, "picture", (".png",))
+    output_file(output, "picture", (".png", ".npz"))
+    names = names_of(outputs)
+    check_names(names, output)
     engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
         parts = rts.load(model, surface=surface)
@@ -171,21 +186,19 @@ def render(
             shader=part.shader if shader == "auto" else shader,
         )
 
+    scene = [prepared(p) for p in parts]
+    options: dict[str, Any] = {"sampler": sampler, "splatter": splatter, "layers": layers_of(layers)}
+    options["supersample"] = supersample_of(supersample)
     start = time.perf_counter()
-    image = rts.render(
-        [prepared(p) for p in parts],
-        seen,
-        shape,
-        sampler=sampler,
-        splatter=splatter,
-        layers=layers_of(layers),
-        supersample=supersample_of(supersample),
-        background=color,
-    )
+    images = rts.render(scene, seen, shape, **options, background=color, outputs=names)
     seconds = time.perf_counter() - start
-    rts.save_image(output, image)
+    lines = write_outputs(output, {name: engine_object.to_numpy(image) for name, image in images.items()})
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
     _say(escape(f"{what}, {shape[0]} x {shape[1]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
+    for line in lines if names != ("color",) else ():
+        _say(escape(f"  {line}"))
+    if profile:
+        typer.echo(rts.profile(scene, seen, shape, **options))
 
 
 @app.command(

@@ -230,6 +230,23 @@ def test_engines_render_the_same(model, tmp_path, engine):
     np.testing.assert_allclose(rts.load_image(tmp_path / "a.png"), rts.load_image(tmp_path / "b.png"), atol=0.01)
 
 
+def test_render_writes_outputs_beside_the_picture_or_as_arrays(model, tmp_path):
+    from PIL import Image
+
+    names = "color,depth,normal,part,alpha"
+    said = succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, "--outputs", names, "--profile")
+    succeed("render", model, "-o", tmp_path / "a.npz", "--size", 32, "--outputs", f"{names},position")
+    known = np.load(tmp_path / "a.npz")
+    assert set(known) == {*names.split(","), "position"} and "Most takes" in said
+    pictures = {name: np.asarray(Image.open(tmp_path / f"a.{name}.png")) for name in ("depth", "normal", "part")}
+    most = float(said.partition("depth, 65535 is ")[2].split()[0])
+    np.testing.assert_allclose(pictures["depth"] * most / 65535, known["depth"][..., 0], atol=1e-3)
+    np.testing.assert_array_equal(pictures["part"], known["part"][..., 0] + 1)
+    there = known["alpha"][..., 0] > 0.5
+    np.testing.assert_allclose(pictures["normal"][there] / 127.5 - 1, known["normal"][there], atol=0.005)
+    assert "one .npz" in fail("render", model, "-o", tmp_path / "a.png", "--outputs", "position", code=2)
+
+
 def test_render_options_reach_the_picture(model, tmp_path):
     def picture(*options):
         succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, *options)
