@@ -12,7 +12,7 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
 from rts.arrays.engine_base import Engine
-from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace
+from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace, stopped
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.checked_parts import CheckedPart, check_cameras, check_scene
 from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count, is_real
@@ -61,7 +61,9 @@ class ImageResiduals(Residuals):
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
             or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
             Of several views (B, H, W, ·), or a list. Or a dict of targets by the names of outputs of `rts.render`, such
-            as {"color": …, "depth": …}; of several views each (B, H, W, ·). Residuals are then in one row.
+            as {"color": …, "depth": …}; of several views each (B, H, W, ·). Residuals are then in one row. Those of
+            means, such as depth, count as far as the pixel is covered: where nothing is seen, colours and alpha tell.
+            A depth or a normal of 0 in the target is one that was not measured, and does not count.
         weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
             bool; constants. Of several views (B, H, W, ·), or a list. For a dict of targets a dict, of arrays or of
             numbers, such as {"depth": 0.1}; outputs that it leaves out have 1.
@@ -125,6 +127,7 @@ class ImageResiduals(Residuals):
         self._full, self._sigma = self.size, 0.0
         self._view: int | None = None
         self._outputs: tuple[str, ...] | None = None
+        self._mean = False
         self._views: list[ImageResiduals] = []
         self._of_outputs: dict[str, ImageResiduals] = {}
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
@@ -164,18 +167,21 @@ class ImageResiduals(Residuals):
 
     def _take_outputs(self, target: Mapping[str, Any], weights: Any, views: int | None) -> None:
         """Set targets and weights of outputs by name, of one view or of `views`, once checked."""
-        self._outputs = Outputs(list(target)).names
+        outputs = Outputs(list(target))
+        # The alpha of pixels weighs means.
+        self._outputs = tuple(dict.fromkeys((*outputs.names, *(["alpha"] if outputs.means else []))))
         if not isinstance(weights, Mapping) or not set(weights) <= set(target):
             raise InputError(f"weights is {quoted(weights)}; expected a dict, by names of targets: {', '.join(target)}")
         if views is None:
             for name, of_output in target.items():
                 child = self._of_outputs[name] = copy(self)
-                child._of_outputs, child._background = {}, None
+                child._of_outputs, child._background, child._mean = {}, None, name in outputs.means
                 child._target = _checked_output(name, of_output, self.size)
                 child._channels = 1 if len(child._target.shape) == 2 else child._target.shape[2]
                 factors = weights.get(name)
                 factors = np.full(self.size, factors, np.float32) if is_real(factors) else factors
-                child._weights = _checked_weights(factors, child._target.shape, self.size)
+                factors = _checked_weights(factors, child._target.shape, self.size)
+                child._weights = _measured(child._target, factors) if name in ("depth", "normal") else factors
             return
         if any((shape_of(x) or (0,))[0] != views for x in target.values()):
             raise InputError(f"there are {views} cameras; expected {views} targets of each output, ({views}, H, W, ·)")
@@ -200,15 +206,21 @@ class ImageResiduals(Residuals):
         ]
         return namespace(of_views[0]).stack(of_views)
 
-    def _difference(self, image: Any, parameters: Tree) -> Array:
-        """The residuals of one view, as of `__call__`, from its image (H, W, C + 1), or a dict of outputs."""
+    def _difference(self, image: Any, parameters: Tree, share: Array | None = None) -> Array:
+        """The residuals of one view, as of `__call__`, from its image (H, W, C + 1), or a dict of outputs.
+
+        A `share` (H, W, 1) of each pixel counts; None for all.
+        """
         if self._of_outputs:
             for name, child in self._of_outputs.items():
                 count = image[name].shape[-1]
                 if child._channels not in ((1, count - 1, count) if name == "color" else (count,)):
                     raise InputError(f"target[{name!r}] {described(child._target)}; expected {count} numbers a pixel")
-            each = [child._difference(image[name], parameters) for name, child in self._of_outputs.items()]
-            return namespace(*each).concat([namespace(x).reshape(x, (-1,)) for x in each])
+            rows = []
+            for name, child in self._of_outputs.items():
+                found = child._difference(image[name], parameters, stopped(image["alpha"]) if child._mean else None)
+                rows.append(namespace(found).reshape(found, (-1,)))
+            return namespace(*rows).concat(rows)
         image = self._beside_target(image, parameters)
         target, weights, _ = self._constants(image)
         if self._outputs is None:
@@ -218,6 +230,8 @@ class ImageResiduals(Residuals):
         difference = difference - target
         if weights is not None:
             difference = difference * weights
+        if share is not None:
+            difference = difference * share
         if self._sigma:
             difference = blurred(difference, self._sigma)
         return namespace(image).reshape(difference, tuple(self._target.shape))
@@ -492,6 +506,17 @@ def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[
     count = shape[2] if len(shape) > 2 else 1
     check_range(target, count, channels)
     return target, count
+
+
+def _measured(target: Array, weights: Array | None) -> Array:
+    """Weights (H, W, 1 or ·) of a target (H, W) or (H, W, ·), and 0 where it is 0."""
+    xp = namespace(target)
+    there = xp.reshape(target, (*target.shape[:2], -1)) != 0
+    there = xp.astype(xp.any(there, axis=-1, keepdims=True), target.dtype)
+    if weights is None:
+        return there
+    weights, there = constants((weights, there), engine_of(target, weights), exemplar((target, weights)))
+    return xp.reshape(weights, (*target.shape[:2], -1)) * there
 
 
 def _checked_output(name: str, target: Any, size: tuple[int, int]) -> Array:
