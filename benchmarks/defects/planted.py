@@ -223,8 +223,8 @@ LOOPS = [
     Defect(
         "gradients of opacity forget the light that passes",
         "rts/splatting/edges/stacks_loops.py",
-        "g_rgba[n, 3] -= through[k] * behind[k, c] * g[y, x, c]",
-        "g_rgba[n, 3] -= behind[k, c] * g[y, x, c]",
+        "g_rgba[n, count - 1] -= through[k] * behind[k, c] * g[y, x, c]",
+        "g_rgba[n, count - 1] -= behind[k, c] * g[y, x, c]",
         "edges_operations",
     ),
     Defect(

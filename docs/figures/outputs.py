@@ -26,6 +26,7 @@ def knot(along=240, around=24, radius=0.55):
 
 
 def main():
+    """Write the picture."""
     vertices, faces = knot()
     theta = {"vertices": vertices.astype(np.float32), "color": np.array([0.2, 0.45, 0.7], np.float32)}
     part = rts.Part(rts.Mesh(faces), theta, "lambert")

@@ -40,7 +40,7 @@ def write_outputs(path: Path, outputs: Mapping[str, np.ndarray]) -> list[str]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".npz":
-        np.savez(path, **outputs)
+        np.savez(path, **outputs)  # pyright: ignore[reportArgumentType]  # No output is called allow_pickle.
         return [f"{path}: {', '.join(outputs)}"]
     return list(_pictures(path, outputs))
 

@@ -120,8 +120,8 @@ def profile(
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, None)
     scene = scene.at(size)
     settings, context = settings.of(scene), scene.context
-    splatter = settings.splatter
-    assert splatter is not None
+    chosen = settings.splatter
+    assert chosen is not None
 
     def timed(make: Callable[[], _T]) -> tuple[_T, float, float]:
         """What a function gives, and the milliseconds of its first call and of later ones."""
@@ -153,7 +153,7 @@ def profile(
         stages.append(Stage(SAMPLING, whole_first, whole_later, _rows(sampled), _megabytes(sampled)))
     splats, first, later = timed(lambda: to_splats(sampled, scene.parts, scene.camera, scene.camera, context))
     stages.append(Stage(SHADING, first, later, splats.rgba.shape[0], _megabytes((splats.positions, splats.rgba))))
-    image, first, later = timed(lambda: image_of_splats(splatter, splats, settings.supersample))
+    image, first, later = timed(lambda: image_of_splats(chosen, splats, settings.supersample))
     stages.append(Stage(SPLATTING, first, later, size[0] * size[1], _megabytes(image)))
     if context.engine.differentiates:
         spent = sum(stage.later for stage in stages)

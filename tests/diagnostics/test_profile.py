@@ -6,6 +6,8 @@ import pytest
 import rts
 from tests.helpers import arrays, icosphere, mesh_part
 
+pytestmark = pytest.mark.rendering
+
 CAMERA = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
 
 

@@ -7,6 +7,8 @@ import torch
 import rts
 from tests.helpers import ALL, arrays, icosphere, mesh_part, to_numpy
 
+pytestmark = pytest.mark.rendering
+
 SIZE = 24
 NEAR, FAR = 2.0, 5.0
 """Depths of a card and of a wall behind it."""
