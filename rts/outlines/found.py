@@ -36,7 +36,7 @@ class Found(NamedTuple):
     ends: Array
     square: Array
     ties: Array
-    side: Array
+    square_sides: Array
     beyond: Array
     corner: Array
     pull: Array
