@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,7 @@ def _found_on_host(
             count = rooms.get(name, rows) if kind == "tables" else rows
             specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
-    found = Found(*(next(results) for _ in Found._fields))
+    found = Found(*islice(results, len(Found._fields)))
     return found, [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]
 
 

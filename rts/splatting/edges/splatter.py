@@ -21,6 +21,7 @@ Where light passes through, C and the colours on both sides of a break are compo
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,8 @@ from rts.splatting.edges.weights import BORDER
 
 FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
 """The fields of outlines that the operation takes: those of one layer."""
+
+_fields_of = attrgetter(*FIELDS)
 
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
@@ -66,10 +69,10 @@ class Edges(SummingSplatter):
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
         check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
         if outlines.stack is None:
-            return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, name) for name in FIELDS))
+            return EDGES(positions, rgba, row[0, ...], *_fields_of(outlines))
         check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
         whole = Operands.of(splats, outlines)
-        image = EDGES(whole.positions, whole.rgba, whole.row, *(getattr(whole.outlines, name) for name in FIELDS))
+        image = EDGES(whole.positions, whole.rgba, whole.row, *_fields_of(whole.outlines))
         return image + whole.motion
 
     def normal_equations(
@@ -102,7 +105,7 @@ class Edges(SummingSplatter):
         def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(arrays)
             positions, rgba, row, found, *tangents_and_fields = map_leaves(lambda _: next(it), tree)
-            known = positions, rgba, row, *(getattr(found, name) for name in FIELDS)
+            known = positions, rgba, row, *_fields_of(found)
             return edges_weights.normal_equations(known, tuple(tangents_and_fields), splats.border, loss)
 
         count, dtype = t_positions.shape[0], np.float64 if floating_bits(splats.positions) == 64 else np.float32
