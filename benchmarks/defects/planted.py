@@ -381,8 +381,8 @@ ARRAYS = [
     Defect(
         "layers beside a break move twice",
         "rts/splatting/edges/stacks.py",
-        "change = change - stopped(own.whole - here.whole) * with_break[:, None]",
-        "change = change + stopped(own.whole - here.whole) * with_break[:, None]",
+        "change = change - stopped(stack.whole - here.whole) * with_break[:, None]",
+        "change = change + stopped(stack.whole - here.whole) * with_break[:, None]",
         "edges_glass",
     ),
     Defect(

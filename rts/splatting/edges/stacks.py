@@ -226,8 +226,8 @@ class _Sides(NamedTuple):
         As `_beside_breaks` of `rts.splatting.edges.splatter` for opaque layers, whose own part of it, of the
         composites and of the motion of breaks, is taken off.
         """
-        outlines, own, row = self.outlines, self.stack, splats.row
-        xp, engine, (layers, height, width) = namespace(own.whole), engine_of(own.whole), row.shape
+        outlines, stack, row = self.outlines, self.stack, splats.row
+        xp, engine, (layers, height, width) = namespace(stack.whole), engine_of(stack.whole), row.shape
         gap, place, unit = outlines.gap, outlines.place, _normals(outlines)
         along = _steps(gap, unit)
         normal, way = xp.concat([unit, unit]), xp.concat([-along, along])
@@ -236,15 +236,15 @@ class _Sides(NamedTuple):
         centre = xp.concat([_on_gaps(outlines, xp.full_like(place, i)) for i in (0, 1)])
         rows = xp.take(xp.reshape(row, (layers, -1)), cell, axis=1)
         here = Stack.of(splats.positions, splats.rgba, rows, centre[None, ...])
-        rise, (through, behind) = stopped(own.color - here.color), here.weights()
+        rise, (through, behind) = stopped(stack.color - here.color), here.weights()
         # What ends there moves along the normal of its outline; other layers know nothing of this.
         across = xp.sum(normal * way, axis=-1)
-        moves, ends = (own.motion + here.motion) / 2, self._ends()
+        moves, ends = (stack.motion + here.motion) / 2, self._ends()
         moves = xp.where(ends, xp.sum(moves * normal, axis=-1) * across, xp.sum(moves * way, axis=-1))[..., None]
         change = xp.sum(through * (rise - rise[..., -1:] * behind) * moves, axis=0)
         # What is added for the composite, as if it moved with the break.
         with_break = xp.sum((self.ending[:, :2] - self.points) / 2 * normal, axis=-1) * across
-        change = change - stopped(own.whole - here.whole) * with_break[:, None]
+        change = change - stopped(stack.whole - here.whole) * with_break[:, None]
         counts = xp.concat([outlines.ends[:, i] for i in (0, 1)]) & (self.front >= 0)
         length = xp.clip(xp.concat([place, 1 - place]), 0.0, 1.0)
         share = (xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0))[:, None]
