@@ -68,7 +68,7 @@ def orbit(
     azimuth: float,
     elevation: float,
     distance: float | None = None,
-    fov: float = 40.0,
+    fov: float = 45.0,
     up: str = "y",
 ) -> Camera:
     """A camera on a sphere around an object, looking at its centre.

@@ -105,7 +105,7 @@ def test_a_pose_is_drawn_exactly_as_it_was_written(model, pose, tmp_path):
     image = rts.render(posed(rts.load(model), pose.matrix), pose.camera, pose.size)
     rts.save_image(tmp_path / "b.png", image)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    run("render", model, "--pose", path, "-o", tmp_path / "c.png", "--size", "96x128")
+    run("render", model, "--pose", path, "-o", tmp_path / "c.png", "--size", "128x96")
     assert rts.load_image(tmp_path / "c.png").shape == (96, 128, 4)
 
 

@@ -76,7 +76,9 @@ def test_every_eighth_picture_is_for_tests(tmp_path):
     data_set(tmp_path)
     names = [v.name for v in rts.load_views(tmp_path, split="all")]
     assert [v.name for v in rts.load_views(tmp_path, split="test")] == [names[0], names[8]]
-    assert [v.name for v in rts.load_views(tmp_path)] == [*names[1:8], names[9]]
+    assert [v.name for v in rts.load_views(tmp_path, split="train")] == [*names[1:8], names[9]]
+    with pytest.warns(rts.errors.FileWarning, match="8 of the 10 pictures of .* every eighth .* split='train'"):
+        assert len(rts.load_views(tmp_path)) == 8
     refused("split is 'val'; expected 'train', 'test' or 'all'", tmp_path, split="val")
     refused("frame is 'nerf'", tmp_path, frame="nerf")
     data_set(tmp_path / "one", count=1)

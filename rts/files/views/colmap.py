@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
-from rts.errors import InputError
+from rts.errors import FileWarning, InputError, warn
 from rts.files.paths import inside
 from rts.files.views.colmap_tables import Entry, Points, read_cameras, read_entries, read_points
 from rts.files.views.pictures import Folder, picture_folder, picture_size, with_mask
@@ -30,17 +30,26 @@ def cameras_in(folder: Path) -> Path | None:
     return None
 
 
-def colmap(path: Path, split: str, downscale: int) -> list[Pose]:
-    """The pictures of a COLMAP model, in the order of their names, given its file of cameras."""
-    if split not in ("train", "test", "all"):
+def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
+    """The pictures of a COLMAP model, in the order of their names, given its file of cameras; None warns of "train"."""
+    if split not in (None, "train", "test", "all"):
         raise InputError(f"split is {quoted(split)}; expected 'train', 'test' or 'all' for COLMAP, which has no others")
     file = _beside(path, "images")
     cameras, entries = read_cameras(path), sorted(read_entries(file), key=lambda entry: entry.name)
     points_file = path.with_name(f"points3D{path.suffix}")
     points = read_points(points_file) if points_file.is_file() else None
-    entries = [e for i, e in enumerate(entries) if split == "all" or (i % EVERY == 0) == (split == "test")]
-    if not entries:
-        raise InputError(f"{file} has no pictures of the split {split!r}; expected some, or ask for split='all'")
+    chosen = [e for i, e in enumerate(entries) if split == "all" or (i % EVERY == 0) == (split == "test")]
+    if not chosen:
+        raise InputError(
+            f"{file} has no pictures of the split {split or 'train'!r}; expected some, or ask for split='all'"
+        )
+    if split is None:
+        warn(
+            f"{len(chosen)} of the {len(entries)} pictures of {file} are taken; every eighth is kept for tests: say "
+            f"split='train' if that is right, else 'all' or 'test'",
+            FileWarning,
+        )
+    entries = chosen
     folder = picture_folder(_root(path.parent), downscale, path)
     pictures = _pictures(file, folder, entries)
     poses = []
