@@ -43,17 +43,10 @@ def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
         raise InputError(
             f"{file} has no pictures of the split {split or 'train'!r}; expected some, or ask for split='all'"
         )
-    if split is None:
-        warn(
-            f"{len(chosen)} of the {len(entries)} pictures of {file} are taken; every eighth is kept for tests: say "
-            f"split='train' if that is right, else 'all' or 'test'",
-            FileWarning,
-        )
-    entries = chosen
     folder = picture_folder(_root(path.parent), downscale, path)
-    pictures = _pictures(file, folder, entries)
+    pictures = _pictures(file, folder, chosen)
     poses = []
-    for entry, picture in zip(entries, pictures, strict=True):
+    for entry, picture in zip(chosen, pictures, strict=True):
         place = f"{file}, image {entry.image}"
         if entry.camera not in cameras:
             raise InputError(f"{place} refers to camera {entry.camera}, which {path} lacks; export the model again")
@@ -63,6 +56,12 @@ def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
         matrix, bounds = from_opencv(entry.rotation, entry.translation), _bounds(entry, points)
         pose = Pose(picture, entry.name, size, folder.downscale, matrix, lens, *bounds)
         poses.append(with_mask(pose, folder.mask(entry.name), folder.reduced))
+    if split is None:
+        warn(
+            f"{len(chosen)} of the {len(entries)} pictures of {file} are taken; every eighth is kept for tests: say "
+            f"split='train' if that is right, else 'all' or 'test'",
+            FileWarning,
+        )
     return poses
 
 
