@@ -94,7 +94,7 @@ def _pictures(file: Path, folder: Folder, entries: list[Entry]) -> list[Path]:
 
 
 def _bounds(entry: Entry, points: Points | None) -> tuple[float | None, float | None]:
-    """Depths between which the scene lies, by the points that the picture sees; None where it sees none."""
+    """Depths between which what is seen lies, by the points that the picture sees; None where it sees none."""
     if points is None:
         return None, None
     seen = points.positions[points.rows[points.images == entry.image]]

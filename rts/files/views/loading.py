@@ -30,7 +30,7 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 PLANES = (0.01, 1000.0)
 """Near and far planes of cameras whose file tells no bounds."""
 MARGIN = 100.0
-"""Factor by which a camera's planes lie nearer, and farther, than the bounds of the scene in its file."""
+"""Factor by which a camera's planes lie nearer, and farther, than the bounds of depth in its file."""
 
 
 def load_views(
@@ -93,8 +93,8 @@ def load_views(
         pixel_center: place in each returned pixel, in x and in y, through which its ray passes. The centre is 0.5.
             NeRF's rays passed through 0 of the pixels it was trained on; so through (n − 1) / 2n of pixels that are
             means of n × n of those (0.375 for 100² of 400²).
-        frame: "file" for the world of the file; "nerf" for that in which NeRF is trained on LLFF scenes: about the mean
-            of all cameras, which looks along −z, and so large that the nearest bound is 1 / 0.75. Blender's is the
+        frame: "file" for the world of the file; "nerf" for that in which NeRF is trained on LLFF data sets: about the
+            mean of all cameras, which looks along −z, and so large that the nearest bound is 1 / 0.75. Blender's is the
             same in both; COLMAP and OpenCV have the first alone.
         near: near plane of the cameras; default 0.01, or a hundredth of the nearest bound.
         far: far plane; default 1000, or a hundred times the farthest bound.
@@ -102,8 +102,8 @@ def load_views(
 
     Returns:
         A list of views: `camera` (float64 NumPy), `size`, `image` (float32), `mask` (float32, or None), `name`, `path`,
-        and `near` and `far` of the scene: LLFF's bounds; of COLMAP, the percentiles 0.1 and 99.9 of the depths of the
-        points that the picture sees; None where the file tells none.
+        and `near` and `far`, depths between which what is seen lies: LLFF's bounds; of COLMAP, the percentiles 0.1 and
+        99.9 of the depths of the points that the picture sees; None where the file tells none.
 
     Raises:
         InputError: a file is missing, damaged or incomplete; a matrix is no rotation and position; an image or a mask
@@ -198,7 +198,7 @@ def _poses(path: Path, split: str | None, downscale: int, frame: str) -> list[Po
     if kind == ".json" and "views" not in tree:
         return blender(path, tree, downscale)
     if frame == "nerf":
-        raise InputError(f"frame is 'nerf', which is for scenes of LLFF's format; expected 'file' for {path}")
+        raise InputError(f"frame is 'nerf', which is for data sets of LLFF's format; expected 'file' for {path}")
     return opencv(path, tree, downscale) if kind == ".json" else colmap(path, split, downscale)
 
 
