@@ -6,7 +6,8 @@ Images are arrays, and have no type of their own.
 from rts.diagnostics.gradient_images import GradientImage
 from rts.diagnostics.gradients import GradientCheck
 from rts.fitting.fit import Fit
+from rts.notebooks import Shown
 from rts.rendering.renderer import PreparedParts, Renderer
 from rts.sampling.auto import Choice
 
-__all__ = ["Choice", "Fit", "GradientCheck", "GradientImage", "PreparedParts", "Renderer"]
+__all__ = ["Choice", "Fit", "GradientCheck", "GradientImage", "PreparedParts", "Renderer", "Shown"]
