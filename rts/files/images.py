@@ -36,20 +36,21 @@ def save_image(path: Any, image: Array) -> None:
         InputError: no array, another shape, integers, NaN or infinity, more than fits into memory, another extension,
             or a path that cannot be or may not be written to.
     """
+    from PIL import Image
+
     path = output_file(path, "picture", (".png",))
-    encoded = png_of(image)
+    encoded = _bytes(_host(image, "the image"))
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encoded)
+        Image.fromarray(encoded).save(path)
 
 
 def png_of(image: Array) -> bytes:
     """The bytes of the PNG that `save_image` writes."""
     from PIL import Image
 
-    encoded = _bytes(_host(image, "the image"))
     file = io.BytesIO()
-    Image.fromarray(encoded).save(file, "PNG")
+    Image.fromarray(_bytes(_host(image, "the image"))).save(file, "PNG")
     return file.getvalue()
 
 

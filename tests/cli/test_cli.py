@@ -340,7 +340,7 @@ def test_a_file_that_cannot_be_written_in_the_end_is_one_line(model, tmp_path, m
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Image.Image, "save", full)
     said = fail("render", model, "--size", 8, "-o", tmp_path / "a.png")
     assert "a.png cannot be written (No space left on device)" in said
 
