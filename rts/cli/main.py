@@ -25,7 +25,6 @@ from rts.cli.options import (
     is_given,
     layers_of,
     refuse_beside,
-    size_of,
     view_of,
 )
 from rts.scene.parts import Part
@@ -35,7 +34,7 @@ Examples:
 
     rts demo
 
-    rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --shader normals
+    rts render bunny.obj -o bunny.png --size 640x480 --camera 30,20 --shader normals
 
     rts fit-pose bunny.obj photo.png -o found
 """
@@ -117,7 +116,7 @@ def plugins(
             _say(escape(newer))
 
 
-@app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")
+@app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 640x480 --camera 30,20 --cull back")
 def render(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
@@ -133,13 +132,13 @@ def render(
         ),
     ] = "color",
     surface: SurfaceName = "mesh",
-    size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
+    size: Annotated[str, typer.Option(help="Pixels: 256, or WIDTHxHEIGHT.")] = "256",
     camera: OrbitAngles = "30,20",
-    fov: FieldOfView = 40.0,
+    fov: FieldOfView = 45.0,
     up: UpAxis = "y",
     sampler: Annotated[str, typer.Option(help="Name of a sampler, see `rts plugins`.")] = "auto",
     engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
-    layers: Annotated[str, typer.Option(help="SurfaceName layers kept at each pixel, or auto.")] = "auto",
+    layers: Annotated[str, typer.Option(help="Layers kept at each pixel, or auto.")] = "auto",
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
     splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, multi, single or none.")] = "auto",
     supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
@@ -157,7 +156,7 @@ def render(
     import rts
     from rts.cli.output_files import check_names, names_of, write_outputs
     from rts.cli.pose_file import posed, read_pose
-    from rts.diagnostics.measuring_api import supersample_of
+    from rts.diagnostics.measuring_api import size_of, supersample_of
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
 
@@ -194,7 +193,7 @@ def render(
     seconds = time.perf_counter() - start
     lines = write_outputs(output, {name: engine_object.to_numpy(image) for name, image in images.items()})
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
-    _say(escape(f"{what}, {shape[0]} x {shape[1]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
+    _say(escape(f"{what}, {shape[1]} x {shape[0]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
     for line in lines if names != ("color",) else ():
         _say(escape(f"  {line}"))
     if profile:
@@ -219,7 +218,7 @@ def fit_pose(
     method: Annotated[str, typer.Option(help="lm (Levenberg–Marquardt), adam or sgd.")] = "lm",
     steps: Annotated[int | None, typer.Option(help="At most so many at each stage.")] = None,
     camera: OrbitAngles = "30,20",
-    fov: FieldOfView = 40.0,
+    fov: FieldOfView = 45.0,
     up: UpAxis = "y",
     fit_fov: Annotated[bool, typer.Option("--fit-fov", help="Fit the field of view, too; --fov is the start.")] = False,
     loss: Annotated[

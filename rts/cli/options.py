@@ -9,14 +9,6 @@ import numpy as np
 import typer
 
 
-def size_of(text: str) -> tuple[int, int]:
-    """(height, width) of "256" or "480x640"."""
-    parts = text.lower().split("x")
-    if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
-        raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")
-    return int(parts[0]), int(parts[-1])
-
-
 def layers_of(text: str) -> Any:
     """The `layers` written as "4" or "auto"."""
     if text != "auto" and not text.lstrip("-").isdecimal():

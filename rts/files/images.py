@@ -45,6 +45,15 @@ def save_image(path: Any, image: Array) -> None:
         Image.fromarray(encoded).save(path)
 
 
+def png_of(image: Array) -> bytes:
+    """The bytes of the PNG that `save_image` writes."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(_bytes(_host(image, "the image"))).save(file, "PNG")
+    return file.getvalue()
+
+
 def load_image(path: Any) -> np.ndarray:
     """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads.
 

@@ -42,9 +42,6 @@ Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]
 SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
 
-F_SCALE = 0.1
-"""The scale of a robust loss of images, whose numbers are mostly from 0 to 1."""
-
 
 class ImageResiduals(Residuals):
     """The difference between the render of a scene and a target, as a function of the scene's parameters.
@@ -78,8 +75,8 @@ class ImageResiduals(Residuals):
         loss: the function of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
             "soft_l1", "huber" or "cauchy", to which large residuals count less: for targets that are partly wrong, such
             as a mask with something in front. Or an `rts.Loss`, which has its own `f_scale`.
-        f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1,
-            which suits images in [0, 1].
+        f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1, as
+            of every `rts.Loss`, which suits images in [0, 1].
 
     Attributes:
         size: (height, width).
@@ -429,7 +426,7 @@ class ImageResiduals(Residuals):
 
 def _checked_loss(loss: Any, f_scale: Any) -> Loss:
     if not isinstance(loss, Loss):
-        return Loss(loss, F_SCALE if f_scale is None else f_scale)
+        return Loss(loss) if f_scale is None else Loss(loss, f_scale)
     if f_scale is not None:
         raise InputError(f"loss is {loss}, and f_scale {quoted(f_scale)}; expected one of them to say the scale")
     return loss

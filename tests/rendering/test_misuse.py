@@ -223,6 +223,7 @@ CALLS = {
     "load.surface": lambda v: rts.load("no such model.obj", surface=v),
     "load.merge": lambda v: rts.load("no such model.obj", merge=v),
     "load_image.path": rts.load_image,
+    "show.thing": rts.show,
     "save_image.path": lambda v: rts.save_image(v, np.zeros((2, 2, 4))),
     "save_image.image": lambda v: rts.save_image("never written.png", v),
     "save_animation.path": lambda v: rts.save_animation(v, [np.zeros((2, 2, 4))]),
@@ -313,6 +314,7 @@ ACCEPTED = {
 WORDS = {
     "save_image.path": "picture",
     "save_animation.path": "animation",
+    "show.thing": "image",
     "save_animation.frames": "frame",
 }
 """Words for an argument in messages, if they are not its name alone."""
@@ -352,7 +354,7 @@ def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, tmp
     assert not {value: said for value, said in complaints.items() if said}
 
 
-@pytest.mark.filterwarnings("ignore::rts.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize(
     "call", [pytest.param(c, marks=[pytest.mark.thorough] * c.startswith("tune.")) for c in misuses.CALLS]
 )

@@ -13,10 +13,11 @@ from analytic import Ellipsoid
 from helpers import splats_of
 
 import rts
-from rts import GBuffer, InputError, Part, PluginError
+from rts import GBuffer, InputError, Part
 from rts.arrays.array_functions import without_border
 from rts.arrays.engines import engine_of, namespace
 from rts.contracts.records import Request
+from rts.errors import PluginError
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import Fragments, RayHits
 from rts.registry import instance
