@@ -60,6 +60,14 @@ def prefiltered(image: Array) -> dict[str, Array]:
     return {"sh": sh, "image": image, "levels": xp.concat([middle[None], levels])}
 
 
+def turned_environment(image: Array, rotation: Array) -> Array:
+    """An environment's image (h, w, 3) as seen from a world whose directions d are `rotation` (3, 3) @ d in its own."""
+    xp, engine, (height, width) = namespace(image), engine_of(image), image.shape[:2]
+    grid = engine.constant(_directions(height, width).reshape(-1, 3), image)
+    ways = sum(grid[:, i : i + 1] * rotation[:, i] for i in range(3))
+    return xp.reshape(_looked_up([image], ways), image.shape)
+
+
 def reflected(environment: Mapping[str, Array], directions: Array, roughness: Array) -> Array:
     """Blurred light (N, 3) from unit directions (N, 3), for surfaces of roughness (N, 1).
 
@@ -112,9 +120,10 @@ def _looked_up(images: list[Array], directions: Array, number: Array | None = No
 
 
 @functools.cache
-def _directions() -> np.ndarray:
-    """The unit directions (ROWS, 2 ROWS, 3) of the centres of a level's texels."""
-    down, around = (np.arange(ROWS)[:, None] + 0.5) / ROWS * np.pi, (np.arange(2 * ROWS) + 0.5) / ROWS * np.pi
+def _directions(height: int = ROWS, width: int = 2 * ROWS) -> np.ndarray:
+    """The unit directions (height, width, 3) of the centres of an image's texels; by default those of a level."""
+    down = (np.arange(height)[:, None] + 0.5) / height * np.pi
+    around = (np.arange(width) + 0.5) / width * 2 * np.pi
     x, z = -np.sin(down) * np.sin(around), np.sin(down) * np.cos(around)
     return np.stack([x, np.cos(down) + 0 * x, z], axis=-1)
 

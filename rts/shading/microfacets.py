@@ -139,7 +139,7 @@ def _table() -> np.ndarray:
 
 
 def _nearest_blur(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of all blurs the one that is nearest to reflected light, by spherical harmonics up to order 3.
+    """The blur that is nearest to reflected light, by spherical harmonics up to order 3.
 
     Args:
         light: (C, n, 3) directions, about the plane of y = 0.
