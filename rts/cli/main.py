@@ -22,6 +22,7 @@ from rts.cli.options import (
     SurfaceName,
     UpAxis,
     color_of,
+    environment_of,
     is_given,
     layers_of,
     refuse_beside,
@@ -122,7 +123,7 @@ def render(
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
     *,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="The PNG to write, or a .npz of all --outputs.")
+        Path, typer.Option("--output", "-o", help="The picture to write: .png, .hdr or .exr; or a .npz of arrays.")
     ] = Path("out.png"),
     outputs: Annotated[
         str,
@@ -144,6 +145,16 @@ def render(
     supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
     cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
+    environment: Annotated[
+        Path | None,
+        typer.Option(
+            help="A picture of all that surrounds the model, and lights it: .hdr, .exr or .png, twice as wide as high."
+        ),
+    ] = None,
+    exposure: Annotated[
+        float | None,
+        typer.Option(help="Stops by which a .png is made brighter; bright colours are then compressed, not clipped."),
+    ] = None,
     pose: Annotated[
         Path | None,
         typer.Option(help="The pose.json of `rts fit-pose`: pose, camera and size are exactly those in it."),
@@ -157,13 +168,19 @@ def render(
     from rts.cli.output_files import check_names, names_of, write_outputs
     from rts.cli.pose_file import posed, read_pose
     from rts.diagnostics.measuring_api import size_of, supersample_of
+    from rts.files.images import PICTURES
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
+    from rts.shading.tone_mapping import check_exposure
 
     shape, view, color = size_of(size), view_of(camera), color_of(background)
-    output_file(output, "picture", (".png", ".npz"))
+    output_file(output, "picture", (*PICTURES, ".npz"))
     names = names_of(outputs)
     check_names(names, output)
+    if exposure is not None and output.suffix.lower() != ".png":
+        raise typer.BadParameter("--exposure is for a .png; .hdr and .exr hold colours of any brightness")
+    check_exposure(exposure or 0.0)
+    light = None if environment is None else environment_of(environment, up)
     engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
         parts = rts.load(model, surface=surface)
@@ -179,6 +196,7 @@ def render(
 
     def prepared(part: Part) -> Part:
         theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
+        theta = theta if light is None else {**theta, "light": {"environment": light}}
         return part.replace(
             theta=map_leaves(engine_object.constant, theta),
             cull=cull,
@@ -191,7 +209,8 @@ def render(
     start = time.perf_counter()
     images = rts.render(scene, seen, shape, **options, background=color, outputs=names)
     seconds = time.perf_counter() - start
-    lines = write_outputs(output, {name: engine_object.to_numpy(image) for name, image in images.items()})
+    arrays = {name: engine_object.to_numpy(image) for name, image in images.items()}
+    lines = write_outputs(output, arrays, exposure)
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
     _say(escape(f"{what}, {shape[1]} x {shape[0]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
     for line in lines if names != ("color",) else ():

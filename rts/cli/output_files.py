@@ -1,4 +1,4 @@
-"""Outputs of a render as files: arrays in one .npz, or a .png each."""
+"""Outputs of a render as files: arrays in one .npz, or a picture each."""
 
 from __future__ import annotations
 
@@ -22,38 +22,45 @@ def names_of(text: str) -> tuple[str, ...]:
 
 
 def check_names(names: tuple[str, ...], path: Path) -> None:
-    """Refuse outputs that a PNG cannot hold, before any is computed."""
-    wrong = [name for name in names if name in NUMBERS]
-    if wrong and path.suffix != ".npz":
+    """Refuse outputs that a picture of this kind cannot hold, before any is computed."""
+    kind = path.suffix.lower()
+    wrong = [name for name in names if name in NUMBERS or (kind == ".hdr" and name != "color")]
+    if wrong and kind != ".npz":
         raise typer.BadParameter(
             f"{', '.join(wrong)} are numbers, and no picture; write all outputs into one .npz: -o out.npz",
             param_hint="'--outputs'",
         )
 
 
-def write_outputs(path: Path, outputs: Mapping[str, np.ndarray]) -> list[str]:
+def write_outputs(path: Path, outputs: Mapping[str, np.ndarray], exposure: float | None = None) -> list[str]:
     """Write outputs (H, W, ·), and return a line for each file, which says what its numbers mean.
 
     Args:
-        path: a .npz for all; or the .png of "color", beside which lie those of others, as out.depth.png beside out.png.
+        path: a .npz for all; or the picture of "color", beside which lie those of others, as out.depth.png beside
+            out.png. In .exr all are numbers as they are.
         outputs: name → array.
+        exposure: of "color", as `rts.save_image` takes it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         np.savez(path, **outputs)  # pyright: ignore[reportArgumentType]  # No output is called allow_pickle.
         return [f"{path}: {', '.join(outputs)}"]
-    return list(_pictures(path, outputs))
+    return list(_pictures(path, outputs, exposure))
 
 
-def _pictures(path: Path, outputs: Mapping[str, np.ndarray]) -> Iterator[str]:
+def _pictures(path: Path, outputs: Mapping[str, np.ndarray], exposure: float | None) -> Iterator[str]:
     from PIL import Image
 
     for name, array in outputs.items():
         if name == "color":
-            rts.save_image(path, array)
+            rts.save_image(path, array, exposure)
             yield f"{path}: color"
             continue
-        file = path.with_suffix(f".{name}.png")
+        file = path.with_suffix(f".{name}{path.suffix}")
+        if path.suffix.lower() == ".exr":
+            rts.save_image(file, array.astype(np.float32))
+            yield f"{file}: {name}"
+            continue
         if name == "normal":
             there = np.abs(array).max(axis=-1, keepdims=True) > 0
             Image.fromarray(np.where(there, np.round(127.5 * (array + 1)), 0).astype(np.uint8)).save(file)

@@ -21,15 +21,24 @@ from rts.errors import InputError
 from rts.operations.linear import affine_map
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
+from rts.shading.tangents import TANGENT, tangents
 from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
-    """The part's G-buffer at the samples, local space.
+    """The part's G-buffer at the samples, local space, with deferred tangents if it has "uv" but no "tangent".
 
     The samples' own G-buffer is taken, if they have one, where the surface's θ is constant and the G-buffer has all
     that the shader reads.
     """
+    gbuffer = _evaluated(part, samples, context)
+    if "uv" in gbuffer and "normal" in gbuffer and TANGENT not in gbuffer:
+        gbuffer.defer(TANGENT, lambda: tangents(part.surface, context.constants(part.read), samples, gbuffer, context))
+    return gbuffer
+
+
+def _evaluated(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
+    """What the part's surface gives at the samples; see `evaluate`."""
     theta = part.read
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
@@ -199,7 +208,7 @@ def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
-    """The G-buffer with positions and normals moved by the part's transform."""
+    """The G-buffer with positions, normals and tangents moved by the part's transform."""
     if transform is None:
         return gbuffer
     world = GBuffer()
@@ -209,6 +218,8 @@ def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
     world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))
     if "normal" in gbuffer:
         world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
+    if TANGENT in gbuffer:
+        world.defer(TANGENT, lambda: _move_tangents(transform, gbuffer[TANGENT]))
     return world
 
 
@@ -217,6 +228,19 @@ def _move_normals(transform: Array, normals: Array) -> Array:
     xp = namespace(transform)
     a, b, c = (transform[:3, i] for i in range(3))
     cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    volume = xp.sum(a * cofactors[0])
-    outside = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
+    outside = _orientation(transform)
     return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))
+
+
+def _move_tangents(transform: Array, tangents: Array) -> Array:
+    """Tangents with signs (N, 4) under an affine map, of any length; a mirror changes the signs."""
+    moved = sum(tangents[:, i : i + 1] * transform[:3, i] for i in range(3))
+    return namespace(moved).concat([moved, tangents[:, 3:] * _orientation(transform)], axis=1)
+
+
+def _orientation(transform: Array) -> Array:
+    """1 () for an affine map, −1 for one that mirrors."""
+    xp = namespace(transform)
+    a, b, c = (transform[:3, i] for i in range(3))
+    volume = xp.sum(a * xp.linalg.cross(b, c))
+    return xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
