@@ -15,10 +15,12 @@ from rts.arrays.array_functions import dot, unit
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.shading.environment import blur
-from rts.shading.harmonics import harmonics
+from rts.shading.harmonics import DIFFUSE, harmonics
 
 SMOOTHEST = 0.045
 """The least roughness: float32 holds the highlights of smoother surfaces badly (Filament)."""
+FAINT = 0.02
+"""What keeps the share of a cosine small where a blur alone is nearly as good, so that the table is smooth."""
 TABLE = 32
 """Number of cosines, and of roughnesses, of `around`'s table."""
 
@@ -61,11 +63,11 @@ def of_light(normal: Array, toward: Array, direction: Array, roughness: Array) -
     return Response(specular * (1 - fresnel), specular * fresnel, to_light * (1 - fresnel))
 
 
-def around(normal: Array, toward: Array, roughness: Array) -> tuple[Response, Array, Array]:
+def around(normal: Array, toward: Array, roughness: Array) -> tuple[Response, Array, Array, Array]:
     """The response (N, 1) to light from all directions: the split-sum approximation (Karis 2013).
 
     The first two numbers are of light of radiance 1. For other light they are factors of its average over directions
-    that a surface reflects, which is replaced by a blur of equal mean direction around this direction.
+    that a surface reflects. For this average there is a blur about a direction, mixed with diffuse light.
 
     Args:
         normal: (N, 3) unit vectors.
@@ -73,8 +75,8 @@ def around(normal: Array, toward: Array, roughness: Array) -> tuple[Response, Ar
         roughness: (N, 1) or (), perceptual.
 
     Returns:
-        The response, the mean directions (N, 3) of reflected light, and the roughnesses (N, 1) of surfaces that blur
-        as much along their normals.
+        The response, directions (N, 3) of blurs, the roughnesses (N, 1) of surfaces that blur as much along their
+        normals, and the shares (N, 1) of diffuse light, irradiance / π, in the average.
     """
     cosine = dot(normal, toward)
     engine = engine_of(cosine, roughness)
@@ -94,17 +96,17 @@ def around(normal: Array, toward: Array, roughness: Array) -> tuple[Response, Ar
 
     upper = at(0) + right * (at(1) - at(0))
     lower = at(TABLE) + right * (at(TABLE + 1) - at(TABLE))
-    a, b, c, along, upright, blurred = ((upper + down * (lower - upper))[:, i : i + 1] for i in range(6))
+    a, b, c, along, upright, blurred, flat = ((upper + down * (lower - upper))[:, i : i + 1] for i in range(7))
     mean = unit(along * (cosine * normal - toward) + upright * normal)
-    return Response(a, b, c), mean, blurred
+    return Response(a, b, c), mean, blurred, flat
 
 
 @functools.cache
 def _table() -> np.ndarray:
-    """Constants of `around` (TABLE², 6): rows of roughness, 0 to 1, in each the square roots of cosines, 0 to 1.
+    """Constants of `around` (TABLE², 7): rows of roughness, 0 to 1, in each the square roots of cosines, 0 to 1.
 
-    Columns are a, b and c; the mean direction of reflected light, in parts along the viewer's mirrored tangent and
-    along the normal; and a roughness.
+    Columns are a, b and c; a direction, in parts along the viewer's mirrored tangent and along the normal; a roughness;
+    and a share of diffuse light.
     """
     step = np.linspace(0, 1, TABLE)
     cosine = np.maximum(step**2, 1e-4)[:, None]
@@ -116,7 +118,7 @@ def _table() -> np.ndarray:
     flat = np.sqrt(u)
     light = np.stack([flat * np.cos(turn), flat * np.sin(turn), np.sqrt(1 - u)], axis=-1)
     half = unit(light + toward)
-    table = np.zeros((TABLE, TABLE, 6))
+    table = np.zeros((TABLE, TABLE, 7))
     table[..., 2] = 1 - _fifth(1 - (toward * half).sum(axis=-1)).mean(axis=1)
     for i, roughness in enumerate(step):
         alpha = max(roughness, SMOOTHEST) ** 2
@@ -133,28 +135,39 @@ def _table() -> np.ndarray:
         weight = to_light * (cosine + of_viewer) / (to_light * of_viewer + cosine * of_light)
         fresnel = _fifth(1 - np.clip(to_half, 0, 1))
         table[i, :, 0], table[i, :, 1] = (weight * (1 - fresnel)).mean(axis=1), (weight * fresnel).mean(axis=1)
-        angle, table[i, :, 5] = _nearest_blur(light, weight / weight.sum(axis=1, keepdims=True))
+        weight = weight / weight.sum(axis=1, keepdims=True)
+        angle, table[i, :, 5], table[i, :, 6] = _nearest_blur(light, weight)
         table[i, :, 3], table[i, :, 4] = np.sin(angle) / sine[:, 0], np.cos(angle)
-    return np.ascontiguousarray(table.reshape(-1, 6), np.float32)
+    return np.ascontiguousarray(table.reshape(-1, 7), np.float32)
 
 
-def _nearest_blur(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The blur that is nearest to reflected light, by spherical harmonics up to order 3.
+def _nearest_blur(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The blur, mixed with a cosine about the normal, that is nearest to reflected light.
+
+    Distances are those of spherical harmonics up to order 3.
 
     Args:
         light: (C, n, 3) directions, about the plane of y = 0.
         weight: (C, n), of sum 1.
 
     Returns:
-        The angles (C,) from the normal towards −x, and the roughnesses (C,).
+        The angles (C,) of blurs from the normal towards −x, their roughnesses (C,), and the shares (C,) of the cosine,
+        below zero where light is spread more widely than by any blur.
     """
     angles, roughness, orders = np.linspace(-0.05, 1.6, 100), np.linspace(0, 1, 65), [0, 1, 4, 9]
-    blurs = np.stack([blur(r, 3) for r in roughness.tolist()])
+    blurs, flat, norm = np.stack([blur(r, 3) for r in roughness.tolist()]), np.array([*DIFFUSE, 0]), [1, 3, 5, 7]
     basis = harmonics(light.reshape(-1, 3), 16).reshape(*light.shape[:2], 16)
-    moments = (weight[:, None] @ basis)[:, 0]
-    ways = harmonics(np.stack([-np.sin(angles), 0 * angles, np.cos(angles)], axis=1), 16)
-    seen = np.add.reduceat(moments[:, None] * ways, orders, axis=2) * 4 * np.pi
-    cost = blurs**2 @ [1, 3, 5, 7] - 2 * seen @ blurs.T
+    moments = 4 * np.pi * (weight[:, None] @ basis)[:, 0]
+    ways, upright = harmonics(np.stack([-np.sin(angles), 0 * angles, np.cos(angles)], axis=1), 16), np.eye(3)[2:]
+    # Scalar products of reflected light, each blur at each angle, and the cosine.
+    light_blur = np.add.reduceat(moments[:, None] * ways, orders, axis=2) @ blurs.T
+    light_flat = (np.add.reduceat(moments * harmonics(upright, 16), orders, axis=1) @ flat)[:, None, None]
+    blur_flat = 4 * np.pi * (np.add.reduceat(ways * harmonics(upright, 16), orders, axis=1) * flat) @ blurs.T
+    blur_blur = blurs**2 @ norm
+    apart = flat**2 @ norm - 2 * blur_flat + blur_blur + FAINT
+    rest = light_flat - blur_flat - light_blur + blur_blur
+    share = np.clip(rest / apart, -1, 1)
+    cost = blur_blur - 2 * light_blur - 2 * share * rest + share**2 * apart
     i, j = np.divmod(cost.reshape(len(cost), -1).argmin(axis=1), len(roughness))
     i, j, rows = np.clip(i, 1, len(angles) - 2), np.clip(j, 1, len(roughness) - 2), np.arange(len(cost))
 
@@ -168,6 +181,7 @@ def _nearest_blur(light: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np
     return (
         refined(angles, i, np.stack([cost[rows, i + k, j] for k in (-1, 0, 1)])),
         refined(roughness, j, np.stack([cost[rows, i, j + k] for k in (-1, 0, 1)])),
+        share[rows, i, j],
     )
 
 

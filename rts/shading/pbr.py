@@ -63,9 +63,10 @@ class Pbr(Unlit):
             a, b, c = microfacets.of_light(normal, toward, direction, roughness)
             shown = shown + (reflectance * a + b + base * c) * brightness
         if light.surrounds:
-            (a, b, c), mean, blurred = microfacets.around(normal, toward, roughness)
-            reflected = light.reflected(mean, blurred)
-            around = (reflectance * a + b) * reflected + base * c * light.diffuse(normal)
+            (a, b, c), mean, blurred, flat = microfacets.around(normal, toward, roughness)
+            diffuse, reflected = light.diffuse(normal), light.reflected(mean, blurred)
+            reflected = reflected + flat * (diffuse - reflected)
+            around = (reflectance * a + b) * reflected + base * c * diffuse
             occlusion = self._entry(theta, gbuffer, "occlusion", 1)
             shown = shown + (around if occlusion is None else occlusion * around)
         emissive = self._entry(theta, gbuffer, "emissive", 3)
