@@ -230,8 +230,8 @@ LOOPS = [
     Defect(
         "composites behind a layer are those behind the next",
         "rts/splatting/edges/stacks_loops.py",
-        "behind[k, c] = rgba[n, c] + (1 - rgba[n, 3]) * behind[k + 1, c]",
-        "behind[k, c] = (1 - rgba[n, 3]) * behind[k + 1, c]",
+        "behind[k, c] = rgba[n, c] + (1 - rgba[n, alpha]) * behind[k + 1, c]",
+        "behind[k, c] = (1 - rgba[n, alpha]) * behind[k + 1, c]",
         "edges_operations edges_glass",
     ),
     Defect(

@@ -202,4 +202,4 @@ def _unknown(name: str, gbuffer: GBuffer) -> str:
     names = ["color", "alpha", *MEANS, *FRONTS, *gbuffer]
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else f"; expected some of {', '.join(dict.fromkeys(names))}"
-    return f"there is no output {name!r}, nor an attribute of that name of the surface{hint}"
+    return f"outputs has {name!r}, which is neither an output nor an attribute of the surface{hint}"

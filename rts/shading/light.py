@@ -39,6 +39,7 @@ DIRECTION = (-0.3, 0.5, 0.81)
 """The default direction, in camera space."""
 FURTHER = ("position", "sh", "environment")
 """Entries besides which there are no defaults."""
+PLURALS = {"color": "colors", "intensity": "intensities"}
 ENTRIES = ("direction", "color", "position", "intensity", "ambient", "sh", "environment")
 
 
@@ -160,7 +161,7 @@ def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, An
     """Each place of a light with its brightness, of which one may serve all."""
     values = _separate_vectors(entries[name]) if name in entries else [default]
     if len(values) not in (1, len(places)):
-        raise InputError(f"theta['light'] has {len(places)} {place}s but {len(values)} of {name}")
+        raise InputError(f"theta['light'] has {len(places)} {place}s but {len(values)} {PLURALS[name]}")
     return list(zip(places, values * len(places) if len(values) == 1 else values, strict=True))
 
 

@@ -114,6 +114,9 @@ CALLS = {
     "prepare.sampler": lambda v: rts.prepare(PART, v),
     "explain.parts": lambda v: rts.explain(v, CAMERA),
     "explain.camera": lambda v: rts.explain(PART, v),
+    "profile.parts": lambda v: rts.profile(v, CAMERA, SIZE),
+    "profile.repeats": lambda v: rts.profile(PART, CAMERA, SIZE, repeats=v),
+    "render.outputs": lambda v: rts.render(PART, CAMERA, SIZE, outputs=v),
     "Part.surface": lambda v: rts.render(PART.replace(surface=v), CAMERA, SIZE),
     "Part.theta": lambda v: rts.render(PART.replace(theta=v), CAMERA, SIZE),
     "Part.shader": lambda v: rts.render(PART.replace(shader=v), CAMERA, SIZE),
@@ -281,8 +284,8 @@ def splatter():
 
 
 OPTIONAL = """
-    render.background render.capacity render.engine sample.splatter render_samples.background prepare.camera
-    prepare.size
+    render.background render.capacity render.engine render.outputs sample.splatter render_samples.background
+    prepare.camera prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
     ImageResiduals.weights ImageResiduals.f_scale fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
     fit.patience fit.schedule Stage.supersample pyramid.largest

@@ -133,7 +133,7 @@ def test_light_that_passes_weighs_what_lies_behind():
 def test_attributes_of_the_surface_are_outputs():
     colors = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float64)
     part = card(NEAR, -9, 9, colors=colors).replace(shader="silhouette")
-    with pytest.raises(rts.InputError, match="no output 'colours'.*did you mean 'color'"):
+    with pytest.raises(rts.InputError, match="outputs has 'colours'.*did you mean 'color'"):
         rts.render(part, CAMERA, (8, 8), outputs=("colours",))
     with pytest.raises(rts.InputError, match="'uv' is an attribute that no part has"):
         rts.render(part, CAMERA, (8, 8), outputs=("uv",))
