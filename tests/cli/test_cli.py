@@ -261,6 +261,20 @@ def test_render_writes_outputs_beside_the_picture_or_as_arrays(model, tmp_path):
     assert "one .npz" in fail("render", model, "-o", tmp_path / "a.png", "--outputs", "position", code=2)
 
 
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_render_is_lit_by_an_environment_and_exposed(model, tmp_path, up):
+    above = np.zeros((16, 32, 3), np.float32)
+    above[:4] = (0.0, 4.0, 0.0)
+    rts.save_image(tmp_path / "sky.hdr", above)
+    common = "render", model, "--size", 24, "--up", up, "--camera", "30,60", "--environment", tmp_path / "sky.hdr"
+    succeed(*common, "-o", tmp_path / "a.hdr")
+    image = rts.load_image(tmp_path / "a.hdr")
+    assert image[..., 1].max() > 0.5 and image[..., 0].max() == 0
+    succeed(*common, "-o", tmp_path / "a.png", "--exposure", "-3", "--shader", "pbr")
+    assert 0 < rts.load_image(tmp_path / "a.png")[..., 1].max() < 0.3
+    assert "--exposure is for a .png" in fail(*common, "-o", tmp_path / "a.hdr", "--exposure", "1", code=2)
+
+
 def test_render_options_reach_the_picture(model, tmp_path):
     def picture(*options):
         succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, *options)

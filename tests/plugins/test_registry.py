@@ -79,7 +79,7 @@ def modules_after(code):
         ("rts.engines", ("jax", "numpy", "torch")),
         ("rts.surfaces", ("mesh",)),
         ("rts.samplers", ("raster", "reference")),
-        ("rts.shaders", ("blinn_phong", "depth", "lambert", "normals", "silhouette", "textured", "unlit")),
+        ("rts.shaders", ("blinn_phong", "depth", "lambert", "normals", "pbr", "silhouette", "textured", "unlit")),
         ("rts.splatters", ("edges", "multi", "none", "single")),
     ],
 )

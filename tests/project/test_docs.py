@@ -31,9 +31,10 @@ ELSEWHERE = {
     "rts plugins --matrix": "test_compatibility.py",
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
+    "rts render model.glb --shader pbr --environment room.hdr --exposure 0.5 -o picture.png": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
 }
-"""Commands that take long, and who runs them."""
+"""Commands that take long, or need files of their own, and who runs them."""
 
 
 def blocks(page, language):
