@@ -108,7 +108,7 @@ def test_engines_blur_an_environment_alike(target):
         ({"environment": np.zeros((4, 8))}, r"expected an array of shape \(h, w, 3\)"),
         ({"environment": {"sh": np.zeros((9, 3))}}, "expected an image, or what prefiltered made of it"),
         ({"intensity": np.ones(3)}, "intensity of point lights, but no position"),
-        ({"position": np.ones((2, 3)), "intensity": np.ones((3, 3))}, "has 2 positions but 3 of intensity"),
+        ({"position": np.ones((2, 3)), "intensity": np.ones((3, 3))}, "has 2 positions but 3 intensities"),
         ({"colour": np.ones(3)}, "has an entry 'colour'; expected direction"),
     ],
 )
