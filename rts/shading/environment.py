@@ -24,7 +24,7 @@ ROUGHNESS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0)
 
 
 def prefiltered(image: Array) -> dict[str, Array]:
-    """An environment's image, blurred for each roughness, as `theta["light"]["environment"]`; differentiable in the image.
+    """An environment's image, blurred for each roughness, as `theta["light"]["environment"]`; differentiable in it.
 
     Shaders do this with an image in each render. An image that stays is prefiltered once, and given in this form.
 
