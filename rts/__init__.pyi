@@ -40,6 +40,7 @@ from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurfac
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradient_images import gradient_image
 from rts.diagnostics.gradients import check_gradient
+from rts.diagnostics.notebooks import show
 from rts.diagnostics.profile import profile
 from rts.errors import InputError, RtsError
 from rts.files.images import load_image, save_animation, save_image
@@ -52,7 +53,6 @@ from rts.fitting.large_steps import LargeSteps
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.fitting.view_residuals import ViewResiduals
-from rts.notebooks import show
 from rts.registry import plugin, plugins
 from rts.rendering.arguments import Adaptive as Adaptive
 from rts.rendering.image import render, render_samples

@@ -5,9 +5,9 @@ Images are arrays, and have no type of their own.
 
 from rts.diagnostics.gradient_images import GradientImage
 from rts.diagnostics.gradients import GradientCheck
+from rts.diagnostics.notebooks import Shown
 from rts.diagnostics.profile import Profile
 from rts.fitting.fit import Fit
-from rts.notebooks import Shown
 from rts.rendering.renderer import PreparedParts, Renderer
 from rts.sampling.auto import Choice
 

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 
 import rts
+from rts.files.paths import writing
 
 MOST = 65535
 """The largest number of a PNG of 16 bits."""
@@ -41,6 +42,12 @@ def write_outputs(path: Path, outputs: Mapping[str, np.ndarray], exposure: float
         outputs: name → array.
         exposure: of "color", as `rts.save_image` takes it.
     """
+    with writing(path):
+        return _written(path, outputs, exposure)
+
+
+def _written(path: Path, outputs: Mapping[str, np.ndarray], exposure: float | None) -> list[str]:
+    """The lines of `write_outputs`, as files are written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".npz":
         np.savez(path, **outputs)  # pyright: ignore[reportArgumentType]  # No output is called allow_pickle.

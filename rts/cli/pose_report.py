@@ -12,10 +12,10 @@ import numpy as np
 from rts.cli.pose_file import Pose, posed
 from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, shrunk
 from rts.cli.pose_verdict import Verdict
+from rts.diagnostics.notebooks import losses_png
 from rts.errors import PluginError
 from rts.files.images import save_animation, save_image
 from rts.files.paths import writing
-from rts.notebooks import losses_png
 from rts.rendering.image import render
 from rts.scene.camera import Camera
 from rts.scene.parts import Part

@@ -37,7 +37,7 @@ HINTS = {
     SPLATTING: "fewer pixels, samples a pixel or layers; opaque=True where no light passes through",
     BACKWARD: "only torch and jax arrays are differentiated: leave what is not fitted in NumPy",
 }
-"""What helps where a stage takes most."""
+"""Advice for the stage that takes most."""
 
 
 class Stage(NamedTuple):
@@ -47,7 +47,7 @@ class Stage(NamedTuple):
         name: "sample", "outlines", "evaluate and shade", "splat", or "gradient", the whole of backward.
         first: milliseconds of the first call, in which loops may be compiled and structures built.
         later: the median of later calls, milliseconds.
-        rows: what it makes: samples, breaks of outlines, splats or pixels; unknown numbers, for a gradient.
+        rows: number of samples, breaks of outlines, splats or pixels; for a gradient, of numbers differentiated by.
         megabytes: of the arrays that it makes; 0 for a gradient.
     """
 
@@ -124,7 +124,7 @@ def profile(
     assert chosen is not None
 
     def timed(make: Callable[[], _T]) -> tuple[_T, float, float]:
-        """What a function gives, and the milliseconds of its first call and of later ones."""
+        """The result of a function, and the milliseconds of its first call and of later ones."""
         times, result = [], None
         for _ in range(repeats + 1):
             start = time.perf_counter()
@@ -158,7 +158,8 @@ def profile(
     if context.engine.differentiates:
         spent = sum(stage.later for stage in stages)
         first, later, count = _gradient(scene, size, settings, timed)
-        stages.append(Stage(BACKWARD, max(first - spent, 0.0), max(later - spent, 0.0), count, 0.0))
+        if count:
+            stages.append(Stage(BACKWARD, max(first - spent, 0.0), max(later - spent, 0.0), count, 0.0))
     longest = max(stages, key=lambda stage: stage.later)
     return Profile(tuple(stages), len(scene.parts), HINTS[longest.name])
 
@@ -170,6 +171,8 @@ def _gradient(scene: Scene, size: tuple[int, int], settings: RenderSettings, tim
     xp = engine.namespace
     arrays = [x for x in leaves(tree) if not is_constant(x) and xp.isdtype(x.dtype, "real floating")]
     known = {id(x) for x in arrays}
+    if not arrays:
+        return 0.0, 0.0, 0
 
     def loss(unknowns: Sequence[Array]) -> Array:
         it = iter(unknowns)

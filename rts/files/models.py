@@ -204,6 +204,8 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
             whole[name] = rows, np.concatenate([t + o for (_, t), o in zip(pairs, offsets, strict=False)])
     vertices, faces = whole.pop("vertices")
     same = all(piece.entries is pieces[0].entries for piece in pieces)
+    if not same:
+        warn(f"{path}: its parts have different materials; merged, they keep base colours alone", FileWarning)
     return Piece(vertices, faces, whole, first, linear=True, entries=pieces[0].entries if same else None)
 
 

@@ -130,7 +130,11 @@ class ImageResiduals(Residuals):
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         cameras = len(check_cameras(camera)) if several else None
         if isinstance(target, Mapping):
+            named = {f"target[{name!r}]": x for name, x in target.items()}
+            warn_of_gradients(named | {"weights": weights, "background": background})
             self._take_outputs(target, {} if weights is None else weights, cameras)
+            of_views = self._views or [self]
+            refuse_zero([child._weights for view in of_views for child in view._of_outputs.values()])
             return
         warn_of_gradients({"target": target, "weights": weights, "background": background})
         if (count := _view_count(target, self.size, several)) is None:

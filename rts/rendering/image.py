@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from rts.advice.empty_images import why_empty
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import averaged
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
-from rts.arrays.trees import Array, Tree
+from rts.arrays.trees import Array
 from rts.contracts.checks import check_background, check_splatter
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.splatter import Splatter
@@ -74,7 +73,8 @@ def render(
             - "position" (H, W, 3): world space.
             - "uv" (H, W, 2): 0 on parts without.
             - the name of another attribute of the G-buffer, such as "uv_footprint": all parts must have it.
-            - "depth_front" (H, W, 1): the depth of the surface in front at the pixel's centre, without edges.
+            - "depth_front" (H, W, 1): the depth of the surface in front at the pixel's centre, without edges. With
+              another splatter than "edges" its derivative is that of the surface's point, which may leave the centre.
             - "part", "triangle" (H, W, 1) int32: the indices of this part, and of its triangle; −1 where empty.
 
             "depth", "normal", "position", "uv" and attributes are means over what is covered of a pixel. They have
@@ -141,7 +141,11 @@ def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: Re
     settings = settings.of(scene)
     splatter = settings.splatter
     assert splatter is not None
-    return _by_bands(scene, size, context, settings, lambda s, window: splatted(s, scene, window, context, splatter))
+
+    def drawn(sampled: Sampled, window: Camera) -> tuple[Array, ...]:
+        return (splatted(sampled, scene, window, context, splatter),)
+
+    return _by_bands(scene, size, context, settings, drawn)[0]
 
 
 def _by_bands(
@@ -149,9 +153,9 @@ def _by_bands(
     size: tuple[int, int],
     context: Context,
     settings: RenderSettings,
-    draw: Callable[[Sampled, Camera], Tree],
-) -> Any:
-    """What `draw` makes of the samples of the whole image, or of bands of it; an array (H, W, ·) or a tuple of them."""
+    draw: Callable[[Sampled, Camera], tuple[Array, ...]],
+) -> tuple[Array, ...]:
+    """The arrays (H, W, ·) that `draw` makes of the samples of the image, drawn whole, or in bands that are joined."""
     bands = settings.bands(size)
     if len(bands) == 1:
         return draw(_sampled(scene, scene.camera, size, settings), scene.camera)
@@ -160,8 +164,6 @@ def _by_bands(
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(_sampled, scene, window, (rows, size[1]), settings)
         drawn.append(context.engine.checkpoint(take, lambda s, w=window: draw(s, w)))
-    if not isinstance(drawn[0], tuple):
-        return namespace(*drawn).concat(drawn)
     return tuple(namespace(*arrays).concat(arrays) for arrays in zip(*drawn, strict=True))
 
 

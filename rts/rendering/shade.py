@@ -38,7 +38,7 @@ def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
 
 
 def _evaluated(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
-    """What the part's surface gives at the samples; see `evaluate`."""
+    """The G-buffer of the part's surface at the samples; see `evaluate`."""
     theta = part.read
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
@@ -228,19 +228,19 @@ def _move_normals(transform: Array, normals: Array) -> Array:
     xp = namespace(transform)
     a, b, c = (transform[:3, i] for i in range(3))
     cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    outside = _orientation(transform)
+    outside = _sign(xp.sum(a * cofactors[0]))
     return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))
 
 
 def _move_tangents(transform: Array, tangents: Array) -> Array:
     """Tangents with signs (N, 4) under an affine map, of any length; a mirror changes the signs."""
-    moved = sum(tangents[:, i : i + 1] * transform[:3, i] for i in range(3))
-    return namespace(moved).concat([moved, tangents[:, 3:] * _orientation(transform)], axis=1)
-
-
-def _orientation(transform: Array) -> Array:
-    """1 () for an affine map, −1 for one that mirrors."""
     xp = namespace(transform)
     a, b, c = (transform[:3, i] for i in range(3))
-    volume = xp.sum(a * xp.linalg.cross(b, c))
+    moved = sum(tangents[:, i : i + 1] * x for i, x in enumerate((a, b, c)))
+    return xp.concat([moved, tangents[:, 3:] * _sign(xp.sum(a * xp.linalg.cross(b, c)))], axis=1)
+
+
+def _sign(volume: Array) -> Array:
+    """1 () for the volume of an affine map's columns, −1 for that of one that mirrors."""
+    xp = namespace(volume)
     return xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))

@@ -1,8 +1,8 @@
 """From the G-buffer to colours: light, textures, and what shaders share; the built-in shaders."""
 
 from rts.shading.environment import prefiltered, turned_environment
-from rts.shading.harmonics import harmonics, irradiance
 from rts.shading.shaders import facing_normals
+from rts.shading.spherical_harmonics import harmonics, irradiance
 from rts.shading.textures import sample_texture
 from rts.shading.tone_mapping import tonemap
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
-from rts.shading.harmonics import harmonics
+from rts.shading.spherical_harmonics import harmonics
 from rts.shading.textures import mip_levels
 from rts.shading.theta_entries import check_entry, shape_of
 

@@ -31,7 +31,7 @@ from rts.errors import InputError
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.environment import blurs, prefiltered, reflected
-from rts.shading.harmonics import COUNTS, irradiance, radiance
+from rts.shading.spherical_harmonics import COUNTS, irradiance, radiance
 from rts.shading.theta_entries import check_entry
 
 AMBIENT, COLOR = 0.2, 0.8

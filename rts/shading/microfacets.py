@@ -15,12 +15,12 @@ from rts.arrays.array_functions import dot, unit
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
 from rts.shading.environment import blur
-from rts.shading.harmonics import DIFFUSE, harmonics
+from rts.shading.spherical_harmonics import DIFFUSE, harmonics
 
 SMOOTHEST = 0.045
 """The least roughness: float32 holds the highlights of smoother surfaces badly (Filament)."""
 FAINT = 0.02
-"""What keeps the share of a cosine small where a blur alone is nearly as good, so that the table is smooth."""
+"""A term that keeps the share of a cosine small where a blur alone is nearly as good, so that the table is smooth."""
 TABLE = 32
 """Number of cosines, and of roughnesses, of `around`'s table."""
 

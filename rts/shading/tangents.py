@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from rts.arrays.array_functions import dot, unit
-from rts.arrays.engines import Context, engine_of, namespace
+from rts.arrays.engines import Context, namespace
 from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
-from rts.errors import InputError
+from rts.shading.parameter_steps import check_two_parameters, steps_beside
 
 TANGENT = "tangent"
 """Name of the attribute in the G-buffer."""
@@ -41,19 +39,10 @@ def tangents(
     Raises:
         InputError: samples have another number of parameters than two.
     """
-    if samples.params.shape[-1] != 2:
-        raise InputError(
-            f"{surface!r} has {samples.params.shape[-1]} parameters a sample; expected two: without them {TANGENT!r}, "
-            f"which normal maps need, is not known"
-        )
+    check_two_parameters(surface, samples, TANGENT, "normal maps")
     params, position, uv = context.constants((samples.params, gbuffer["position"], gbuffer["uv"]))
-    xp, moves, changes = namespace(position), [], []
-    for i in range(2):
-        axis = engine_of(params).constant(surface.param_step * np.eye(2)[i : i + 1], params)
-        # A step towards the middle stays on the patch.
-        beside = surface.evaluate(theta, replace(samples, params=params + xp.where(params < 0.5, axis, -axis)))
-        moves.append(beside["position"] - position)
-        changes.append(beside["uv"] - uv)
+    xp, beside = namespace(position), replace(samples, params=params)
+    moves, changes = zip(*steps_beside(surface, theta, beside, position, uv), strict=True)
     (au, av), (bu, bv) = ((change[:, :1], change[:, 1:2]) for change in changes)
     mirrored = au * bv - av * bu < 0
     along_u, along_v = moves[0] * bv - moves[1] * av, moves[1] * au - moves[0] * bu

@@ -30,6 +30,9 @@ def test_a_profile_names_the_stages_and_counts_rows(splatter):
 def test_without_derivatives_there_is_no_gradient():
     found = rts.profile(mesh_part(icosphere(1), shader="lambert"), CAMERA, (16, 16), repeats=1)
     assert "gradient" not in [stage.name for stage in found.stages]
+    camera = arrays("torch-cpu", CAMERA)  # It has derivatives, but no part has.
+    found = rts.profile(mesh_part(icosphere(1), shader="lambert"), camera, (16, 16), repeats=1)
+    assert "gradient" not in [stage.name for stage in found.stages]
     with pytest.raises(rts.InputError, match="repeats is 0"):
         rts.profile(mesh_part(icosphere(1)), CAMERA, (16, 16), repeats=0)
     assert np.isfinite([stage.later for stage in found.stages]).all()

@@ -101,6 +101,23 @@ def test_other_materials_have_the_shaders_of_before(tmp_path, material):
     assert not isinstance(part.shader, Pbr) and "metallic" not in part.theta
 
 
+def test_merged_parts_keep_a_material_that_all_have_or_say_that_it_goes(tmp_path):
+    path = model(tmp_path, {"pbrMetallicRoughness": {"roughnessFactor": 0.3}})
+    tree = json.loads(path.read_text())
+    tree["nodes"].append({"mesh": 0, "translation": [2, 0, 0]})
+    tree["scenes"] = [{"nodes": [0, 1]}]
+    path.write_text(json.dumps(tree))
+    [part] = rts.load(path, merge=True)
+    assert part.theta["roughness"] == pytest.approx(0.3)
+    tree["materials"].append({"pbrMetallicRoughness": {"roughnessFactor": 0.7}})
+    tree["meshes"].append({"primitives": [tree["meshes"][0]["primitives"][0] | {"material": 1}]})
+    tree["nodes"][1]["mesh"] = 1
+    path.write_text(json.dumps(tree))
+    with pytest.warns(rts.errors.FileWarning, match="different materials; merged, they keep base colours alone"):
+        [part] = rts.load(path, merge=True)
+    assert "roughness" not in part.theta
+
+
 def test_maps_need_uv(tmp_path):
     material = {"pbrMetallicRoughness": {"metallicFactor": 0.0}, "normalTexture": {"index": 0}}
     [part] = rts.load(model(tmp_path, material, [np.full((1, 1, 3), 128)], uv=False))

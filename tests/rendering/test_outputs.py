@@ -149,6 +149,16 @@ def test_uv_is_zero_on_parts_without():
     np.testing.assert_allclose(found[5, -1], 0, atol=1e-6)
 
 
+@pytest.mark.thorough
+def test_outputs_inside_of_jit_are_those_outside():
+    jax = pytest.importorskip("jax")
+    part, camera = arrays("jax", mesh_part(icosphere(1))), rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    names = ("color", "depth", "depth_front", "part", "triangle")
+    found = jax.jit(lambda p: rts.render(p, camera, (16, 16), outputs=names))(part)
+    for name, expected in rts.render(part, camera, (16, 16), outputs=names).items():
+        np.testing.assert_allclose(found[name], expected, atol=1e-5)
+
+
 # ------------------------------------------------------------------------------------------------ residuals
 
 
@@ -195,12 +205,13 @@ def test_wrong_targets_of_outputs_are_refused():
         ({"part": np.zeros((8, 8))}, r"target\['part'\]"),
         ({"depth": np.full((8, 8), np.nan)}, "NaN.*weight of 0"),
         ({}, "expected a tuple of names"),
+        ({"depth": np.zeros((8, 8))}, "all zero, so that nothing is compared"),
     ):
         with pytest.raises(rts.InputError, match=message):
             residuals(target)
     with pytest.raises(rts.InputError, match="weights is .*by names of targets: depth"):
-        residuals({"depth": np.zeros((8, 8))}, {"dept": 1.0})
+        residuals({"depth": np.ones((8, 8))}, {"dept": 1.0})
     with pytest.raises(rts.InputError, match="expected 2 targets of each output"):
-        residuals({"depth": np.zeros((8, 8))}, cameras=[camera, camera])
+        residuals({"depth": np.ones((8, 8))}, cameras=[camera, camera])
     with pytest.raises(rts.InputError, match="expected 1 numbers a pixel"):
-        residuals({"depth": np.zeros((8, 8, 3))})({})
+        residuals({"depth": np.ones((8, 8, 3))})({})

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import rts
-from rts.notebooks import SIZE
+from rts.diagnostics.notebooks import SIZE
 from rts.scene.default_camera import default_camera
 
 pytestmark = pytest.mark.rendering
