@@ -18,17 +18,18 @@ from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 
-VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
+VERTEX_ATTRIBUTES = ("normals", "colors", "uv", "tangent")
 
 
 class Mesh(TriangleSurface):
     """A triangle mesh.
 
-    θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors" and
-    "uv" are known and have one row a vertex (A = V). `indices` declares attributes of other names, and tables for
-    attributes with other rows, such as a uv map with split seams. In the G-buffer "normals" becomes "normal" and
+    θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors", "uv"
+    and "tangent" are known and have one row a vertex (A = V). `indices` declares attributes of other names, and tables
+    for attributes with other rows, such as a uv map with split seams. In the G-buffer "normals" becomes "normal" and
     "colors" becomes "color". Where θ has no normals, smooth ones are computed from the positions, differentiably, if
-    the shader reads them.
+    the shader reads them. A "tangent" (A, 4) is the direction of u, and the sign of v's, for normal maps; without it,
+    both are computed.
 
     Args:
         faces: (T, 3) integers into θ["vertices"]; copied.
