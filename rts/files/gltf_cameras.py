@@ -11,6 +11,10 @@ from rts.files.gltf_scenes import read_places
 from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import fault_of
 from rts.scene.camera import Camera
+from rts.scene.transforms import orthographic, perspective
+
+FAR = 1e13
+"""The depth of a far plane that is missing, as a multiple of the near plane's; `Camera` takes it for infinite."""
 
 
 def read_cameras(gltf: Gltf) -> list[Camera]:
@@ -39,20 +43,16 @@ def _camera(gltf: Gltf, camera: dict[str, Any], index: int, place: np.ndarray) -
     world_from_camera[:3, :3], world_from_camera[:3, 3] = left @ right, place[:3, 3]  # Without scale.
     view = np.linalg.inv(world_from_camera)
     numbers = camera[camera["type"]]
-    near, far = float(numbers["znear"]), float(numbers.get("zfar", math.inf))
+    near = float(numbers["znear"])
     if camera["type"] == "orthographic":
-        width, height = float(numbers["xmag"]), float(numbers["ymag"])
-        sound = 0 <= near < far < math.inf and width != 0 and height != 0
-        x, y, depth = 1 / width, 1 / height, [0, 0, -2 / (far - near), -(far + near) / (far - near)]
-        last, aspect = [0, 0, 0, 1], abs(width / height)
+        width, height, far = (float(numbers[key]) for key in ("xmag", "ymag", "zfar"))
+        if 0 <= near < far < math.inf and 0 < width < math.inf and 0 < height < math.inf:
+            aspect = width / height
+            return Camera(view, orthographic(2 * height, aspect, near, far), aspect)
     else:
-        fov_y, aspect = float(numbers["yfov"]), numbers.get("aspectRatio", "open")
-        sound = 0 < near < far and 0 < fov_y < math.pi and (aspect == "open" or 0 < aspect < math.inf)
-        y = 1 / math.tan(fov_y / 2)
-        x = y if aspect == "open" else y / aspect
-        share = 0.0 if far == math.inf else near / far
-        depth = [0, 0, -(1 + share) / (1 - share), -2 * near / (1 - share)]
-        last = [0, 0, -1, 0]
-    if not sound:
-        raise gltf.fail(f"the camera of node {index} makes no image: {numbers}")
-    return Camera(view, np.array([[x, 0, 0, 0], [0, y, 0, 0], depth, last]), aspect)
+        fov_y, far = float(numbers["yfov"]), float(numbers.get("zfar", FAR * near))
+        aspect = numbers.get("aspectRatio", "open")
+        if 0 < near < far < math.inf and 0 < fov_y < math.pi and (aspect == "open" or 0 < aspect < math.inf):
+            ratio = 1.0 if aspect == "open" else aspect
+            return Camera(view, perspective(math.degrees(fov_y), ratio, near, far), aspect)
+    raise gltf.fail(f"the camera of node {index} makes no image: {str(numbers)[:200]}")

@@ -75,7 +75,7 @@ def _piece(
     if (uv := f"TEXCOORD_{lookup.texcoord}") in read:
         attributes["uv"] = lookup.uv(read[uv].numbers()), faces
     if "TANGENT" in read and entries is not None and "normal_map" in entries:
-        attributes["tangent"] = read["TANGENT"].numbers(), faces
+        attributes["tangents"] = read["TANGENT"].numbers(), faces
     colors = None
     if "COLOR_0" in read:
         colors = unit_colors(gltf, f"COLOR_0 of {name}", read["COLOR_0"].numbers(fractions=True))

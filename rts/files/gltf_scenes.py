@@ -14,30 +14,18 @@ _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
 def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
-    """The meshes of the scene that is shown: index, and transform (4, 4) scene-from-local, one for each node.
-
-    Warns of skins, instances and morph targets, which are not read. Refuses what `read_places` refuses.
-    """
-    path, tree = gltf.path, gltf.tree
-    nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
-    places = read_places(gltf)
-    bent = [index for index, node in enumerate(nodes) if "skin" in node]
-    if bent:
-        warn(f"{path}: node {bent[0]} is bent by a skin, which is not read; it is loaded as it is without")
-    repeated = [index for index, node in enumerate(nodes) if TOLD in node.get("extensions", {})]
-    if repeated:
-        warn(f"{path}: node {repeated[0]} stands for several instances, which are not read; it is loaded once")
-    if any(np.any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)):
-        warn(f"{path} has morph targets, which are not read; meshes are loaded as they are without")
-    return [(nodes[index]["mesh"], place) for index, place in places if "mesh" in nodes[index]]
+    """The meshes of the scene that is shown: index, and transform (4, 4) scene-from-local, one for each node."""
+    nodes = gltf.tree.get("nodes", [])
+    return [(nodes[index]["mesh"], place) for index, place in read_places(gltf) if "mesh" in nodes[index]]
 
 
 def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
     """The nodes of the scene that is shown: index, and transform (4, 4) scene-from-local.
 
-    Refuses nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots.
+    Refuses nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots; warns of
+    skins, instances and morph targets, which are not read.
     """
-    fail, tree = gltf.fail, gltf.tree
+    path, fail, tree = gltf.path, gltf.fail, gltf.tree
     nodes, meshes, scenes = tree.get("nodes", []), tree.get("meshes", []), tree.get("scenes", [])
     parents = _parents(nodes, fail)
     moves = [_move(f"node {index}", node, fail) for index, node in enumerate(nodes)]
@@ -52,6 +40,14 @@ def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
     for index in sorted(shown):
         if fault := fault_of(moves[index]):
             raise fail(f"the transform of node {index} {fault}")
+    bent = [index for index, node in enumerate(nodes) if "skin" in node]
+    if bent:
+        warn(f"{path}: node {bent[0]} is bent by a skin, which is not read; it is loaded as it is without")
+    repeated = [index for index, node in enumerate(nodes) if TOLD in node.get("extensions", {})]
+    if repeated:
+        warn(f"{path}: node {repeated[0]} stands for several instances, which are not read; it is loaded once")
+    if any(np.any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)):
+        warn(f"{path} has morph targets, which are not read; meshes are loaded as they are without")
     if "scene" in tree and count_of(tree["scene"]) >= len(scenes):
         raise fail(f"its scene is number {tree['scene']}, and there are {len(scenes)}")
     for index, scene in enumerate(scenes):

@@ -11,7 +11,7 @@ import numpy as np
 
 from rts.errors import InputError
 
-WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "tangent": (4,), "colors": (3, 4)}
+WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "tangents": (4,), "colors": (3, 4)}
 """Numbers in a row of each table."""
 LARGEST = float(np.finfo(np.float32).max)
 SINGULAR = 1e-9
@@ -24,7 +24,7 @@ class Piece(NamedTuple):
     Attributes:
         vertices: (V, 3) float, local space.
         faces: (T, 3) int into `vertices`.
-        attributes: "uv", "normals", "tangent", "colors" → rows (A, C) and (T, 3) int into them, each where the file
+        attributes: "uv", "normals", "tangents", "colors" → rows (A, C) and (T, 3) int into them, each where the file
             has it. Colours are in [0, 1], as encoded in the file.
         texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, alpha straight; or None.
         color: (3,) or (4,) factor of the material, as encoded in the file; or None.

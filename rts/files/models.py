@@ -246,10 +246,10 @@ def _in_scene(piece: Piece) -> Piece:
         if "normals" in attributes:
             rows, table = attributes["normals"]
             attributes["normals"] = (rows @ np.linalg.inv(m[:3, :3]), table)
-        if "tangent" in attributes:
-            rows, table = attributes["tangent"]
+        if "tangents" in attributes:
+            rows, table = attributes["tangents"]
             moved = rows[:, :3] @ m[:3, :3].T
-            attributes["tangent"] = (np.column_stack([moved, -rows[:, 3] if mirrored else rows[:, 3]]), table)
+            attributes["tangents"] = (np.column_stack([moved, -rows[:, 3] if mirrored else rows[:, 3]]), table)
         if mirrored:  # Mirrored triangles would be inside out.
             faces = faces[:, ::-1]
             attributes = {name: (rows, table[:, ::-1]) for name, (rows, table) in attributes.items()}
