@@ -36,8 +36,8 @@ class Material(NamedTuple):
             is white with alpha, or None where opaque. Without d, alpha is 1 − Tr, unless Tr is at least 1 or MeshLab
             wrote the file: then Tr is taken for d.
         texture: file of map_Kd, or None. It replaces Kd.
-        numbers: "metallic" () and "roughness" (), both in [0, 1], "emissive" (3,), sRGB, as far as the material has
-            them; without an "emissive" that is black.
+        numbers: "metallic" () of Pm and "roughness" () of Pr, both in [0, 1], and "emissive" (3,) of Ke, sRGB and not
+            black, as far as the material has them.
         maps: files of "metallic", "roughness", "emissive" and "normal_map". They replace numbers.
         unread: statements of other maps.
     """

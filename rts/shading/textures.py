@@ -132,10 +132,9 @@ def _texels(
     xp = namespace(flat, uv)
     columns = width if first is None else xp.astype(width, xp.int32)
     along_u, along_v = (wrap, wrap) if isinstance(wrap, str) else wrap
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     nearest = filter == "nearest"
-    middle = 0.0 if nearest else 0.5
-    x, y = uv[:, 0] * width - middle, (1 - uv[:, 1]) * height - middle
-    x0, y0 = xp.floor(x), xp.floor(y)
+    x0, y0 = (xp.floor(x + 0.5), xp.floor(y + 0.5)) if nearest else (xp.floor(x), xp.floor(y))
 
     def texel(dx: int, dy: int) -> Array:
         index = _wrapped(y0 + dy, height, along_v) * columns + _wrapped(x0 + dx, width, along_u)
