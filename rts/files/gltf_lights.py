@@ -32,7 +32,7 @@ def read_lights(gltf: Gltf) -> dict[str, np.ndarray]:
             gltf.part(f"the light of node {index}", _add, gltf, lights, index, place, found)
     if not found:
         return {}
-    return {name: np.array(rows, np.float32) for name, rows in found.items()} | {"ambient": np.float32(0)}
+    return {name: np.array(rows, np.float32) for name, rows in found.items()} | {"ambient": np.zeros((), np.float32)}
 
 
 def _add(gltf: Gltf, lights: list[Any], index: int, place: np.ndarray, found: dict[str, list[Any]]) -> None:
