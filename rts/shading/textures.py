@@ -1,4 +1,4 @@
-"""Textures: lookup of texels, bilinear lookup, and both in a pyramid of averages (mipmaps)."""
+"""Textures: bilinear lookup, and trilinear lookup in a pyramid of averages (mipmaps)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def sample_texture(
         wrap: "repeat" or "mirror" outside [0, 1]; any other text is "clamp". A pair is for u and for v.
         footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for a step to the next cell, constant. The texture is averaged
             over roughly this area, by `mip_levels` and `level_of`. None for no average.
-        filter: "nearest" takes the texel that holds a point, without derivative in uv; any other text is "linear".
+        filter: "nearest" takes the texel around a point, without derivative in uv; any other text is "linear".
 
     Returns:
         (N, C).
@@ -49,7 +49,7 @@ def sample_texture(
         )
     height, width, channels = shape
     if footprint is None:
-        return _texels(xp.reshape(texture, (height * width, channels)), uv, wrap, filter, height, width)
+        return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width, filter=filter)
     levels, engine = mip_levels(texture), engine_of(texture, uv)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
     sizes = np.array([x.shape[:2] for x in levels])
@@ -60,7 +60,7 @@ def sample_texture(
     share, lower = (level - finer)[:, None], xp.astype(finer, xp.int32)
 
     def at(number: Array) -> Array:
-        return _texels(table, uv, wrap, filter, *(xp.take(x, number, axis=0) for x in (heights, widths, first)))
+        return _bilinear(table, uv, wrap, *(xp.take(x, number, axis=0) for x in (heights, widths, first)), filter)
 
     below = at(lower)
     return below + share * (at(xp.clip(lower + 1, 0, len(levels) - 1)) - below)
@@ -115,34 +115,34 @@ def _halved(x: Array) -> Array:
     return (m / n - part) * x[0:-1:2, ...] + m / n * x[1::2, ...] + (part + 1 / n) * x[2::2, ...]
 
 
-def _texels(
-    flat: Array, uv: Array, wrap: Wrap, filter: str, height: Any, width: Any, first: Array | None = None
+def _bilinear(
+    flat: Array, uv: Array, wrap: Wrap, height: Any, width: Any, first: Array | None = None, filter: str = "linear"
 ) -> Array:
-    """Lookup (N, C) in a table of texels: of one texture, row by row, or of several, one after the other.
+    """Bilinear lookup (N, C) in a table of texels: of one texture, row by row, or of several, one after the other.
 
     Args:
         flat: (M, C), the texels.
         uv: (N, 2).
         wrap: see `sample_texture`.
-        filter: see `sample_texture`.
         height: height of the texture; for several textures (N,) floats of uv's dtype.
         width: width, in the same form.
         first: (N,) integers, the table row of the texture's first texel; None for a single texture.
+        filter: see `sample_texture`.
     """
     xp = namespace(flat, uv)
     columns = width if first is None else xp.astype(width, xp.int32)
-    along_u, along_v = (wrap, wrap) if isinstance(wrap, str) else wrap
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    nearest = filter == "nearest"
-    x0, y0 = (xp.floor(x + 0.5), xp.floor(y + 0.5)) if nearest else (xp.floor(x), xp.floor(y))
+    if filter == "nearest":
+        x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
+    x0, y0 = xp.floor(x), xp.floor(y)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+
+    along_u, along_v = (wrap, wrap) if isinstance(wrap, str) else wrap
 
     def texel(dx: int, dy: int) -> Array:
         index = _wrapped(y0 + dy, height, along_v) * columns + _wrapped(x0 + dx, width, along_u)
         return xp.take(flat, index if first is None else index + first, axis=0)
 
-    if nearest:
-        return texel(0, 0)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     top = texel(0, 0) + fx * (texel(1, 0) - texel(0, 0))
     bottom = texel(0, 1) + fx * (texel(1, 1) - texel(0, 1))
     return top + fy * (bottom - top)
