@@ -40,9 +40,10 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     "normals", "colors", "texture" and "color". Vertices are in the order of the file; those that no face refers to
     are left out, and those that coincide exactly are welded: where uv or normals differ between the faces around a
     vertex they have an index table of their own, so that moving vertices opens no seams. Normals of the file do not
-    follow moving vertices: drop them from θ, and smooth ones are computed that do. The shader is `pbr` where the
-    material of a glTF tells more than its base colour: θ then has "metallic", "roughness", "normal_map", "occlusion"
-    and "emissive", as far as the file has them. Else it is `textured` where there are uv and a texture, or `lambert`.
+    follow moving vertices: drop them from θ, and smooth ones are computed that do; likewise "tangents". The shader is
+    `pbr` where the material of a glTF or MTL tells more than its base colour: θ then has "metallic", "roughness",
+    "normal_map", "occlusion" and "emissive", as far as the file has them. Else it is `textured` where there are uv and
+    a texture, `unlit` where a glTF says that there is no light, or `lambert`.
 
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
     about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
@@ -70,7 +71,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
 
     Warns:
         FileWarning: something was left out or guessed, such as a library of materials that is not there, a statement or
-            property that is not known, or positions that are not within the bounds that a glTF gives them.
+            property that is not known, or positions that are not within the bounds that a glTF gives them. There is
+            one warning for all of this.
     """
     path = as_path(path)
     for name, flag in (("merge", merge), ("weld", weld)):
@@ -90,14 +92,10 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         pieces = [_linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):
             pieces = [_merged(path, pieces)]
-        parts = [
-            _part(path, piece, weld).replace(
-                cull="back" if cull == "back" or (cull == "file" and piece.one_sided) else "none"
-            )
-            for piece in pieces
-        ]
+        culled = [cull == "back" or (cull == "file" and piece.one_sided) for piece in pieces]
+        parts = [_part(path, piece, weld) for piece in pieces]
     warn_once(path, notes)
-    return parts
+    return [part.replace(cull="back") if back else part for part, back in zip(parts, culled, strict=True)]
 
 
 def _linear(piece: Piece) -> Piece:
