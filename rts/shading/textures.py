@@ -60,7 +60,9 @@ def sample_texture(
     share, lower = (level - finer)[:, None], xp.astype(finer, xp.int32)
 
     def at(number: Array) -> Array:
-        return _bilinear(table, uv, wrap, *(xp.take(x, number, axis=0) for x in (heights, widths, first)), filter)
+        return _bilinear(
+            table, uv, wrap, *(xp.take(x, number, axis=0) for x in (heights, widths, first)), filter=filter
+        )
 
     below = at(lower)
     return below + share * (at(xp.clip(lower + 1, 0, len(levels) - 1)) - below)
