@@ -144,7 +144,9 @@ def render(
     splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, multi, single or none.")] = "auto",
     supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
-    cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
+    cull: Annotated[
+        str, typer.Option(help="none; back, to leave out triangles seen from behind; or file: where a glTF says so.")
+    ] = "none",
     environment: Annotated[
         Path | None,
         typer.Option(
@@ -183,13 +185,13 @@ def render(
     light = None if environment is None else environment_of(environment, up)
     engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
-        parts = rts.load(model, surface=surface)
+        parts = rts.load(model, surface=surface, cull=cull)
         seen = orbit(bounds_of(parts), shape, *view, fov=fov, up=up)
     else:
         refuse_beside("--pose", context, ("camera", "fov", "up"))
         matrix, seen, pose_size = read_pose(pose)
         shape = shape if is_given(context, "size") else pose_size
-        parts = posed(rts.load(model, surface=surface), matrix)
+        parts = posed(rts.load(model, surface=surface, cull=cull), matrix)
     bounds = bounds_of(parts)
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
     extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
@@ -199,7 +201,6 @@ def render(
         theta = theta if light is None else {**theta, "light": {"environment": light}}
         return part.replace(
             theta=map_leaves(engine_object.constant, theta),
-            cull=cull,
             shader=part.shader if shader == "auto" else shader,
         )
 

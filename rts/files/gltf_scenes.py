@@ -14,7 +14,13 @@ _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
 def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
-    """The meshes of the scene that is shown: index, and transform (4, 4) scene-from-local, one for each node.
+    """The meshes of the scene that is shown: index, and transform (4, 4) scene-from-local, one for each node."""
+    nodes = gltf.tree.get("nodes", [])
+    return [(nodes[index]["mesh"], place) for index, place in read_places(gltf) if "mesh" in nodes[index]]
+
+
+def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
+    """The nodes of the scene that is shown: index, and transform (4, 4) scene-from-local.
 
     Refuses nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots; warns of
     skins, instances and morph targets, which are not read.
@@ -51,15 +57,14 @@ def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
             raise fail(
                 f"scene {index} has node {wrong[0]}, which is there twice, is the child of another, or is missing"
             )
-    instances = []
+    places = []
     ahead = [(root, np.eye(4)) for root in scenes[tree.get("scene", 0)].get("nodes", [])] if scenes else []
     while ahead:
         index, outer = ahead.pop()
         place = outer @ moves[index]
         ahead += [(child, place) for child in nodes[index].get("children", [])]
-        if "mesh" in nodes[index]:
-            instances.append((nodes[index]["mesh"], place))
-    return instances
+        places.append((index, place))
+    return places
 
 
 def _parents(nodes: list[dict[str, Any]], fail: Fail) -> dict[int, int]:
