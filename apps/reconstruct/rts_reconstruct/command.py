@@ -81,6 +81,22 @@ def reconstruct(
         watch.wait()
 
 
+def cameras(
+    photos: Annotated[Path, typer.Argument(help="Folder of photographs of one thing that stands still.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")] = Path("cameras"),
+    size: Annotated[int, typer.Option(help="Longer side, in pixels, in which features are looked for.")] = 1600,
+) -> None:
+    """Find the cameras of photographs, by COLMAP.
+
+    Writes a folder that rts reconstruct and other tools read: images, and sparse/0.
+
+    Example: rts cameras photos/ -o thing && rts reconstruct thing/ -o out/thing
+    """
+    from rts_reconstruct.cameras import find_cameras
+
+    _say(f"{find_cameras(photos, out, size=size)}; {out} is a data set of COLMAP")
+
+
 def _say(text: str) -> None:
     Console(soft_wrap=True, highlight=False).print(escape(text))
 
