@@ -54,8 +54,8 @@ class FoundCameras:
         missing = f"; no camera for {_some(self.missing)}" if self.missing else ""
         turned = f"; {len(self.turned)} turned upright, as their EXIF says" if self.turned else ""
         return (
-            f"{self.registered} of {self.photographs} cameras found, {self.points:,} points, {self.error:.2f} pixels off "
-            f"in the mean{turned}{missing}"
+            f"{self.registered} of {self.photographs} cameras found, {self.points:,} points, {self.error:.2f} pixels "
+            f"off in the mean{turned}{missing}"
         )
 
 
@@ -95,8 +95,8 @@ def find_cameras(photos: Any, out: Any, *, size: int = 1600) -> FoundCameras:
             model = _model(pycolmap, folder, groups, size)
             if model is None:
                 raise rts.InputError(
-                    f"no cameras were found for the {len(files)} photographs of {photos}; expected ones that overlap by "
-                    "two thirds, of a thing with texture that stands still"
+                    f"no cameras were found for the {len(files)} photographs of {photos}; expected ones that overlap "
+                    "by two thirds, of a thing with texture that stands still"
                 )
             sparse = folder / "sparse" / "0"
             sparse.mkdir(parents=True)
@@ -168,7 +168,7 @@ def _upright(files: list[Path], photos: Path, to: Path) -> tuple[tuple[str, ...]
                 lens = exif.get_ifd(0x8769)
                 upright = ImageOps.exif_transpose(picture) if exif.get(ORIENTATION, 1) != 1 else None
                 if upright is None:
-                    picture.verify()
+                    picture.load()
                     shutil.copy2(file, to / file.name)
                 else:
                     upright.save(to / file.name, exif=upright.getexif(), quality=95)

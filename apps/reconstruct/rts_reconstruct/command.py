@@ -15,7 +15,9 @@ import rts
 def reconstruct(
     views: Annotated[
         Path,
-        typer.Argument(help="Folder or file of pictures with cameras: transforms.json, COLMAP, LLFF, cameras.json."),
+        typer.Argument(
+            help="Pictures with cameras: transforms.json, COLMAP, LLFF, cameras.json; or photographs alone."
+        ),
     ],
     out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("reconstruction"),
     start: Annotated[str, typer.Option(help="ball, hull (of alpha or masks), or a file of a mesh.")] = "ball",

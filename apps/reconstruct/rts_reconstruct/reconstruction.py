@@ -112,7 +112,8 @@ def reconstruct(
     Under torchrun processes share the pictures of a step, and the first one writes.
 
     Args:
-        views: file or folder, as `rts.load_views` takes it; or a list of views with sRGB-encoded images.
+        views: file or folder, as `rts.load_views` takes it; a folder of photographs alone, whose cameras are
+            looked for; or a list of views with sRGB-encoded images.
         out: the folder to write into.
         start: "ball"; "hull", the visual hull of alpha or masks; or the path of a mesh in the world of the cameras.
         surface: "mesh"; "isosurface", for stages that fit values on a lattice, whose surface may change its topology,

@@ -47,11 +47,9 @@ def test_cameras_are_those_of_the_scene(photographs, tmp_path):
     assert sorted(p.name for p in (tmp_path / "set").iterdir()) == ["images", "sparse"]
     views = rts.load_views(tmp_path / "set", split="all")
     assert [view.size for view in views] == [SIZE] * COUNT
+    pairs = [(camera, view.camera) for camera, view in zip(cameras, views, strict=True)]
     # Where cameras stand, up to a similarity.
-    eyes = [
-        np.stack([np.linalg.inv(np.asarray(c.view))[:3, 3] for c in side])
-        for side in (cameras, [v.camera for v in views])
-    ]
+    eyes = [np.stack([np.linalg.inv(np.asarray(c.view))[:3, 3] for c in side]) for side in zip(*pairs, strict=True)]
     true, got = (e - e.mean(0) for e in eyes)
     u, s, vt = np.linalg.svd(got.T @ true)
     assert np.linalg.det(u @ vt) > 0
