@@ -33,6 +33,7 @@ ELSEWHERE = {
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
     "rts render model.glb --shader pbr --environment room.hdr --exposure 0.5 -o picture.png": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
+    "rts cameras photos/ -o thing": "make apps",
 }
 """Commands that take long, or need files of their own, and who runs them."""
 
