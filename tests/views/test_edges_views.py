@@ -8,9 +8,9 @@ from helpers import arrays, box, icosphere, to_numpy
 import rts
 from rts import Camera
 from rts.arrays.engines import engine_of, namespace
+from rts.sampling import picture as side_by_side
+from rts.sampling.picture import Picture
 from rts.splatting.edges import Edges
-from rts.views import picture as side_by_side
-from rts.views.picture import Picture
 
 torch = pytest.importorskip("torch")
 

@@ -9,10 +9,10 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere
 import rts
 from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
+from rts.sampling import picture as side_by_side
+from rts.sampling.picture import Picture
 from rts.scene.row_cameras import RowCameras
 from rts.shading.shaders import Lambert
-from rts.views import picture as side_by_side
-from rts.views.picture import Picture
 
 pytestmark = pytest.mark.rendering
 
