@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped
+from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
@@ -168,7 +168,11 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
         return replace(sampled.cells, triangle=None)
     row, counts = sampled.row, [own.ids.shape[-2] for own in sampled.samples]
     more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
-    shift = engine_of(row).constant(np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), row)
-    xp = namespace(row)
+    shift, engine = np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), engine_of(row)
+    known = value_of(row)
+    if known is not None and not is_batched(row):
+        place = np.append(np.arange(len(shift), dtype=np.int32) + shift, np.int32(-1))
+        return replace(sampled.cells, row=engine.constant(place[known], row), triangle=None)
+    xp, shift = namespace(row), engine.constant(shift, row)
     moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
     return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)

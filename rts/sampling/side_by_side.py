@@ -79,15 +79,16 @@ class View(NamedTuple):
             return None
         tables = {tuple(None if x is None else x.shape[1:] for x in (own.ids, own.corner_params)) for own in proxies}
         widths = tuple(f"{x:.5g}" for x in pixel_widths(camera, grid.size))
-        kind = id(sampler), cull, sign, widths, p[2:].tobytes(), grid.size, *tables
+        kind = id(sampler), cull, sign, widths, p[3].tobytes(), grid.size, *tables
         return cls(scene, grid, camera, proxies, seen, kind)
 
 
 def _is_inside(seen: np.ndarray, camera: Camera, size: tuple[int, int]) -> bool:
-    """True if vertices, as in `View.seen`, lie in front of the viewer, and within a view of this size."""
-    w = seen[:, 2] * camera.projection[3, 2] + camera.projection[3, 3]
+    """True if vertices, as in `View.seen`, lie between the near and the far plane, and within a view of this size."""
+    z, w = (seen[:, 2] * row[2] + row[3] for row in camera.projection[2:])
     limits = 1 - 2 * MARGIN / np.array(size[::-1])
-    return bool((w > 0).all() and (np.abs(seen[:, :2]) <= limits * w[:, None]).all())
+    whole = (w > 0).all() and (np.abs(z) <= w).all()
+    return bool(whole and (np.abs(seen[:, :2]) <= limits * w[:, None]).all())
 
 
 def joined(views: Sequence[View], picture: Picture) -> tuple[Scene, Grid]:
@@ -103,7 +104,8 @@ def joined(views: Sequence[View], picture: Picture) -> tuple[Scene, Grid]:
     # From the clip space of each view to that of the picture.
     windows = [identity.window(picture.view, (-int(y), -int(x)), picture.size).projection for x, y in picture.corners()]
     scale = np.array([windows[0][axis, axis] * first[axis, axis] for axis in (0, 1)])
-    camera = Camera(np.eye(4), np.stack([scale[0] * np.eye(4)[0], scale[1] * np.eye(4)[1], *first[2:]]))
+    # Views may differ in near and far planes. Nothing lies beyond these, so that the picture has none.
+    camera = Camera(np.eye(4), np.stack([scale[0] * np.eye(4)[0], scale[1] * np.eye(4)[1], np.zeros(4), first[3]]))
     vertices = []
     for view, window in zip(views, windows, strict=True):
         for seen in view.seen:
