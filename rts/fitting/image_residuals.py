@@ -33,7 +33,8 @@ from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
-from rts.views.render_views import are_scenes, render_views
+from rts.views.render_views import render_views
+from rts.views.scenes import are_scenes
 
 Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]

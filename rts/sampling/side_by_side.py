@@ -7,6 +7,7 @@ so views have to show their scenes whole.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from rts.sampling.joint import MOST, Joint, is_suited
 from rts.sampling.picture import Picture
 from rts.sampling.points import pixel_widths
 from rts.sampling.scene import Grid, Scene
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 
 MARGIN = 1
@@ -51,7 +53,7 @@ class View(NamedTuple):
         Its parts must be such as can be `Joint`, of few triangles, all of one sampler. All vertices must lie in it.
         """
         sampler, cull, like = scene.samplers[0], scene.parts[0].cull, scene.context.like
-        if like is not None and scene.context.engine.padded(like):
+        if not isinstance(sampler, TriangleSampler) or (like is not None and scene.context.engine.padded(like)):
             return None
         for part, own in zip(scene.parts, scene.samplers, strict=True):
             if own is not sampler or part.cull != cull or not is_suited(part, own):
@@ -115,7 +117,7 @@ def joined(views: Sequence[View], picture: Picture) -> tuple[Scene, Grid]:
             )
     scenes = [view.scene for view in views]
     whole = Scene(
-        [part.replace(transform=None) for scene in scenes for part in scene.parts],
+        [replace(part, transform=None) for scene in scenes for part in scene.parts],
         camera,
         [sampler for scene in scenes for sampler in scene.samplers],
         [None] * len(vertices),

@@ -53,8 +53,10 @@ class Evaluated(NamedTuple):
             return cls(_of_all(parts, [whole]), transforms, whole, None)
         for part, ids, params in zip(parts, *rows, strict=True):
             of_view = replace(samples, ids=ids, params=params)
-            seen = part is not None and ids.shape[0]
-            pieces.append((of_view, evaluate(part, of_view, inputs) if seen else GBuffer(position=params[:, :1])))
+            if part is None or not ids.shape[0]:
+                pieces.append((of_view, GBuffer(position=params[:, :1])))
+            else:
+                pieces.append((of_view, evaluate(part, of_view, inputs)))
         shown = [local for (own, local) in pieces if own.ids.shape[0]]
         (position,) = concatenated([local["position"] for local in shown])
         whole = GBuffer(position=position)

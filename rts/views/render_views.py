@@ -22,21 +22,17 @@ from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
 from rts.sampling.picture import Picture, at_once
-from rts.sampling.prepared import Prepared
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.side_by_side import View
 from rts.scene.camera import Camera
-from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
 from rts.views.joint_views import sampled_at_once
 from rts.views.outlines import with_outlines_of_views
 from rts.views.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
+from rts.views.scenes import SceneParts, check_scene_channels, distinct, scenes_of_views
 from rts.views.splats import views_to_splats
 
 _T = TypeVar("_T")
-
-SceneParts = Part | Sequence[Part] | Prepared
-"""The parts of a scene."""
 
 
 @uncompiled
@@ -94,69 +90,17 @@ def render_views(
     """
     camera_list = check_cameras(cameras)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
-    scenes = _scenes(parts, camera_list, sampler, engine)
-    context = context_of_scene(
-        [part for scene in _distinct(scenes) for part in scene.parts], camera_list, engine=engine
-    )
+    scenes = scenes_of_views(parts, camera_list, sampler, engine)
+    context = context_of_scene([part for scene in distinct(scenes) for part in scene.parts], camera_list, engine=engine)
     scenes = [scene._replace(context=context).at(size) for scene in scenes]
-    channels = _check_scene_channels(scenes)
+    channels = check_scene_channels(scenes)
     background = _check_backgrounds(background, len(camera_list), size, channels)
     if not is_constant(background):
-        context = scenes[0].context_with([scene.parts for scene in _distinct(scenes)], camera_list, background)
+        context = scenes[0].context_with([scene.parts for scene in distinct(scenes)], camera_list, background)
     images = _images(scenes, size, context, settings)
     for b, view_scene in enumerate(scenes):
         warned_if_empty(images[b], view_scene, f"view {b}")
     return over_background(images, background)
-
-
-def _scenes(parts: Any, cameras: Sequence[Camera], sampler: SamplerLike, engine: str | None) -> list[Scene]:
-    """The checked scene of each view; views of one scene share its lists of parts, samplers and entries."""
-    if not are_scenes(parts):
-        scene = Scene.of(parts, cameras[0], sampler, engine)
-        return [scene._replace(camera=camera) for camera in cameras]
-    if len(parts) != len(cameras):
-        raise InputError(
-            f"{len(parts)} scenes were given with {len(cameras)} cameras; expected a camera for each scene"
-        )
-    scenes = []
-    for b, (own, camera) in enumerate(zip(parts, cameras, strict=True)):
-        try:
-            scenes.append(Scene.of(own, camera, sampler, engine))
-        except InputError as error:
-            raise InputError(f"scene {b}: {error}") from error
-    return scenes
-
-
-def are_scenes(parts: Any) -> bool:
-    """True for a list of scenes, False for the parts of one.
-
-    Raises:
-        InputError: a list of both.
-    """
-    if not isinstance(parts, (list, tuple)):
-        return False
-    several = [isinstance(own, (list, tuple, Prepared)) for own in parts]
-    if any(several) and not all(several):
-        raise InputError(
-            "parts holds both parts and scenes; expected the parts of one scene, or a list of parts for each scene"
-        )
-    return any(several)
-
-
-def _distinct(scenes: Sequence[Scene]) -> list[Scene]:
-    """Scenes of different lists of parts."""
-    return list({id(scene.parts): scene for scene in scenes}.values())
-
-
-def _check_scene_channels(scenes: Sequence[Scene]) -> int:
-    """The number of channels besides alpha, which all scenes must share."""
-    for b, scene in enumerate(scenes):
-        if scene.channels != scenes[0].channels:
-            raise InputError(
-                f"the shaders of scene 0 give {scenes[0].channels} channels and those of scene {b} give "
-                f"{scene.channels}; expected the same number for all scenes"
-            )
-    return scenes[0].channels
 
 
 def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:
@@ -170,7 +114,7 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of several views, without a background."""
-    of_each = [settings.of(scene) for scene in _distinct(scenes)]
+    of_each = [settings.of(scene) for scene in distinct(scenes)]
     settings, cells = of_each[0], [settings.supersample * n + 2 * settings.apron for n in size]
     views: list[View | None] = [None] * len(scenes)
     whole = settings.layers != "auto" and len(settings.bands(size)) == 1 and settings.capacity is None
@@ -188,7 +132,7 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
         if kind is not None and len(indices) > 1:
             together = [view for b in indices if (view := views[b]) is not None]
             drawn = _drawn_at_once(together, (cells[0], cells[1]), context, settings)
-        elif len(_distinct(own)) == 1 and len(own) > 1:
+        elif len(distinct(own)) == 1 and len(own) > 1:
             drawn = _images_of_scene(own, size, context, settings)
         else:
             drawn = [image_of(scene, size, context, settings) for scene in own]
