@@ -123,7 +123,7 @@ def fitted(shape: Shape, pictures: Any, method: str, setting: dict[str, float], 
     start, faces = sphere()
     energy = rts.regularizers.Laplacian(start, faces)
     edge = float(np.linalg.norm(start[faces[:, 0]] - start[faces[:, 1]], axis=1).mean())
-    free = LargeSteps(faces, len(start), setting["smoothness"]) if "smoothness" in setting else None
+    free = LargeSteps(start, faces, setting["smoothness"]) if "smoothness" in setting else None
     parameter = torch.tensor(start if free is None else free.encode(start), requires_grad=True)
     optimizer: Any = torch.optim.Adam([parameter], lr=setting["rate"])
     if method.endswith("uniform"):
@@ -205,7 +205,7 @@ def solvers() -> dict[str, Any]:
         vertices, faces = welded(*mesh(name))
         edges = edges_of(faces)[0]
         given = edges, 1 + 19.0 * np.bincount(edges.reshape(-1), minlength=len(vertices)), 19.0
-        u = LargeSteps(faces, len(vertices)).encode(vertices)
+        u = LargeSteps(vertices, faces).encode(vertices)
         made = in_turn({way: lambda f=f, given=given: f(*given) for way, f in ways.items()}, 3)
         solves = {way: f(*given) for way, f in ways.items()}
         for solve in solves.values():

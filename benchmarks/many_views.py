@@ -132,7 +132,7 @@ class Model(NamedTuple):
 
     def fitted(self, views: list[rts.View], stage: Stage, cameras: bool) -> Model:
         """The model after a stage."""
-        steps = rts.LargeSteps(self.mesh.faces, len(self.mesh.vertices), stage.smoothness)
+        steps = rts.LargeSteps(self.mesh.vertices, self.mesh.faces, stage.smoothness)
         surface = rts.Mesh(self.mesh.faces)
         p = {
             "shape": torch.tensor(np.asarray(steps.encode(np.asarray(self.mesh.vertices, np.float32)))),

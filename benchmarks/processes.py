@@ -103,7 +103,7 @@ def worker(steps: int) -> None:
         torch.distributed.init_process_group("gloo")
     known = many_views.subject("spot")
     ball = trimesh.creation.icosphere(4, radius=0.6)
-    large = rts.LargeSteps(ball.faces, len(ball.vertices), 40)
+    large = rts.LargeSteps(ball.vertices, ball.faces, 40)
     surface, times = rts.Mesh(ball.faces), []
     p = {
         "shape": torch.tensor(np.asarray(large.encode(np.asarray(ball.vertices, np.float32)))),

@@ -15,6 +15,13 @@ from mkdocs.structure.files import File, InclusionLevel
 ROOT = Path(__file__).resolve().parent.parent
 LINK = re.compile(r"(?<=\]\()([^)\s#]+)(?=[)#])")
 log = logging.getLogger("mkdocs.hooks.rts")
+BOOSTS = {
+    "start/": 2,
+    "guides/": 2,
+    "reference/": 0.5,
+    **dict.fromkeys(("results/", "benchmarks/", "architecture", "CHANGELOG", "CONTRIBUTING"), 0.1),
+}
+"""Beginning of a page's place → factor on its rank in the search: what people ask for first is in the guides."""
 
 
 def on_files(files, config):
@@ -66,8 +73,8 @@ def on_page_markdown(markdown, page, config, files):
     uri = page.file.src_uri
     if not uri.endswith(".md"):
         return markdown
-    if uri.startswith(("benchmarks/", "architecture", "CHANGELOG", "CONTRIBUTING")):
-        page.meta["search"] = {"boost": 0.2}  # Below pages for users, whatever they hold.
+    if boost := next((value for start, value in BOOSTS.items() if uri.startswith(start)), None):
+        page.meta["search"] = {"boost": boost}
     shows = "```python" in markdown or "](../images/" in markdown
     if re.match(r"guides/(?!index)|coming-from/", uri) and not shows:
         log.warning("%s has neither a picture nor code that runs", uri)

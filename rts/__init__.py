@@ -3,11 +3,12 @@
 With any ordinary renderer, find where camera rays meet a surface; evaluate it there, shade it and splat it;
 differentiate only that.
 
-Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`.
+Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`, types of results in
+`rts.results`.
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are `rts.tune`, of the package `rts_compare`,
-`rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+`rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
 # pyright: reportUnsupportedDunderAll=false
@@ -18,6 +19,7 @@ import importlib
 from rts import errors as errors
 from rts import registry
 from rts import regularizers as regularizers
+from rts import results as results
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import engine_of, namespace
 from rts.compiling.warmup import warmup
@@ -30,7 +32,9 @@ from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurfac
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradient_images import gradient_image
 from rts.diagnostics.gradients import check_gradient
-from rts.errors import InputError, PluginError, RtsError, RtsWarning
+from rts.diagnostics.notebooks import show
+from rts.diagnostics.profile import profile
+from rts.errors import InputError, RtsError
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.files.views.loading import load_views
@@ -55,7 +59,7 @@ from rts.views.render_views import render_views
 
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning EngineError FileWarning InputWarning "
-    "LayersWarning SamplerWarning ToleranceWarning",
+    "LayersWarning PluginError RtsWarning SamplerWarning ToleranceWarning",
     "rts.plugin_api.operations": "Operation combine gradient",
     "rts.plugin_api.records": "ArraySpec Fragments Proxy Rate RayHits Rays Samples Splats",
     "rts.plugin_api.splats": "SummingSplatter",
@@ -90,11 +94,9 @@ __all__ = [
     "LargeSteps",
     "Loss",
     "Part",
-    "PluginError",
     "RaySurface",
     "Residuals",
     "RtsError",
-    "RtsWarning",
     "Sampler",
     "Shader",
     "Splatter",
@@ -117,6 +119,7 @@ __all__ = [
     "plugin",
     "plugins",
     "prepare",
+    "profile",
     "pyramid",
     "render",
     "render_samples",
@@ -126,6 +129,7 @@ __all__ = [
     "save_animation",
     "save_image",
     "save_views",
+    "show",
     "tune",
     "volume_render",
     "warmup",

@@ -5,11 +5,12 @@
 With any ordinary renderer, find where camera rays meet a surface; evaluate it there, shade it and splat it;
 differentiate only that.
 
-Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`.
+Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`, types of results in
+`rts.results`.
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are `rts.tune`, of the package `rts_compare`,
-`rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+`rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
 import os
@@ -21,7 +22,10 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rts import errors as errors
 from rts import registry as registry
+from rts import regularizers as regularizers
+from rts import results as results
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array, Tree
@@ -36,7 +40,9 @@ from rts.contracts.surface import Evaluator, RaySurface, Surface, TriangleSurfac
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradient_images import gradient_image
 from rts.diagnostics.gradients import check_gradient
-from rts.errors import InputError, PluginError, RtsError, RtsWarning
+from rts.diagnostics.notebooks import show
+from rts.diagnostics.profile import profile
+from rts.errors import InputError, RtsError
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.files.views.loading import load_views
@@ -70,11 +76,9 @@ __all__ = [
     "LargeSteps",
     "Loss",
     "Part",
-    "PluginError",
     "RaySurface",
     "Residuals",
     "RtsError",
-    "RtsWarning",
     "Sampler",
     "Shader",
     "Splatter",
@@ -97,6 +101,7 @@ __all__ = [
     "plugin",
     "plugins",
     "prepare",
+    "profile",
     "pyramid",
     "render",
     "render_samples",
@@ -106,6 +111,7 @@ __all__ = [
     "save_animation",
     "save_image",
     "save_views",
+    "show",
     "tune",
     "volume_render",
     "warmup",
@@ -263,15 +269,37 @@ class Subdivision(_BuiltInTriangles):
         tolerance: float = 0.1,
     ) -> None: ...
 
-class _NarrowBand(Protocol):
-    @property
-    def lipschitz(self) -> float | None: ...
-    @property
-    def coarse(self) -> int | None: ...
-    @property
-    def margin(self) -> int: ...
-    @property
-    def chunk(self) -> int: ...
+@dataclass(frozen=True)
+class NarrowBand:
+    """A search for the cells of a lattice that a surface passes through.
+
+    With a Lipschitz bound these are all cells whose corners differ in sign. A block of cells is dropped if the level at
+    its centre is further from zero than it can change within the block; other blocks are halved.
+
+    Without one, the search halves coarse cells whose corners differ in sign, with a margin around them. Of the halves,
+    only those whose corners differ in sign are halved again. At every fineness the surface is then followed across the
+    sides of cells that it crosses. So each coarse cell whose corners differ in sign has cells in the band, and the band
+    has no holes: if the four corners shared with a neighbour differ in sign, the neighbour is in it, too. A separate
+    part of the surface between coarse corners of one sign is found only in the margin, and only if it shows at corners
+    of halved cells.
+
+    Isosurfaces also need levels one cell further inside, where rays that graze the surface are deepest.
+
+    Args:
+        lipschitz: the fastest change of the level, per unit of length; None if unknown.
+        coarse: cells along each side of the first blocks, a power of two; None for 16 with a Lipschitz bound and 8
+            without one.
+        margin: width, in coarse cells, of this margin. It has no effect with a Lipschitz bound.
+        chunk: the largest number of points at which the level is evaluated together.
+
+    Raises:
+        InputError: an argument is of the wrong kind.
+    """
+
+    lipschitz: float | None = None
+    coarse: int | None = None
+    margin: int = 1
+    chunk: int = 262144
 
 class _Extracted(NamedTuple):
     vertices: np.ndarray
@@ -326,7 +354,7 @@ class Isosurface(_BuiltInTriangles, _BuiltInRays):
         at_bounds: str = "capped",
         near_singular: str = "bound",
         table: bool | int = False,
-        band: _NarrowBand | None = None,
+        band: NarrowBand | None = None,
         lipschitz: float | None = None,
         reads: Sequence[str] | None = None,
         attributes: Mapping[str, Callable[[Any, Array], Array]] | None = None,
@@ -390,7 +418,8 @@ class Ndc:
 
     Attributes:
         scale: (x, y), focal length over half the width and half the height of the image.
-        near: depth of the near plane, 1 in the frame of NeRF's forward-facing scenes (`rts.load_views(frame="nerf")`).
+        near: depth of the near plane, 1 in the frame of NeRF's forward-facing data sets
+            (`rts.load_views(frame="nerf")`).
 
     Raises:
         InputError: a number is not positive.
@@ -530,7 +559,7 @@ def volume_render(
         camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras of
             `load_views` with `pixel_center`).
         size: (height, width) in pixels.
-        near: depth at which rays begin; default 2, as in NeRF's Blender scenes; with `ndc`, always its near plane.
+        near: depth at which rays begin; default 2, as in NeRF's Blender data sets; with `ndc`, always its near plane.
         far: depth at which rays end; default 6; with `ndc`, always infinity.
         samples: (N_c, N_f), at least 3 and 1.
         background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.

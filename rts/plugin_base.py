@@ -21,6 +21,7 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
     "takes_views": ("__call__",),
     "reads": ("__call__", "base_color"),
     "translucent": ("image", "accumulate"),
+    "any_channels": ("image", "accumulate"),
 }
 """Promise → the methods whose behaviour it describes; a class may lack some of them."""
 

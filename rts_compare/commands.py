@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rts.diagnostics.measuring_api import supersample_of
+from rts.diagnostics.measuring_api import size_of, supersample_of
 
 if TYPE_CHECKING:
     from rts_compare.comparison import Comparison
@@ -32,7 +32,7 @@ Modes = Annotated[
     list[str] | None,
     typer.Option("--mode", help="translation, rotation, shape, color or camera; may be repeated. All by default."),
 ]
-SceneSize = Annotated[str | None, typer.Option("--size", help="Pixels: 256, or HEIGHTxWIDTH; the scene's own.")]
+SceneSize = Annotated[str | None, typer.Option("--size", help="Pixels: 256, or WIDTHxHEIGHT; the scene's own.")]
 
 
 def compare(
@@ -67,7 +67,7 @@ def compare(
     wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
     options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
     options["supersample"] = [supersample_of(text) for text in supersample or []] or None
-    shape = None if size is None else _size(size)
+    shape = None if size is None else size_of(size)
     if (missing := _missing_charts()) is not None:
         _say(escape(missing))
     with _interrupted("what was measured is kept: the same command goes on from there"):
@@ -97,7 +97,7 @@ def tune(
     from rts_compare.chart_style import time_label
     from rts_compare.tuning import tune as tuned
 
-    shape, chosen = None if size is None else _size(size), None if engine == "auto" else engine
+    shape, chosen = None if size is None else size_of(size), None if engine == "auto" else engine
     options: dict[str, Any] = dict(tolerance=tolerance, budget_s=budget, modes=modes or None)
     with _interrupted("the truth is kept, other measurements are not"):
         found = tuned(scene, size=shape, engine=chosen, surface=surface, **options)
@@ -155,14 +155,6 @@ def _missing_charts() -> str | None:
         f"no {' or '.join(kinds[package] for package in missing)}, which needs {' and '.join(missing)}: pip install "
         f"'rasterize-then-splat[plots]'. What is measured is kept: the same command draws it later"
     )
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) of a text: "256" for a square, or "480x640"; typer.BadParameter for any other text."""
-    parts = text.lower().split("x")
-    if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
-        raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")
-    return int(parts[0]), int(parts[-1])
 
 
 def _say(text: str) -> None:

@@ -309,5 +309,5 @@ def part_of(surface):
         return rts.Part(Ellipsoid(), {"center": center, "radii": np.array([1, 0.7, 0.8], np.float32)}, "lambert")
     try:
         return rts.plugin("surfaces", surface).example()
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))

@@ -223,15 +223,15 @@ LOOPS = [
     Defect(
         "gradients of opacity forget the light that passes",
         "rts/splatting/edges/stacks_loops.py",
-        "g_rgba[n, 3] -= through[k] * behind[k, c] * g[y, x, c]",
-        "g_rgba[n, 3] -= behind[k, c] * g[y, x, c]",
+        "g_rgba[n, count - 1] -= through[k] * behind[k, c] * g[y, x, c]",
+        "g_rgba[n, count - 1] -= behind[k, c] * g[y, x, c]",
         "edges_operations",
     ),
     Defect(
         "composites behind a layer are those behind the next",
         "rts/splatting/edges/stacks_loops.py",
-        "behind[k, c] = rgba[n, c] + (1 - rgba[n, 3]) * behind[k + 1, c]",
-        "behind[k, c] = (1 - rgba[n, 3]) * behind[k + 1, c]",
+        "behind[k, c] = rgba[n, c] + (1 - rgba[n, alpha]) * behind[k + 1, c]",
+        "behind[k, c] = (1 - rgba[n, alpha]) * behind[k + 1, c]",
         "edges_operations edges_glass",
     ),
     Defect(
@@ -381,8 +381,8 @@ ARRAYS = [
     Defect(
         "layers beside a break move twice",
         "rts/splatting/edges/stacks.py",
-        "change = change - stopped(own.whole - here.whole) * with_break[:, None]",
-        "change = change + stopped(own.whole - here.whole) * with_break[:, None]",
+        "change = change - stopped(stack.whole - here.whole) * with_break[:, None]",
+        "change = change + stopped(stack.whole - here.whole) * with_break[:, None]",
         "edges_glass",
     ),
     Defect(

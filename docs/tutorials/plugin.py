@@ -12,6 +12,8 @@ import torch
 from PIL import Image
 
 import rts
+from rts.plugin_api.arrays import namespace
+from rts.plugin_api.bases import GBuffer, RaySurface
 from rts.plugin_api.records import RayHits
 
 size = (32, 32) if "RTS_QUICK" in os.environ else (160, 160)
@@ -27,18 +29,18 @@ size = (32, 32) if "RTS_QUICK" in os.environ else (160, 160)
 
 
 # %%
-class Ellipsoid(rts.RaySurface):
+class Ellipsoid(RaySurface):
     """θ["radii"] (3,) are its half axes. A sample is a point (3,) of the unit sphere, stretched by them."""
 
     sample_widths = (0, 3)  # No integers, three reals a sample.
 
     def evaluate(self, theta, samples):
-        gbuffer = rts.GBuffer(position=theta["radii"] * samples.params)
+        gbuffer = GBuffer(position=theta["radii"] * samples.params)
         gbuffer.defer("normal", lambda: samples.params / theta["radii"])
         return gbuffer
 
     def intersect(self, theta, origins, directions, layers):
-        xp, radii = rts.namespace(origins), theta["radii"]
+        xp, radii = namespace(origins), theta["radii"]
         start, along = origins / radii, directions / radii
         square = xp.sum(along * along, axis=-1)
         middle = -xp.sum(start * along, axis=-1) / square

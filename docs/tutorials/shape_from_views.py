@@ -74,7 +74,7 @@ pictures = torch.as_tensor(images(truth, faces))
 # %%
 ball = trimesh.creation.icosphere(detail, 0.5)
 start = np.asarray(ball.vertices, np.float32)
-steps = rts.LargeSteps(ball.faces, len(start))
+steps = rts.LargeSteps(start, ball.faces)
 u = torch.tensor(steps.encode(start), requires_grad=True)
 optimizer = torch.optim.Adam([u], lr=0.03)
 for step in range(count):

@@ -97,7 +97,7 @@ def _shape(x: Any) -> Any:
 
 def shape_of(x: Any) -> tuple[int, ...]:
     """The shape of an array; () of anything else."""
-    return tuple(_shape(x) or ())
+    return tuple(getattr(x, "shape", None) or ())
 
 
 def described(x: Any) -> str:

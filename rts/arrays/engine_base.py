@@ -246,10 +246,10 @@ class Engine(Plugin):
         parts = [f(rows[i : i + size]) for i in range(0, rows.shape[0], size)]
         return parts[0] if len(parts) == 1 else self.namespace.concat(parts)
 
-    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
-        """The result of `f(make())`. For its gradient `f` may run again, so that no intermediate arrays are kept.
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Tree]) -> Any:
+        """The result of `f(make())`: an array, or a tuple of arrays. For its gradient `f` may run again.
 
-        `make` has no derivative. The engine runs it again, too, or keeps its tree.
+        So no intermediate arrays are kept. `make` has no derivative. The engine runs it again, too, or keeps its tree.
         """
         return f(make())
 

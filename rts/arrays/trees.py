@@ -40,14 +40,12 @@ def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
 
 def record_arrays(value: Any) -> list[Any]:
     """A record's array fields in order of declaration."""
-    values = value.__dict__
-    return [values[name] for name in _ARRAY_FIELDS[type(value)]]
+    return list(map(value.__dict__.__getitem__, _ARRAY_FIELDS[type(value)]))
 
 
 def split_record(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
     """A record's array fields in order of declaration, and its static fields in the order of `STATIC_FIELDS`."""
-    values = value.__dict__
-    return record_arrays(value), tuple([values[name] for name in STATIC_FIELDS[type(value)]])
+    return record_arrays(value), tuple(map(value.__dict__.__getitem__, STATIC_FIELDS[type(value)]))
 
 
 def join_record(cls: type, arrays: Iterable[Any], static: tuple[Any, ...]) -> Any:

@@ -64,7 +64,7 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
     model = [knot()]
     bounds = bounds_of(model)
     floor = ground(float(bounds.center[1] - 1.02 * bounds.radius))
-    camera = orbit(bounds._replace(radius=1.25 * bounds.radius), SIZE, 28, 24)
+    camera = orbit(bounds._replace(radius=1.25 * bounds.radius), SIZE, 28, 24, fov=40)
     true = np.asarray(rigid(np.array([*TRUE_ROTATION, *TRUE_TRANSLATION]), bounds.center))
     # One layer, as in the fit: two would widen the outline, since back faces of the knot are not culled.
     target = silhouette_of(render(posed(model, true, "silhouette"), camera, SIZE, splatter="single", layers=1))

@@ -22,10 +22,10 @@ from rts.cli.options import (
     SurfaceName,
     UpAxis,
     color_of,
+    environment_of,
     is_given,
     layers_of,
     refuse_beside,
-    size_of,
     view_of,
 )
 from rts.scene.parts import Part
@@ -35,7 +35,7 @@ Examples:
 
     rts demo
 
-    rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --shader normals
+    rts render bunny.obj -o bunny.png --size 640x480 --camera 30,20 --shader normals
 
     rts fit-pose bunny.obj photo.png -o found
 """
@@ -117,39 +117,70 @@ def plugins(
             _say(escape(newer))
 
 
-@app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")
+@app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 640x480 --camera 30,20 --cull back")
 def render(
     context: typer.Context,
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The picture to write: .png, .hdr or .exr; or a .npz of arrays.")
+    ] = Path("out.png"),
+    outputs: Annotated[
+        str,
+        typer.Option(
+            help="What to write, such as color,depth,normal; all but color as out.depth.png (16 bits) beside out.png. "
+            "rts.render says which there are."
+        ),
+    ] = "color",
     surface: SurfaceName = "mesh",
-    size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
+    size: Annotated[str, typer.Option(help="Pixels: 256, or WIDTHxHEIGHT.")] = "256",
     camera: OrbitAngles = "30,20",
-    fov: FieldOfView = 40.0,
+    fov: FieldOfView = 45.0,
     up: UpAxis = "y",
     sampler: Annotated[str, typer.Option(help="Name of a sampler, see `rts plugins`.")] = "auto",
     engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
-    layers: Annotated[str, typer.Option(help="SurfaceName layers kept at each pixel, or auto.")] = "auto",
+    layers: Annotated[str, typer.Option(help="Layers kept at each pixel, or auto.")] = "auto",
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
     splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, multi, single or none.")] = "auto",
     supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
     cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
+    environment: Annotated[
+        Path | None,
+        typer.Option(
+            help="A picture of all that surrounds the model, and lights it: .hdr, .exr or .png, twice as wide as high."
+        ),
+    ] = None,
+    exposure: Annotated[
+        float | None,
+        typer.Option(help="Stops by which a .png is made brighter; bright colours are then compressed, not clipped."),
+    ] = None,
     pose: Annotated[
         Path | None,
         typer.Option(help="The pose.json of `rts fit-pose`: pose, camera and size are exactly those in it."),
     ] = None,
+    profile: Annotated[
+        bool, typer.Option("--profile", help="Show where the time goes, stage by stage, and what would help.")
+    ] = False,
 ) -> None:
     """Render a model to a picture."""
     import rts
+    from rts.cli.output_files import check_names, names_of, write_outputs
     from rts.cli.pose_file import posed, read_pose
-    from rts.diagnostics.measuring_api import supersample_of
+    from rts.diagnostics.measuring_api import size_of, supersample_of
+    from rts.files.images import PICTURES
     from rts.files.paths import output_file
     from rts.scene.default_camera import bounds_of, orbit
+    from rts.shading.tone_mapping import check_exposure
 
     shape, view, color = size_of(size), view_of(camera), color_of(background)
-    output_file(output, "picture", (".png",))
+    output_file(output, "picture", (*PICTURES, ".npz"))
+    names = names_of(outputs)
+    check_names(names, output)
+    if exposure is not None and output.suffix.lower() != ".png":
+        raise typer.BadParameter("--exposure is for a .png; .hdr and .exr hold colours of any brightness")
+    check_exposure(exposure or 0.0)
+    light = None if environment is None else environment_of(environment, up)
     engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
         parts = rts.load(model, surface=surface)
@@ -165,27 +196,27 @@ def render(
 
     def prepared(part: Part) -> Part:
         theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
+        theta = theta if light is None else {**theta, "light": {"environment": light}}
         return part.replace(
             theta=map_leaves(engine_object.constant, theta),
             cull=cull,
             shader=part.shader if shader == "auto" else shader,
         )
 
+    scene = [prepared(p) for p in parts]
+    options: dict[str, Any] = {"sampler": sampler, "splatter": splatter, "layers": layers_of(layers)}
+    options["supersample"] = supersample_of(supersample)
     start = time.perf_counter()
-    image = rts.render(
-        [prepared(p) for p in parts],
-        seen,
-        shape,
-        sampler=sampler,
-        splatter=splatter,
-        layers=layers_of(layers),
-        supersample=supersample_of(supersample),
-        background=color,
-    )
+    images = rts.render(scene, seen, shape, **options, background=color, outputs=names)
     seconds = time.perf_counter() - start
-    rts.save_image(output, image)
+    arrays = {name: engine_object.to_numpy(image) for name, image in images.items()}
+    lines = write_outputs(output, arrays, exposure)
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
-    _say(escape(f"{what}, {shape[0]} x {shape[1]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
+    _say(escape(f"{what}, {shape[1]} x {shape[0]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
+    for line in lines if names != ("color",) else ():
+        _say(escape(f"  {line}"))
+    if profile:
+        typer.echo(rts.profile(scene, seen, shape, **options))
 
 
 @app.command(
@@ -206,7 +237,7 @@ def fit_pose(
     method: Annotated[str, typer.Option(help="lm (Levenberg–Marquardt), adam or sgd.")] = "lm",
     steps: Annotated[int | None, typer.Option(help="At most so many at each stage.")] = None,
     camera: OrbitAngles = "30,20",
-    fov: FieldOfView = 40.0,
+    fov: FieldOfView = 45.0,
     up: UpAxis = "y",
     fit_fov: Annotated[bool, typer.Option("--fit-fov", help="Fit the field of view, too; --fov is the start.")] = False,
     loss: Annotated[

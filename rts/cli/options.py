@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-
-
-def size_of(text: str) -> tuple[int, int]:
-    """(height, width) of "256" or "480x640"."""
-    parts = text.lower().split("x")
-    if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
-        raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")
-    return int(parts[0]), int(parts[-1])
 
 
 def layers_of(text: str) -> Any:
@@ -49,6 +42,17 @@ def color_of(text: str) -> tuple[float, ...] | None:
         return tuple(decode_srgb(np.array(ImageColor.getrgb(text)[:3]) / 255))
     except ValueError:
         raise typer.BadParameter(f"{text!r} is no colour; expected a name, #rrggbb, or none") from None
+
+
+def environment_of(path: Path, up: str) -> Any:
+    """The light of a picture of all that surrounds a scene, as θ["light"]["environment"], its top `up`, y or z."""
+    import rts
+    from rts.shading import prefiltered, turned_environment
+
+    image = rts.load_image(path)[..., :3]
+    if up == "z":  # A direction (x, y, z) is (x, z, −y) in the picture.
+        image = turned_environment(image, np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32))
+    return prefiltered(image)
 
 
 def is_given(context: typer.Context, option: str) -> bool:

@@ -12,6 +12,8 @@ import numpy as np
 from rts.cli.pose_file import Pose, posed
 from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, shrunk
 from rts.cli.pose_verdict import Verdict
+from rts.diagnostics.notebooks import losses_png
+from rts.errors import PluginError
 from rts.files.images import save_animation, save_image
 from rts.files.paths import writing
 from rts.rendering.image import render
@@ -20,7 +22,6 @@ from rts.scene.parts import Part
 
 PICTURE_SIDE, FRAMES = 512, 48
 PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)
-STAGE_COLORS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def write_report(
@@ -100,27 +101,11 @@ def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.nda
 
 
 def _plot(path: Path, history: Sequence[float], levels: Sequence[int]) -> list[Path]:
-    """Plot the loss over the steps, a line a stage: losses of two stages are of different images.
-
-    Returns a list of the file, or an empty one if matplotlib is missing.
-    """
+    """Plot the loss over the steps. Returns a list of the file, or an empty one if matplotlib is missing."""
     try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError:
+        plot = losses_png(history, levels)
+    except PluginError:
         return []
-    figure = Figure(figsize=(6, 3.5), layout="constrained")
-    axes = figure.subplots()
-    first = 0
-    for number, count in enumerate(levels):
-        losses = np.maximum(history[first : first + count], 1e-12)
-        steps, color = range(first, first + count), STAGE_COLORS[number % len(STAGE_COLORS)]
-        axes.semilogy(steps, losses, ".-", color=color, linewidth=1, markersize=4, label=f"stage {number + 1}")
-        first += count
-    axes.set(xlabel="step", ylabel="loss of the stage")
-    axes.set_title("Silhouette, coarse to fine: each stage compares other images", fontsize=10)
-    axes.grid(alpha=0.3)
-    if len(levels) > 1:
-        axes.legend(frameon=False, fontsize=8)
     with writing(path):
-        figure.savefig(path, dpi=120)
+        path.write_bytes(plot)
     return [path]

@@ -156,7 +156,7 @@ def check_memory(height: int, width: int, layers: int, capacity: int | None, *, 
     needed = height * width * layers * bytes_
     if needed > MEMORY:
         raise InputError(
-            f"{height} x {width} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
+            f"{width} x {height} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
             f"{MEMORY / 2**30:.3g} GiB; choose a smaller size, or fewer samples a pixel or layers"
         )
 

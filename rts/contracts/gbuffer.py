@@ -15,7 +15,9 @@ class GBuffer(dict):
     deferred: it is computed when first read, as `gbuffer[name]`, so a shader pays for what it reads. Reading a missing
     attribute raises an `InputError`. Built-in surfaces use the names position, normal, uv and color. If there is "uv",
     shaders also receive "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, the change of uv to the cell on the right, and ∂u/∂y,
-    ∂v/∂y, the change to the cell below; without derivative.
+    ∂v/∂y, the change to the cell below; without derivative. If there are "uv" and "normal", they receive "tangent"
+    (N, 4), unless the surface has one: the direction in which u grows, and a sign. The direction of v is sign · normal
+    × tangent.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):

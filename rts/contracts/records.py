@@ -220,7 +220,7 @@ class Outlines:
         square: (S, 2) int32, the first corner (y, x) of each segment's square.
         ties: (S, 2) int32, the two breaks of each segment; the near surface lies to the right of the way from one to
             the other. −1 in second place if a break is alone. A segment from a break to itself has no effect.
-        side: (S, 2) int32, the sides of the square that these breaks lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
+        square_sides: (S, 2) int32, the sides of the square that these lie on: 0 top, 1 right, 2 bottom, 3 left; or −1.
         beyond: (S, 2) int32, the breaks along the same outline before and after these two; −1 for none.
         corner: (S, 2) float64, a point between the two where the outline turns: x and y from the square's first centre.
         pull: (S, 4) float64, weights of the motions of the break before, of these two, and of the one after, whose sum
@@ -244,7 +244,7 @@ class Outlines:
     ends: Array
     square: Array
     ties: Array
-    side: Array
+    square_sides: Array
     beyond: Array
     corner: Array
     pull: Array
@@ -304,7 +304,7 @@ class Splats(_OnCells):
         positions: (N, 3) x and y in cells from the corner of the grid, border included, and linear depth;
             differentiable.
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
-            channels, (N, C + 1): splatters are given three of them at a time, and alpha.
+            channels, (N, C + 1): splatters are given three of them at a time, and alpha, or all (`any_channels`).
         cells: the index of the sample in each cell, without depth; arrays of the positions' engine.
         border: cells at each side that splat into the image but are no part of it.
         opaque: a promise that alpha is 1 at all samples.

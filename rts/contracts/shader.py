@@ -46,8 +46,8 @@ class Shader(Plugin):
             camera: the camera of the whole image; for a shader that `takes_views` it may be a `RowCameras`.
 
         Returns:
-            (N, 4) premultiplied linear RGBA, in [0, 1]. With other `channels`, (N, C + 1), alpha last; every channel
-            is multiplied by alpha, and otherwise of any value.
+            (N, 4) premultiplied linear RGBA: alpha in [0, 1], colours from 0 on, above 1 where it is bright. With other
+            `channels`, (N, C + 1), alpha last; every channel is multiplied by alpha, and otherwise of any value.
 
         Raises:
             InputError: an entry that the shader needs is missing.

@@ -25,16 +25,22 @@ class Splatter(Plugin):
         reads: "outlines", if it reads `Splats.outlines`, which are found for no other.
         translucent: a promise that samples behind others show as far as alpha lets light through, in all their layers,
             if `Splats.opaque` is False. Without it an image of translucent samples comes with a `LayersWarning`.
+        any_channels: a promise that `image` takes any number of channels at once, alpha last. Without it, it is given
+            three of them at a time, and alpha.
     """
 
     layers: int | None = None
     reach: int = 1
     reads: frozenset[str] = frozenset()
     translucent: bool = False
+    any_channels: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:
-        """The image of all cells, those of the border included: (H, W, 4) premultiplied RGBA."""
+        """The image of all cells, those of the border included: (H, W, 4) premultiplied RGBA.
+
+        For a splatter that takes `any_channels` (H, W, C + 1), as `Splats.rgba` is.
+        """
 
     def cropped(self, splats: Splats) -> Array:
         """The result of `image` with the border cut off: (H − 2 border, W − 2 border, 4). Override to save a copy."""

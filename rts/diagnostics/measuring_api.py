@@ -2,11 +2,29 @@
 
 from rts.arrays.engines import engine_named
 from rts.contracts.checked_parts import check_scene
-from rts.errors import InputError
+from rts.errors import InputError, InputWarning, warn
 from rts.files.paths import output_folder, writing
 from rts.scene.default_camera import default_camera
 
-__all__ = ["check_scene", "default_camera", "engine_named", "output_folder", "supersample_of", "writing"]
+__all__ = ["check_scene", "default_camera", "engine_named", "output_folder", "size_of", "supersample_of", "writing"]
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """(height, width) in pixels of an option's text: "256" for a square, or "640x480", WIDTHxHEIGHT.
+
+    Raises:
+        InputError: the text is no size.
+
+    Warns:
+        InputWarning: the sides differ, and until 0.3 the first one was the height. The warning goes in 0.4.
+    """
+    sides = text.lower().split("x")
+    if len(sides) not in (1, 2) or not all(side.strip().isdecimal() and int(side) > 0 for side in sides):
+        raise InputError(f"{text!r} is no size; expected a number of pixels, or WIDTHxHEIGHT such as 640x480")
+    width, height = int(sides[0]), int(sides[-1])
+    if width != height:
+        warn(f"size {text} is {width} wide and {height} high; before rts 0.3 the height came first", InputWarning)
+    return height, width
 
 
 def supersample_of(text: str) -> int:

@@ -8,7 +8,13 @@ import numpy as np
 
 from rts.files.damaged_files import warn
 from rts.files.gltf_tree import Gltf
+from rts.files.srgb import decode_srgb
 
+UNLIT = "KHR_materials_unlit"
+STATED = ("metallicFactor", "roughnessFactor", "metallicRoughnessTexture")
+"""Entries of `pbrMetallicRoughness` beside the base colour."""
+LARGEST = 1e6
+"""The largest factor."""
 SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 """An older kind of material; of what it is made of, the diffuse colour is read."""
 
@@ -21,12 +27,15 @@ class Material(NamedTuple):
         texture: (h, w, 3 or 4) of the base colour, as `rts.files.images.pixels` gives it; or None.
         alpha_mode: "OPAQUE", "MASK" or "BLEND".
         cutoff: the least alpha that is shown, of "MASK".
+        entries: entries of θ for the shader `pbr`, linear: "metallic", "roughness", "normal_map", "occlusion" and
+            "emissive", numbers or maps; None where the material tells nothing but its base colour.
     """
 
     color: np.ndarray | None = None
     texture: np.ndarray | None = None
     alpha_mode: str = "OPAQUE"
     cutoff: float = 0.5
+    entries: dict[str, np.ndarray] | None = None
 
     def shown(
         self, rows: np.ndarray | None, mapped: bool
@@ -64,13 +73,59 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
     if factor.shape != (4,):
         raise gltf.fail(f"the baseColorFactor of {name} is {factor.tolist()}; expected four numbers")
     color = unit_colors(gltf, f"baseColorFactor of {name}", factor[None])[0] if "baseColorFactor" in look else None
-    texture = None
-    if "baseColorTexture" in look:
-        reference = look["baseColorTexture"]
-        if "KHR_texture_transform" in reference.get("extensions", {}) or reference.get("texCoord", 0) != 0:
-            warn(f"{gltf.path}: the texture of {name} has a transform or coordinates of its own, which are not read")
-        texture = gltf.picture(reference["index"], f"the texture of {name}")
-    return Material(color, texture, material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5)))
+    texture = _picture(gltf, look, "baseColorTexture", f"the texture of {name}")
+    entries = None if UNLIT in material.get("extensions", {}) or older else _entries(gltf, material, look, name)
+    mode, cutoff = material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5))
+    return Material(color, texture, mode, cutoff, entries)
+
+
+def _picture(gltf: Gltf, entry: dict[str, Any], key: str, name: str) -> np.ndarray | None:
+    """The pixels of a texture that an entry refers to, as the file has them; None if it has none, or is not read."""
+    if key not in entry:
+        return None
+    reference = entry[key]
+    if "KHR_texture_transform" in reference.get("extensions", {}) or reference.get("texCoord", 0) != 0:
+        warn(f"{gltf.path}: {name} has a transform or coordinates of its own, which are not read")
+    return gltf.picture(reference["index"], name)
+
+
+def _entries(gltf: Gltf, material: dict[str, Any], look: dict[str, Any], name: str) -> dict[str, np.ndarray] | None:
+    """`Material.entries`; refused where a factor is no number, or out of its range."""
+    keys = {*look} & set(STATED) | {*material} & {"normalTexture", "occlusionTexture", "emissiveTexture"}
+    if not keys:
+        return None
+    surface = _picture(gltf, look, "metallicRoughnessTexture", f"the metallicRoughnessTexture of {name}")
+    entries = {}
+    for entry, key, channel in (("metallic", "metallicFactor", 2), ("roughness", "roughnessFactor", 1)):
+        factor = _number(gltf, look, key, 1.0, name, most=1.0)
+        entries[entry] = np.asarray(factor if surface is None else factor * surface[..., channel : channel + 1])
+    bumps = _picture(gltf, material, "normalTexture", f"the normalTexture of {name}")
+    if bumps is not None:
+        scale = _number(gltf, material["normalTexture"], "scale", 1.0, name, least=-LARGEST)
+        entries["normal_map"] = (2 * bumps[..., :3] - 1) * [scale, scale, 1.0]
+    open_ = _picture(gltf, material, "occlusionTexture", f"the occlusionTexture of {name}")
+    if open_ is not None:
+        strength = _number(gltf, material["occlusionTexture"], "strength", 1.0, name, most=1.0)
+        entries["occlusion"] = 1 + strength * (open_[..., :1] - 1)
+    strong = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
+    factor = np.array(material.get("emissiveFactor", [0.0] * 3), np.float64)
+    if factor.shape != (3,) or not (np.abs(factor - 0.5) <= 0.5).all():
+        raise gltf.fail(f"the emissiveFactor of {name} is {factor.tolist()}; expected three numbers from 0 to 1")
+    factor = factor * _number(gltf, strong, "emissiveStrength", 1.0, name)
+    if factor.any():
+        glow = _picture(gltf, material, "emissiveTexture", f"the emissiveTexture of {name}")
+        entries["emissive"] = factor if glow is None else factor * decode_srgb(glow[..., :3])
+    return {entry: np.asarray(value, np.float32) for entry, value in entries.items()}
+
+
+def _number(
+    gltf: Gltf, entry: dict[str, Any], key: str, default: float, name: str, least: float = 0.0, most: float = LARGEST
+) -> float:
+    """A number of an entry; refused outside of a range."""
+    value = entry.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= most:
+        raise gltf.fail(f"{key} of {name} is {str(value)[:80]}; expected a number from {least:g} to {most:g}")
+    return float(value)
 
 
 def unit_colors(gltf: Gltf, name: str, colors: np.ndarray) -> np.ndarray:

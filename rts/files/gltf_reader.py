@@ -80,4 +80,4 @@ def _piece(
     if colors is not None:
         attributes["colors"] = colors, faces
     vertices = read["POSITION"].numbers().astype(np.float64)
-    return Piece(vertices, faces, attributes, texture, color, linear=True)
+    return Piece(vertices, faces, attributes, texture, color, linear=True, entries=material.entries)

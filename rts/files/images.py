@@ -19,40 +19,69 @@ from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.contracts.checks import MEMORY, is_real
 from rts.errors import EngineError, FileWarning, InputError, PluginError, warn
+from rts.files.bright_images import read_exr, read_hdr, write_exr, write_hdr
 from rts.files.damaged_files import Fail, gathered
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
+from rts.shading.tone_mapping import check_exposure, tonemap
+
+PICTURES = (".png", ".hdr", ".exr")
+"""Extensions that `save_image` writes."""
 
 
-def save_image(path: Any, image: Array) -> None:
-    """Write a PNG.
+def save_image(path: Any, image: Array, exposure: float | None = None) -> None:
+    """Write a PNG, or with colours of any brightness Radiance's .hdr, or .exr if OpenEXR is installed (extra `exr`).
 
     Args:
-        path: a name ending in .png; folders that do not exist are made.
+        path: a name with one of these extensions; folders that do not exist are made.
         image: (H, W, 4) premultiplied linear RGBA, (H, W, 3), (H, W, 1) or (H, W), floating numbers, an array of any
-            engine or nested lists; values outside [0, 1] are clipped.
+            engine or nested lists. In a .png, values outside [0, 1] are clipped. A .hdr has no alpha, and nothing
+            below 0.
+        exposure: for colours in a .png: stops by which they are made brighter, before `rts.shading.tonemap` brings
+            them into the range of a display. None does neither.
 
     Raises:
         InputError: no array, another shape, integers, NaN or infinity, more than fits into memory, another extension,
-            or a path that cannot be or may not be written to.
+            a path that cannot be or may not be written to, or an exposure that is no number, or not for this picture.
+        PluginError: .exr without OpenEXR.
     """
     from PIL import Image
 
-    path = output_file(path, "picture", (".png",))
-    encoded = _bytes(_host(image, "the image"))
+    path = output_file(path, "picture", PICTURES)
+    kind, pixels = path.suffix.lower(), _host(image, "the image")
+    if exposure is not None:
+        check_exposure(exposure)
+        if kind != ".png" or pixels.ndim == 2:
+            raise InputError(f"exposure is {exposure}, for {path.name!r}; expected None, but for colours in a .png")
+        pixels = tonemap(pixels, exposure)
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(encoded).save(path)
+        if kind == ".hdr":
+            write_hdr(path, pixels)
+        elif kind == ".exr":
+            write_exr(path, pixels)
+        else:
+            Image.fromarray(_bytes(pixels)).save(path)
+
+
+def png_of(image: Array) -> bytes:
+    """The bytes of the PNG that `save_image` writes."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(_bytes(_host(image, "the image"))).save(file, "PNG")
+    return file.getvalue()
 
 
 def load_image(path: Any) -> np.ndarray:
-    """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads.
+    """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads, of .hdr or .exr.
 
-    Of several frames it is the first.
+    Of several frames it is the first. Colours of .hdr and .exr have any brightness.
 
     Raises:
-        InputError: there is no such file, it cannot be read as a picture, or holds floating-point numbers, whose
-            range is not known.
+        InputError: there is no such file, it cannot be read as a picture, holds NaN or infinity, or floating-point
+            numbers whose range is not known.
+        PluginError: .exr without OpenEXR (extra `exr`).
 
     Warns:
         FileWarning: Pillow found something wrong with it.
@@ -62,6 +91,8 @@ def load_image(path: Any) -> np.ndarray:
         raise InputError(f"{path} is a folder; expected a picture")
     if not path.is_file():
         raise InputError(f"there is no picture {path}; check the path (relative paths start at {Path.cwd()})")
+    if path.suffix.lower() in (".hdr", ".exr"):
+        return _bright(path)
     with gathered(path) as notes:
         encoded = read_image(path)
     for note in notes:
@@ -69,6 +100,17 @@ def load_image(path: Any) -> np.ndarray:
     straight = decode_srgb(encoded)
     alpha = straight[..., 3:] if straight.shape[2] == 4 else np.ones_like(straight[..., :1])
     return np.concatenate([straight[..., :3] * alpha, alpha], axis=2)
+
+
+def _bright(path: Path) -> np.ndarray:
+    """The result of `load_image` for .hdr and .exr."""
+    pixels = read_hdr(path) if path.suffix.lower() == ".hdr" else read_exr(path)
+    wrong = pixels.size - int(np.isfinite(pixels).sum())
+    if wrong:
+        raise InputError(f"{wrong} of {path}'s {pixels.size} values are NaN or infinite; check what made it")
+    color = pixels[..., :3] if pixels.shape[2] > 1 else np.repeat(pixels, 3, axis=2)
+    alpha = pixels[..., 3:] if pixels.shape[2] == 4 else np.ones_like(pixels[..., :1])
+    return np.concatenate([color, alpha], axis=2)
 
 
 def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> None:
@@ -177,7 +219,7 @@ def _host(image: Any, name: str) -> np.ndarray:
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     if not np.issubdtype(array.dtype, np.floating):
-        raise InputError(f"{name} has dtype {array.dtype}; expected linear floats in [0, 1]")
+        raise InputError(f"{name} has dtype {array.dtype}; expected linear floats")
     wrong = array.size - int(np.isfinite(array).sum())
     if wrong:
         raise InputError(f"{wrong} of {name}'s {array.size} values are NaN or infinite; check what made it")

@@ -28,6 +28,7 @@ class Piece(NamedTuple):
         color: (3,) or (4,) factor of the material, as encoded in the file; or None.
         linear: True if `color` and the attribute "colors" are linear rather than sRGB.
         transform: (4, 4) scene-from-local, or None.
+        entries: further entries of θ, for the shader `pbr`; None for other shaders.
     """
 
     vertices: np.ndarray
@@ -37,6 +38,7 @@ class Piece(NamedTuple):
     color: np.ndarray | None = None
     linear: bool = False
     transform: np.ndarray | None = None
+    entries: dict[str, np.ndarray] | None = None
 
 
 def check_piece(path: Path, piece: Piece) -> None:

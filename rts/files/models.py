@@ -26,6 +26,7 @@ from rts.files.srgb import decode_srgb
 from rts.files.stl_reader import read_stl
 from rts.files.trimesh_reader import read_with_trimesh
 from rts.scene.parts import Part
+from rts.shading.pbr import Pbr
 from rts.shading.shaders import Lambert, Textured
 
 
@@ -37,8 +38,9 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     "normals", "colors", "texture" and "color". Vertices are in the order of the file; those that no face refers to
     are left out, and those that coincide exactly are welded: where uv or normals differ between the faces around a
     vertex they have an index table of their own, so that moving vertices opens no seams. Normals of the file do not
-    follow moving vertices: drop them from θ, and smooth ones are computed that do. The shader is `textured` where
-    there are uv and a texture, else `lambert`.
+    follow moving vertices: drop them from θ, and smooth ones are computed that do. The shader is `pbr` where the
+    material of a glTF tells more than its base colour: θ then has "metallic", "roughness", "normal_map", "occlusion"
+    and "emissive", as far as the file has them. Else it is `textured` where there are uv and a texture, or `lambert`.
 
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
     about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
@@ -114,6 +116,8 @@ def _part(path: Path, piece: Piece, weld: bool) -> Part:
     textured = piece.texture is not None and "uv" in theta
     if piece.texture is not None and textured:
         theta["texture"] = piece.texture.astype(np.float32)
+    if piece.entries is not None:
+        theta |= {name: x for name, x in piece.entries.items() if x.ndim < 3 or "uv" in theta}
     if piece.color is not None and (piece.color < 1).any():
         theta["color"] = piece.color[: 3 if (piece.color[3:] >= 1).all() else 4].astype(np.float32)
     for name, values in theta.items():
@@ -131,7 +135,7 @@ def _part(path: Path, piece: Piece, weld: bool) -> Part:
     return Part(
         registry.plugin("rts.surfaces", "mesh")(faces, indices),
         theta,
-        (Textured if textured else Lambert)(opaque=not translucent),
+        (Pbr if piece.entries is not None else Textured if textured else Lambert)(opaque=not translucent),
         piece.transform,
     )
 
@@ -174,7 +178,8 @@ def _settled(
 def _merged(path: Path, pieces: list[Piece]) -> Piece:
     """All pieces as one, transforms applied, material colours moved to the vertices.
 
-    Attributes that only some pieces have are dropped; pieces with different textures are refused.
+    Attributes that only some pieces have are dropped; so are entries for `pbr`, unless all pieces have one material.
+    Pieces with different textures are refused.
     """
     first = pieces[0].texture
     for piece in pieces[1:]:
@@ -198,7 +203,10 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
             rows = np.concatenate([rows for rows, _ in pairs])
             whole[name] = rows, np.concatenate([t + o for (_, t), o in zip(pairs, offsets, strict=False)])
     vertices, faces = whole.pop("vertices")
-    return Piece(vertices, faces, whole, first, linear=True)
+    same = all(piece.entries is pieces[0].entries for piece in pieces)
+    if not same:
+        warn(f"{path}: its parts have different materials; merged, they keep base colours alone", FileWarning)
+    return Piece(vertices, faces, whole, first, linear=True, entries=pieces[0].entries if same else None)
 
 
 def _in_scene(piece: Piece) -> Piece:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, TypeGuard
 
+import numpy as np
+
 from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
 from rts.arrays.engine_base import Engine
-from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace
-from rts.arrays.trees import Array, Tree
+from rts.arrays.engines import constants, context_of, engine_of, exemplar, namespace, stopped
+from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.checked_parts import CheckedPart, check_cameras, check_scene
-from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count
+from rts.contracts.checks import check_background, check_floating, check_ratio, check_sampler, is_count, is_real
 from rts.contracts.records import Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
@@ -26,6 +28,7 @@ from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradi
 from rts.plugin_base import overrides
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
 from rts.rendering.image import render
+from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
@@ -39,9 +42,6 @@ from rts.views.scenes import are_scenes
 Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]
 SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
-
-F_SCALE = 0.1
-"""The scale of a robust loss of images, whose numbers are mostly from 0 to 1."""
 
 
 class ImageResiduals(Residuals):
@@ -59,9 +59,13 @@ class ImageResiduals(Residuals):
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
             or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
-            Of several views (B, H, W, ·), or a list.
+            Of several views (B, H, W, ·), or a list. Or a dict of targets by the names of outputs of `rts.render`, such
+            as {"color": …, "depth": …}; of several views each (B, H, W, ·). Residuals are then in one row. Those of
+            means, such as depth, count as far as the pixel is covered: where nothing is seen, colours and alpha tell.
+            A depth or a normal of 0 in the target is one that was not measured, and does not count.
         weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
-            bool; constants. Of several views (B, H, W, ·), or a list.
+            bool; constants. Of several views (B, H, W, ·), or a list. For a dict of targets a dict, of arrays or of
+            numbers, such as {"depth": 0.1}; outputs that it leaves out have 1.
         background: as in `render`; a constant, the same for every view.
         sampler: as in `render`.
         splatter: as in `render`.
@@ -73,8 +77,8 @@ class ImageResiduals(Residuals):
         loss: the function of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
             "soft_l1", "huber" or "cauchy", to which large residuals count less: for targets that are partly wrong, such
             as a mask with something in front. Or an `rts.Loss`, which has its own `f_scale`.
-        f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1,
-            which suits images in [0, 1].
+        f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1, as
+            of every `rts.Loss`, which suits images in [0, 1].
 
     Attributes:
         size: (height, width).
@@ -93,9 +97,9 @@ class ImageResiduals(Residuals):
         scene: SceneFunction,
         camera: Cameras | None,
         size: tuple[int, int],
-        target: Array | Sequence[Array],
+        target: Array | Sequence[Array] | Mapping[str, Array],
         *,
-        weights: Array | Sequence[Array] | None = None,
+        weights: Array | Sequence[Array] | Mapping[str, Array | float] | None = None,
         background: BackgroundLike = None,
         sampler: SamplerLike = "auto",
         splatter: SplatterLike = "auto",
@@ -121,9 +125,19 @@ class ImageResiduals(Residuals):
         self._background = check_background(background, self.size, channels)
         self._full, self._sigma = self.size, 0.0
         self._view: int | None = None
+        self._outputs: tuple[str, ...] | None = None
+        self._mean = False
         self._views: list[ImageResiduals] = []
+        self._of_outputs: dict[str, ImageResiduals] = {}
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         cameras = len(check_cameras(camera)) if several else None
+        if isinstance(target, Mapping):
+            named = {f"target[{name!r}]": x for name, x in target.items()}
+            warn_of_gradients(named | {"weights": weights, "background": background})
+            self._take_outputs(target, {} if weights is None else weights, cameras)
+            of_views = self._views or [self]
+            refuse_zero([child._weights for view in of_views for child in view._of_outputs.values()])
+            return
         warn_of_gradients({"target": target, "weights": weights, "background": background})
         if (count := _view_count(target, self.size, several)) is None:
             self._take(target, weights)
@@ -154,27 +168,73 @@ class ImageResiduals(Residuals):
         self._target, self._channels = _checked_target(target, self.size, self._image_channels)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
 
+    def _take_outputs(self, target: Mapping[str, Any], weights: Any, views: int | None) -> None:
+        """Set targets and weights of outputs by name, of one view or of `views`, once checked."""
+        outputs = Outputs(list(target))
+        # The alpha of pixels weighs means.
+        self._outputs = tuple(dict.fromkeys((*outputs.names, *(["alpha"] if outputs.means else []))))
+        if not isinstance(weights, Mapping) or not set(weights) <= set(target):
+            raise InputError(f"weights is {quoted(weights)}; expected a dict, by names of targets: {', '.join(target)}")
+        if views is None:
+            for name, of_output in target.items():
+                child = self._of_outputs[name] = copy(self)
+                child._of_outputs, child._background, child._mean = {}, None, name in outputs.means
+                child._target = _checked_output(name, of_output, self.size)
+                child._channels = 1 if len(child._target.shape) == 2 else child._target.shape[2]
+                factors = weights.get(name)
+                factors = np.full(self.size, factors, np.float32) if is_real(factors) else factors
+                factors = _checked_weights(factors, child._target.shape, self.size)
+                child._weights = _measured(child._target, factors) if name in ("depth", "normal") else factors
+            return
+        if any((shape_of(x) or (0,))[0] != views for x in target.values()):
+            raise InputError(f"there are {views} cameras; expected {views} targets of each output, ({views}, H, W, ·)")
+        for b in range(views):
+            view = copy(self)
+            view._view, view._views, view._of_outputs = b, [], {}
+            factors = {name: x if is_real(x) else x[b] for name, x in weights.items()}
+            view._take_outputs({name: x[b] for name, x in target.items()}, factors, None)
+            self._views.append(view)
+
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape, whatever the loss; blurred if a stage says so."""
         parts, camera = self.scene(parameters)
-        options = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
+        options = {name: getattr(self._settings, name) for name in ("splatter", "layers", "supersample", "capacity")}
+        options |= {"sampler": self._sampler, "background": self._background, "outputs": self._outputs}
         if not self._views:
             return self._difference(render(parts, camera, self.size, **options), parameters)
         images = render_views(parts, camera, self.size, **options)
-        return namespace(images).stack(
-            [view._difference(images[b, ...], parameters) for b, view in enumerate(self._views)]
-        )
+        of_views = [
+            view._difference(map_leaves(lambda x, b=b: x[b, ...], images), parameters)
+            for b, view in enumerate(self._views)
+        ]
+        return namespace(of_views[0]).stack(of_views)
 
-    def _difference(self, image: Array, parameters: Tree) -> Array:
-        """The residuals of one view, as of `__call__`, from its image (H, W, C + 1)."""
+    def _difference(self, image: Any, parameters: Tree, share: Array | None = None) -> Array:
+        """The residuals of one view, as of `__call__`, from its image (H, W, C + 1), or a dict of outputs.
+
+        A `share` (H, W, 1) of each pixel counts; None for all.
+        """
+        if self._of_outputs:
+            for name, child in self._of_outputs.items():
+                count = image[name].shape[-1]
+                if child._channels not in ((1, count - 1, count) if name == "color" else (count,)):
+                    raise InputError(f"target[{name!r}] {described(child._target)}; expected {count} numbers a pixel")
+            rows = []
+            for name, child in self._of_outputs.items():
+                found = child._difference(image[name], parameters, stopped(image["alpha"]) if child._mean else None)
+                rows.append(namespace(found).reshape(found, (-1,)))
+            return namespace(*rows).concat(rows)
         image = self._beside_target(image, parameters)
         target, weights, _ = self._constants(image)
-        self._refuse_other(image.shape[-1] - 1)
+        if self._outputs is None:
+            self._refuse_other(image.shape[-1] - 1)
         # Alpha is last; a target of one channel is one of it alone.
         difference = image[..., -1:] if self._channels == 1 else image[..., : self._channels]
         difference = difference - target
         if weights is not None:
             difference = difference * weights
+        if share is not None:
+            difference = difference * share
         if self._sigma:
             difference = blurred(difference, self._sigma)
         return namespace(image).reshape(difference, tuple(self._target.shape))
@@ -203,12 +263,13 @@ class ImageResiduals(Residuals):
         """
         other = copy(self)
         other._views = [view.at_stage(stage) for view in self._views]
+        other._of_outputs = {name: child.at_stage(stage) for name, child in self._of_outputs.items()}
         other._sigma = float(stage.sigma)
         if stage.supersample is not None:
             other._settings = replace(self._settings, supersample=stage.supersample)
         other.size = stage.size(self.size)
         if other.size != self.size:
-            if not self._views:
+            if not self._views and not self._of_outputs:
                 other._target, other._weights = _shrunk(self._target, self._weights, other.size)
             if self._background is not None and len(self._background.shape) == 3:
                 other._background = box_filtered(self._background, other.size)
@@ -286,6 +347,7 @@ class ImageResiduals(Residuals):
             return value, matrix, gradient
         engine, equations = engine_of(parameters), None
         splatter, ordinary = self._settings.splatter, self._ordinary and not self._sigma and self._image_channels == 3
+        ordinary = ordinary and self._outputs is None
         if isinstance(splatter, SummingSplatter) and ordinary and engine.differentiates:
             equations = self._swept(parameters, engine, splatter)
         return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
@@ -379,7 +441,7 @@ class ImageResiduals(Residuals):
 
 def _checked_loss(loss: Any, f_scale: Any) -> Loss:
     if not isinstance(loss, Loss):
-        return Loss(loss, F_SCALE if f_scale is None else f_scale)
+        return Loss(loss) if f_scale is None else Loss(loss, f_scale)
     if f_scale is not None:
         raise InputError(f"loss is {loss}, and f_scale {quoted(f_scale)}; expected one of them to say the scale")
     return loss
@@ -458,6 +520,31 @@ def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[
     return target, count
 
 
+def _measured(target: Array, weights: Array | None) -> Array:
+    """Weights (H, W, 1 or ·) of a target (H, W) or (H, W, ·), and 0 where it is 0."""
+    xp = namespace(target)
+    there = xp.reshape(target, (*target.shape[:2], -1)) != 0
+    there = xp.astype(xp.any(there, axis=-1, keepdims=True), target.dtype)
+    if weights is None:
+        return there
+    weights, there = constants((weights, there), engine_of(target, weights), exemplar((target, weights)))
+    return xp.reshape(weights, (*target.shape[:2], -1)) * there
+
+
+def _checked_output(name: str, target: Any, size: tuple[int, int]) -> Array:
+    """The target (H, W) or (H, W, ·) of an output, checked."""
+    target = from_numbers(target, f"target[{name!r}]")
+    shape = shape_of(target)
+    if name in ("part", "triangle") or shape[:2] != size or len(shape) not in (2, 3):
+        height, width = size
+        raise InputError(
+            f"target[{name!r}] {described(target)}; expected real numbers ({height}, {width}) or ({height}, {width}, ·)"
+        )
+    check_floating(f"target[{name!r}]", target)
+    _check_finite(f"target[{name!r}]", target)
+    return target
+
+
 def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
     if weights is None:
         return None
@@ -479,4 +566,6 @@ def _check_finite(name: str, value: Array) -> None:
     """Refuse NaN and infinity, where values are known."""
     if not is_finite(value):
         hint = "; where there is nothing to compare with, put any number and give it a weight of 0"
-        raise InputError(f"{name} holds NaN or infinity; expected finite numbers{hint if name == 'target' else ''}")
+        raise InputError(
+            f"{name} holds NaN or infinity; expected finite numbers{hint if name.startswith('target') else ''}"
+        )

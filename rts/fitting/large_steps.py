@@ -12,9 +12,11 @@ from rts.arrays.argument_checks import check_positive, quoted
 from rts.arrays.array_functions import described, from_numbers, shape_of
 from rts.arrays.engines import engine_of, namespace, uncompiled
 from rts.arrays.trees import Array
-from rts.errors import InputError
+from rts.contracts.checks import is_count
+from rts.errors import InputError, warn_deprecated
 from rts.operations.operation import Arrays, Operation, Some
 from rts.regularizers.laplacian import Laplacian
+from rts.regularizers.regularizer import known_vertices
 from rts.scene.topology import index_table
 
 LARGEST = 1e5
@@ -34,8 +36,8 @@ class LargeSteps:
     for second derivatives, array code takes Chebyshev's iteration, whose time and rounding grow with λ.
 
     Args:
-        faces: (T, 3) integers into vertices; copied.
-        count: V, the number of vertices.
+        vertices: (V, 3) finite numbers, as for `rts.regularizers`; only their number is kept.
+        faces: (T, 3) integers into vertices; copied. `LargeSteps(faces, count)`, the order of 0.2, warns until 0.4.
         smoothness: λ, positive, at most 1e5. The default is the paper's, 19; the paper's other form
             (1 − α) I + αL, but for a factor, has λ = α / (1 − α), here α = 0.95.
 
@@ -45,24 +47,24 @@ class LargeSteps:
         smoothness: λ.
 
     Raises:
-        InputError: an argument is of another kind or shape, faces name a vertex that is not there, or no edge; or the
-            smoothness is traced or out of range.
+        InputError: an argument is of another kind or shape; vertices are traced; faces name missing ones, or no edge;
+            the smoothness is traced or out of range.
     """
 
-    def __init__(self, faces: Any, count: int, smoothness: float = 19.0):
+    def __init__(self, vertices: Any = None, faces: Any = None, smoothness: float = 19.0, *, count: Any = None):
+        if count is not None or is_count(faces):
+            warn_deprecated("LargeSteps(faces, count)", "LargeSteps(vertices, faces)", until="0.4")
+            count, faces = (faces, vertices) if count is None else (count, vertices if faces is None else faces)
+            if not is_count(count):
+                raise InputError(f"count is {quoted(count)}; expected the number of vertices, a positive integer")
+            vertices = np.zeros((count, 3))
         self.faces = index_table("faces", faces, 3)
-        if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
-            raise InputError(f"count is {quoted(count)}; expected the number of vertices, a positive integer")
-        if self.faces.max() >= count:
-            raise InputError(
-                f"faces name vertex {self.faces.max()}, but count says that there are {count} vertices; check the "
-                f"indices (they count from 0)"
-            )
+        self.count = len(known_vertices("vertices", vertices, self.faces))
         number = check_positive("smoothness", smoothness)
         if number is None or number > LARGEST:
             value = "traced" if number is None else quoted(smoothness)
             raise InputError(f"smoothness is {value}; expected a known number of at most {LARGEST:g}")
-        self.count, self.smoothness = int(count), float(number)
+        self.smoothness = float(number)
         self._laplacian = Laplacian(np.zeros((self.count, 3)), self.faces)
         edges = self._laplacian.edges
         degrees = np.bincount(edges.reshape(-1), minlength=self.count)
@@ -76,7 +78,7 @@ class LargeSteps:
         return f"LargeSteps({self.count} vertices, smoothness {self.smoothness:g})"
 
     def __reduce__(self) -> tuple[type, tuple]:
-        return type(self), (self.faces, self.count, self.smoothness)  # A factorisation cannot be copied.
+        return type(self), (np.zeros((self.count, 3)), self.faces, self.smoothness)  # A factorisation cannot be copied.
 
     @uncompiled
     def encode(self, vertices: Array) -> Array:

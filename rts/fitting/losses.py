@@ -102,9 +102,9 @@ class Loss:
 
     Attributes:
         name: one of the above.
-        f_scale: s, the residual at which square turns into robust, in units of the residuals, from 1e-10 to 1e10. By
-            default it is SciPy's 1, for residuals of any unit; for images see `rts.ImageResiduals`. "linear" has none:
-            it is 1 there, whatever is given.
+        f_scale: s, the residual at which square turns into robust, in units of the residuals, from 1e-10 to 1e10. The
+            default, 0.1, suits differences of images in [0, 1]; SciPy's is 1. "linear" has none: it is 1 there,
+            whatever is given.
 
     Raises:
         InputError: another name, or a scale that is no number from 1e-10 to 1e10.
@@ -114,7 +114,7 @@ class Loss:
     LEAST_SHARE: ClassVar[float] = LEAST_SHARE
 
     name: str = "linear"
-    f_scale: float = 1.0
+    f_scale: float = 0.1
 
     def __post_init__(self):
         if not isinstance(self.name, str) or self.name not in FORMS:

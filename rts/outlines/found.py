@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ class Found(NamedTuple):
     ends: Array
     square: Array
     ties: Array
-    side: Array
+    square_sides: Array
     beyond: Array
     corner: Array
     pull: Array
@@ -62,7 +63,7 @@ class Found(NamedTuple):
         named = {"rows": last, "inner": rows[:, 2:4], "pair": rows[:, 4:]}
         if self.sides.shape[-1]:
             named = {"rows": last, "inner": last, "pair": 0 * last - 1, **self._stacks(rows[:, 2:])}
-        return Outlines(**{f.name: named.get(f.name, getattr(self, f.name, None)) for f in fields(Outlines)})
+        return Outlines(**dict(zip(_SHARED, _shared_of(self), strict=True)) | named)
 
     def _stacks(self, rows: Array) -> dict[str, Array]:
         """`Outlines.stack` and `Outlines.stack_points`; `rows` (B, K + 1) are the samples of each stack."""
@@ -71,6 +72,10 @@ class Found(NamedTuple):
         at = xp.reshape(xp.where(there, first + self.sides, 0), (-1,))
         stack, places = (xp.reshape(xp.take(xp.reshape(x, (-1,)), at), shape) for x in (rows, self.places))
         return {"stack": xp.where(there, stack, -1), "stack_points": xp.where(there, places, 0.0)}
+
+
+_SHARED = tuple(f.name for f in fields(Outlines) if f.name in Found._fields)
+_shared_of = attrgetter(*_SHARED)
 
 
 def columns(layers: int) -> tuple[int, int, int]:

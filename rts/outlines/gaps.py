@@ -317,8 +317,8 @@ class _Change(NamedTuple):
         swapped = ~(lone[0].any(0) | lone[1].any(0))
         ends = np.where(swapped, first, lone[0].argmax(0)), np.where(swapped, first, lone[1].argmax(0))
         depths = [
-            np.where(own.any(0) | swapped, side.of_layer(at).depth, np.inf)
-            for own, side, at in zip(lone, sides, ends, strict=True)
+            np.where(alone.any(0) | swapped, side.of_layer(at).depth, np.inf)
+            for alone, side, at in zip(lone, sides, ends, strict=True)
         ]
         return cls(sides, (behind, before), first, ends, (depths[1] < depths[0]).astype(np.int32))
 
@@ -354,8 +354,8 @@ class _Change(NamedTuple):
         place = np.argsort(order, axis=0)
         place = np.where(there & (place <= layers), place, -1)
         order = order[: layers + 1]
-        own = place[:layers], np.where(lone, place[layers:], np.take_along_axis(place, np.maximum(before, 0), 0))
-        sides = np.stack([own[0].T, np.where(b.part >= 0, own[1], -1).T], 1)
+        placed = place[:layers], np.where(lone, place[layers:], np.take_along_axis(place, np.maximum(before, 0), 0))
+        sides = np.stack([placed[0].T, np.where(b.part >= 0, placed[1], -1).T], 1)
         part = np.where(there, np.concatenate([a.part, b.part]), -1)
         at = np.where((behind >= 0)[..., None], points[:, 0], inner[:, 0])
         at = np.concatenate([at, np.broadcast_to(inner[:, 1], (layers, *inner[:, 1].shape))])
@@ -370,7 +370,7 @@ class _Change(NamedTuple):
 
 def _numbers(part: np.ndarray) -> np.ndarray:
     """For layers (K, M), how many of the same part are in front."""
-    return np.stack([(part[:k] == own).sum(0) for k, own in enumerate(part)])
+    return np.stack([(part[:k] == layer).sum(0) for k, layer in enumerate(part)])
 
 
 def _sampled_slopes(found: _Intervals, layer: np.ndarray, gaps: _Lines, oracle: Oracle) -> np.ndarray:

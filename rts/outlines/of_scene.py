@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -57,12 +58,12 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         # Engines that compile eager operations anew for each shape pad them.
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
     xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
-    for part, (own, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        count = own.ids.shape[-2]
+    for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
+        count = of_cells.ids.shape[-2]
         rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
-        whole = in_one_table([own, extra])
+        whole = in_one_table([of_cells, extra])
         if engine_of(whole.ids).padded(whole.ids):
-            whole = _without_gaps(whole, own, xp.where(found.parts == part, found.rows, -1))
+            whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
         first += whole.ids.shape[-2]
     outlines = found.outlines(rows)
@@ -70,14 +71,14 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
 
 
-def _without_gaps(whole: Samples, own: Samples, beside: Array) -> Samples:
-    """Samples, those `own` of cells and then further ones, in which unused rows repeat one in use.
+def _without_gaps(whole: Samples, of_cells: Samples, beside: Array) -> Samples:
+    """Samples, those `of_cells` of cells and then further ones, in which unused rows repeat one in use.
 
     `beside` (B, R) holds the numbers of the further ones in use, or −1.
     """
-    xp, count, constant = namespace(whole.ids), own.ids.shape[-2], engine_of(whole.ids).constant
+    xp, count, constant = namespace(whole.ids), of_cells.ids.shape[-2], engine_of(whole.ids).constant
     rows = constant(np.arange(whole.ids.shape[-2], dtype=np.int32), whole.ids)
-    used, last = (xp.max(xp.concat([xp.reshape(x, (-1,)), 0 * rows[:1] - 1])) + 1 for x in (own.row, beside))
+    used, last = (xp.max(xp.concat([xp.reshape(x, (-1,)), 0 * rows[:1] - 1])) + 1 for x in (of_cells.row, beside))
     there = (rows < used) | ((rows >= count) & (rows < count + last))
     return taken_rows(whole, xp.where(there, rows, xp.where(used > 0, 0, count)))
 
@@ -86,14 +87,14 @@ def _found_on_host(
     sampled: Sampled, scene: Scene, grid: Grid, most: int | None, capacity: int | None, inputs: Tree
 ) -> tuple[Found, list[Samples]]:
     """`Points.found` by a call to the host, with room for `most` breaks; `inputs` as in `with_outlines`."""
-    owners, layers = [_tables(own) for own in sampled.samples], sampled.row.shape[0]
+    owners, layers = [_tables(samples) for samples in sampled.samples], sampled.row.shape[0]
     # Where a break has a pair, its last sample is there once more.
     rows = (columns(layers)[0] + 1) * (most or 0)
-    room = [_rooms(*own, rows, capacity) for own in zip(scene.parts, sampled.samples, strict=True)]
+    room = [_rooms(*pair, rows, capacity) for pair in zip(scene.parts, sampled.samples, strict=True)]
 
     def host(*arrays: np.ndarray) -> list[np.ndarray]:
-        given = iter(arrays)
-        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(given), inputs)
+        values = iter(arrays)
+        known = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), inputs)
         of_parts, whole, camera, cells = known
         own_parts = zip(scene.parts, of_parts, strict=True)
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
@@ -115,14 +116,14 @@ def _found_on_host(
 
     operands = [x for x in leaves(inputs) if type(x) is not np.ndarray]
     specs = Found.specs(most or 0, grid.size, real_of(scene), layers)
-    for own, rooms in zip(owners, room, strict=True):
-        for (kind, name), x in own.items():
+    for tables, rooms in zip(owners, room, strict=True):
+        for (kind, name), x in tables.items():
             dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
             count = rooms.get(name, rows) if kind == "tables" else rows
             specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
     results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
-    found = Found(*(next(results) for _ in Found._fields))
-    return found, [_with_tables(own, {name: next(results) for name in _tables(own)}) for own in sampled.samples]
+    found = Found(*islice(results, len(Found._fields)))
+    return found, [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]
 
 
 def real_of(scene: Scene) -> Any:
@@ -157,7 +158,7 @@ def _tables(samples: Samples) -> dict[tuple[str, str], Array]:
 
 def _with_tables(samples: Samples, arrays: dict[tuple[str, str], Array]) -> Samples:
     """Samples with other arrays of `_tables`."""
-    of = {kind: {name: x for (own, name), x in arrays.items() if own == kind} for kind in ("", "tables", "gbuffer")}
+    of = {kind: {name: x for (k, name), x in arrays.items() if k == kind} for kind in ("", "tables", "gbuffer")}
     gbuffer = None if samples.gbuffer is None else of["gbuffer"]
     return replace(samples, **of[""], tables=of["tables"], gbuffer=gbuffer)
 
@@ -166,7 +167,7 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
     """The cells of a scene whose parts have got further rows behind their own."""
     if sampled.one_part:
         return replace(sampled.cells, triangle=None)
-    row, counts = sampled.row, [own.ids.shape[-2] for own in sampled.samples]
+    row, counts = sampled.row, [before.ids.shape[-2] for before in sampled.samples]
     more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
     shift, engine = np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), engine_of(row)
     known = value_of(row)

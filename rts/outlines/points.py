@@ -41,32 +41,32 @@ def found_in_views(
     Samples of several views lie on triangles. They are one table for each part, view after view.
     """
     broken = each(lambda b: views[b].broken(layers[b], most), range(len(views)))
-    rows, samples = [np.full(own.parts.shape, -1, np.int32) for own in broken], []
+    rows, samples = [np.full(one.parts.shape, -1, np.int32) for one in broken], []
     while len(samples) < len(views[0].entries):
         part = len(samples)
         joint = views[0].joint(part)
         stop = part + 1 if joint is None else joint.stop
-        inside = [(own.parts >= part) & (own.parts < stop) for own in broken]
-        points = [own.points[here] for own, here in zip(broken, inside, strict=True)]
-        known = [own.triangles[here] for own, here in zip(broken, inside, strict=True)]
-        fragments = [view.on_sheets(part, *own) for view, *own in zip(views, points, known, strict=True)]
+        inside = [(one.parts >= part) & (one.parts < stop) for one in broken]
+        points = [one.points[here] for one, here in zip(broken, inside, strict=True)]
+        known = [one.triangles[here] for one, here in zip(broken, inside, strict=True)]
+        fragments = [view.on_sheets(part, *one) for view, *one in zip(views, points, known, strict=True)]
         together = None
         if None not in fragments:
             together = Fragments(*(np.concatenate(x, axis=2) for x in zip(*fragments, strict=True)))
         if joint is not None:  # In a single view.
             assert together is not None
             lifted = joint.lifted(together)
-            firsts = np.cumsum([0, *(len(own.ids) for own in lifted.samples)], dtype=np.int32)
+            firsts = np.cumsum([0, *(len(one.ids) for one in lifted.samples)], dtype=np.int32)
             samples += lifted.samples
             rows[0][inside[0]] = host_value(lifted.row)[0, 0] - firsts[broken[0].parts[inside[0]] - part]
             continue
-        numbers = np.concatenate([own.numbers[here] for own, here in zip(broken, inside, strict=True)])
-        own, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
+        numbers = np.concatenate([one.numbers[here] for one, here in zip(broken, inside, strict=True)])
+        one, numbers = views[0].of_layers(part, np.concatenate(points), numbers, together)
         ends = np.cumsum([len(x) for x in points])
-        samples.append(own)
-        for own, here, number in zip(rows, inside, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
-            own[here] = number
-    return [view.found(own, at, samples) for view, own, at in zip(views, broken, rows, strict=True)], samples
+        samples.append(one)
+        for one, here, number in zip(rows, inside, np.split(numbers[: ends[-1]], ends[:-1]), strict=True):
+            one[here] = number
+    return [view.found(one, at, samples) for view, one, at in zip(views, broken, rows, strict=True)], samples
 
 
 class _Broken(NamedTuple):
@@ -103,7 +103,7 @@ class Points:
     def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree]) -> Points:
         """The points of a grid; `inputs` of each part's proxy, on the host, are read where it has no entry."""
         parts, joints = [], {joint.first: joint for joint in scene.joints}
-        for index, (part, sampler, entry, own) in enumerate(
+        for index, (part, sampler, entry, part_inputs) in enumerate(
             zip(scene.parts, scene.samplers, scene.entries, inputs, strict=True)
         ):
             camera, sheets, joint = grid.camera.within(part.transform), None, joints.get(index)
@@ -113,7 +113,7 @@ class Points:
                 sheets = parts[-1][3]
             elif isinstance(sampler, TriangleSampler):
                 host = on_host(camera.for_size(grid.size))
-                entry = entry or entry_of(part, sampler, own, host, grid.size)
+                entry = entry or entry_of(part, sampler, part_inputs, host, grid.size)
                 if has_sheets(part, sampler):
                     sheets = Sheets.of(entry.proxy, host, grid.size, part.cull, index)
             parts.append((sampler, camera, entry, sheets))
@@ -140,9 +140,9 @@ class Points:
         place = ((breaks.place - first) * along).sum(-1)
         places = ((points - first[:, None]) * along[:, None]).sum(-1)
         entries = places[:, 2:] if layered else places[:, :0]
-        own = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
+        of_breaks = breaks.gap, places[:, :2], breaks.near, breaks.slope, breaks.ends
         segments = joined(breaks, layered)
-        return Found(rows, parts, sides, entries, place, *own, *segments, breaks.joined, np.int32(left))
+        return Found(rows, parts, sides, entries, place, *of_breaks, *segments, breaks.joined, np.int32(left))
 
     def _pairs(self, breaks: Breaks, samples: list[Samples]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs beside the deepest points of rays at breaks, rows (B, 2) of their parts, or −1; and these parts (B, 2).
@@ -151,19 +151,19 @@ class Points:
         """
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
-        for own, known in enumerate(self._parts):
-            at = np.flatnonzero(part == own)
-            surface, points, triangles = self._scene.parts[own].surface, breaks.points, breaks.triangles
+        for index, known in enumerate(self._parts):
+            at = np.flatnonzero(part == index)
+            surface, points, triangles = self._scene.parts[index].surface, breaks.points, breaks.triangles
             drawn = isinstance(known[0], TriangleSampler)
             if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
                 continue
             ending = at, breaks.near[at]
-            fragments = self.on_sheets(own, points[ending], triangles[ending]) if drawn else None
-            more = self.sample(own, points[ending], fragments, pairs=True)
+            fragments = self.on_sheets(index, points[ending], triangles[ending]) if drawn else None
+            more = self.sample(index, points[ending], fragments, pairs=True)
             if more.pair is not None:
                 found = host_value(more.pair).T
-                rows[at] = np.where(found >= 0, found + samples[own].ids.shape[-2], -1)
-            samples[own] = in_one_table([samples[own], more])
+                rows[at] = np.where(found >= 0, found + samples[index].ids.shape[-2], -1)
+            samples[index] = in_one_table([samples[index], more])
         return rows, np.column_stack([part, part]).astype(np.int32)
 
     def broken(self, layers: Fronts, most: int | None) -> _Broken:
@@ -177,9 +177,9 @@ class Points:
 
     def _breaks(self, layers: Fronts) -> tuple[Breaks, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """All breaks, and the other arrays of `_Broken`."""
-        every, opaque = [own for *_, own in self._parts], np.array(self._scene.opaque)
+        every, opaque = [sheet for *_, sheet in self._parts], np.array(self._scene.opaque)
         known, count = None not in every, len(layers.part)
-        sheets = list({id(own): own for own in every}.values())
+        sheets = list({id(sheet): sheet for sheet in every}.values())
         if count == 1 and known:
             breaks, stacks = breaks_of_triangles(Fronts(*(x[0] for x in layers)), sheets, self._width), None
         elif known:
@@ -212,10 +212,10 @@ class Points:
         if not most:
             return samples, row[0, :count]
         row = row[numbers, np.arange(count)]
-        used, own = np.unique(row, return_inverse=True)
+        used, index_of = np.unique(row, return_inverse=True)
         none = int(used[0] < 0)
         used = used[none:].astype(np.int32) if len(used) > none else np.zeros(1, np.int32)
-        return taken_rows(samples, engine_of(samples.row).constant(used, samples.row)), own.reshape(-1) - none
+        return taken_rows(samples, engine_of(samples.row).constant(used, samples.row)), index_of.reshape(-1) - none
 
     def sample(
         self,
@@ -255,8 +255,8 @@ class Points:
     def _layers(self, points: np.ndarray, count: int) -> Fronts:
         """The nearest `count` layers at points (M, 2), nothing behind an opaque one; of equal ones the first part's."""
         scene, none = self._scene, (count, len(points))
-        given = [part.theta for part in scene.parts], self._grid.camera
-        more = engine_of(*given).room(len(points), exemplar(*given)) - len(points)
+        arrays = [part.theta for part in scene.parts], self._grid.camera
+        more = engine_of(*arrays).room(len(points), exemplar(*arrays)) - len(points)
         padded = np.concatenate([points, np.repeat(points[:1], more, axis=0)])
         part, depth = np.full(none, -1, np.int32), np.full(none, np.inf)
         for index, opaque in enumerate(scene.opaque):
@@ -272,7 +272,7 @@ class Points:
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
     part = np.minimum(cells.row, np.int32(0))
-    for first in np.cumsum([own.ids.shape[-2] for own in samples])[:-1]:
+    for first in np.cumsum([one.ids.shape[-2] for one in samples])[:-1]:
         part += cells.row >= first
     triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
     assert cells.depth is not None
@@ -282,9 +282,9 @@ def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
 def _lit(layers: Fronts, opaque: np.ndarray) -> Fronts:
     """The surfaces seen at points (K, ...), without what lies behind an opaque layer."""
     part, hidden = layers.part.copy(), np.zeros(layers.part.shape[1:], np.bool_)
-    for own in part:
-        own[hidden] = -1
-        hidden |= (own >= 0) & opaque[own]
+    for layer in part:
+        layer[hidden] = -1
+        hidden |= (layer >= 0) & opaque[layer]
     return layers._replace(part=part, depth=np.where(part >= 0, layers.depth, 0.0))
 
 

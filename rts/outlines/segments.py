@@ -16,7 +16,7 @@ class Segments(NamedTuple):
     Attributes:
         square: (S, 2) int32.
         ties: (S, 2) int32.
-        side: (S, 2) int32.
+        square_sides: (S, 2) int32.
         beyond: (S, 2) int32.
         corner: (S, 2) float64.
         pull: (S, 4) float64.
@@ -24,7 +24,7 @@ class Segments(NamedTuple):
 
     square: np.ndarray
     ties: np.ndarray
-    side: np.ndarray
+    square_sides: np.ndarray
     beyond: np.ndarray
     corner: np.ndarray
     pull: np.ndarray
@@ -46,7 +46,7 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     begins = np.append(np.flatnonzero(np.diff(group[order], prepend=-1)), len(square))
     partner = np.full(len(square), -1, np.int32)
     loops.join(begins, ends, breaks.place, breaks.tangent, partner)
-    origin, ties, side = loops.segments_of(square, ends, partner, width)
+    origin, ties, square_sides = loops.segments_of(square, ends, partner, width)
     around = loops.beyond(ties, len(breaks.place))
     corner, pull = np.empty((len(ties), 2)), np.empty((len(ties), 4))
     ending = np.arange(len(breaks.near)), np.where(breaks.near == 1, 1, 0)
@@ -54,6 +54,8 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     triangle = np.where(
         triangle >= 0, triangle + part * (1 + triangle.max(initial=0)), -1
     )  # Of all parts, no two alike.
-    own = breaks.place, breaks.tangent, triangle
-    parallel(loops.corners, len(ties), origin, ties, side, around, *own, corner, pull, work=300 * len(ties))
-    return Segments(origin, ties, side, np.ascontiguousarray(around[:, 1:3]), corner, pull)
+    of_breaks = breaks.place, breaks.tangent, triangle
+    parallel(
+        loops.corners, len(ties), origin, ties, square_sides, around, *of_breaks, corner, pull, work=300 * len(ties)
+    )
+    return Segments(origin, ties, square_sides, np.ascontiguousarray(around[:, 1:3]), corner, pull)

@@ -141,7 +141,7 @@ def _read(first, n, step, partner):
 def segments_of(square, ends, partner, width):
     """First corners (S, 2), ties (S, 2) and sides (S, 2) of segments, int32; see `rts.contracts.records.Outlines`."""
     origin = np.empty((len(ends), 2), np.int32)
-    ties, side = np.full((len(ends), 2), -1, np.int32), np.full((len(ends), 2), -1, np.int32)
+    ties, square_sides = np.full((len(ends), 2), -1, np.int32), np.full((len(ends), 2), -1, np.int32)
     count = 0
     for e in range(len(ends)):
         other, sign = partner[e], ends[e, 2]
@@ -149,11 +149,11 @@ def segments_of(square, ends, partner, width):
         if other >= 0 and not (sign > 0 or (sign == 0 and (ends[other, 2] < 0 or (ends[other, 2] == 0 and e < other)))):
             continue
         origin[count, 0], origin[count, 1] = square[e] // width, square[e] % width
-        ties[count, 0], side[count, 0] = ends[e, 0], ends[e, 1]
+        ties[count, 0], square_sides[count, 0] = ends[e, 0], ends[e, 1]
         if other >= 0:
-            ties[count, 1], side[count, 1] = ends[other, 0], ends[other, 1]
+            ties[count, 1], square_sides[count, 1] = ends[other, 0], ends[other, 1]
         count += 1
-    return origin[:count], ties[:count], side[:count]
+    return origin[:count], ties[:count], square_sides[:count]
 
 
 @loop
@@ -172,16 +172,16 @@ def beyond(ties, count):
     found = np.full((len(ties), 4), -1, np.int32)
     for s in range(len(ties)):
         for e in range(2):
-            own = 2 * s + e
+            tie = 2 * s + e
             for far in range(2):
-                b = ties[own // 2, own % 2]
+                b = ties[tie // 2, tie % 2]
                 if b < 0:
                     break
-                next_ = at[b, 1] if at[b, 0] == own else at[b, 0]
+                next_ = at[b, 1] if at[b, 0] == tie else at[b, 0]
                 if next_ < 0:
                     break
-                own = next_ + 1 - 2 * (next_ % 2)  # Its other end.
-                found[s, (1 - far) if e == 0 else 2 + far] = ties[own // 2, own % 2]
+                tie = next_ + 1 - 2 * (next_ % 2)  # Its other end.
+                found[s, (1 - far) if e == 0 else 2 + far] = ties[tie // 2, tie % 2]
     return found
 
 
@@ -220,7 +220,7 @@ def _within(point, origin, s):
 
 
 @loop
-def corners(first, last, origin, ties, side, around, place, tangent, triangle, corner, pull):
+def corners(first, last, origin, ties, square_sides, around, place, tangent, triangle, corner, pull):
     """Fill `corner` (S, 2), from the square's first centre, and `pull` (S, 4) of segments; see `Outlines`.
 
     Where an outline turns at a segment alone, the lines before and after it meet in its corner. Where it turns as much
@@ -233,7 +233,7 @@ def corners(first, last, origin, ties, side, around, place, tangent, triangle, c
         last: the segment after the last.
         origin: (S, 2), y and x of the first corner of each square.
         ties: (S, 2).
-        side: (S, 2), see `segments_of`.
+        square_sides: (S, 2), see `segments_of`.
         around: (S, 4), the result of `beyond`.
         place: (B, 2), x and y of breaks.
         tangent: (B, 2), see `join`.
@@ -247,11 +247,11 @@ def corners(first, last, origin, ties, side, around, place, tangent, triangle, c
         for a in range(2):
             corner[s, a] = (start[a] + end[a]) / 2
         alone, on, back = 0.0, 0.0, 0.0
-        tip = ties[s, 1] >= 0 and side[s, 0] == side[s, 1]
+        tip = ties[s, 1] >= 0 and square_sides[s, 0] == square_sides[s, 1]
         if tip:
             a, b = ties[s, 0], ties[s, 1]
-            _inward(tangent[a], side[s, 0], way)
-            _inward(tangent[b], side[s, 1], sharp)
+            _inward(tangent[a], square_sides[s, 0], way)
+            _inward(tangent[b], square_sides[s, 1], sharp)
             tip = _meeting(start, way, end, -sharp, curve) and _within(curve, origin, s)
             share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
             for i in range(2):

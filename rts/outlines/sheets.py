@@ -73,8 +73,9 @@ class Sheets(NamedTuple):
         vertices, faces = read_only(proxy.vertices), read_only(proxy.faces, np.int32)
         rows, seen = pixel_rows(camera, size), np.empty((len(vertices), 2), np.float32)
         parallel(sheets_loops.projected, len(seen), vertices, rows, seen, work=10 * len(seen))
-        starts = np.cumsum([0, *(len(own.faces) for own in proxies or [proxy])], dtype=np.int32)
-        beyond, sides = [_beyond(own.faces) for own in proxies or [proxy]], np.zeros(len(faces) + 1, np.int8)
+        tables, sides = [x.faces for x in proxies or [proxy]], np.zeros(len(faces) + 1, np.int8)
+        starts = np.cumsum([0, *map(len, tables)], dtype=np.int32)
+        beyond = [_beyond(table) for table in tables]
         if proxies is not None:
             beyond = [np.where(x >= 0, x + start, x) for x, start in zip(beyond, starts, strict=False)]
         beyond = np.concatenate(beyond) if len(beyond) > 1 else beyond[0]
@@ -94,8 +95,8 @@ class Sheets(NamedTuple):
         from rts.outlines import silhouettes_loops
 
         mesh, count = (self.rows, self.vertices, self.faces), len(self.faces)
-        own = self.clip[0], self.keep, self.seen, self.beyond, self.sides
-        parallel(silhouettes_loops.meet, count, *mesh, *own, fronts.part, fronts.depth, width, met, work=10 * count)
+        seen_by = self.clip[0], self.keep, self.seen, self.beyond, self.sides
+        parallel(silhouettes_loops.meet, count, *mesh, *seen_by, fronts.part, fronts.depth, width, met, work=10 * count)
 
     def join(self, fronts: Fronts, met: np.ndarray, joined: np.ndarray) -> None:
         """Mark, in `joined` (2, H, W), the centres whose fronts, of one of the parts, a sheet joins to the next ones'.
@@ -105,8 +106,8 @@ class Sheets(NamedTuple):
         from rts.outlines import sheets_loops
 
         mesh, height = (self.seen, self.rows, self.vertices, self.faces, self.beyond), len(joined[0])
-        own = np.int32(self.parts.start), np.int32(self.parts.stop)
-        arguments = *map(read_only, fronts), own, *mesh, self.keep != 0, met, joined
+        part_range = np.int32(self.parts.start), np.int32(self.parts.stop)
+        arguments = *map(read_only, fronts), part_range, *mesh, self.keep != 0, met, joined
         parallel(sheets_loops.seams, height, *arguments, work=20 * joined[0].size)
 
     def spans(self, gaps: Gaps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -116,8 +117,8 @@ class Sheets(NamedTuple):
         close = np.empty(len(self.seen), np.int8)
         parallel(spans_loops.close, len(close), self.seen, gaps.around, close, work=3 * len(close))
         most, count = np.empty(len(self.faces), np.int32), len(self.faces)
-        own = self.faces, self.seen, self.sides, self.keep, close
-        parallel(spans_loops.most_spans, count, *own, gaps.rows, gaps.columns, most, work=10 * count)
+        of_triangles = self.faces, self.seen, self.sides, self.keep, close
+        parallel(spans_loops.most_spans, count, *of_triangles, gaps.rows, gaps.columns, most, work=10 * count)
         triangles = np.flatnonzero(most)
         most = most[triangles]
         begins = np.cumsum(most) - most

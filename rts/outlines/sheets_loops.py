@@ -135,7 +135,7 @@ def _touch(faces, t, s):
 
 
 @loop
-def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, beyond, one_sided, met, joined):
+def seams(first, last, part, triangle, depth, part_range, seen, rows, vertices, faces, beyond, one_sided, met, joined):
     """Mark neighbouring centres, in lines `first` to `last`, whose fronts are joined by a sheet of triangles.
 
     Args:
@@ -144,7 +144,7 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
         part: (H, W) int32, the parts seen at centres.
         triangle: (H, W) int32, and their triangles.
         depth: (H, W) float64.
-        own: the first part that the further arguments belong to, and the one after the last.
+        part_range: the first part that the further arguments belong to, and the one after the last.
         seen: (V, 2), see `projected`.
         rows: (4, 4), see `corners_of`.
         vertices: (V, 3) of the proxy.
@@ -157,7 +157,7 @@ def seams(first, last, part, triangle, depth, own, seen, rows, vertices, faces, 
     (height, width), corners = part.shape, np.empty((3, 4))
     for y in range(first, last):
         for x in range(width):
-            if not own[0] <= part[y, x] < own[1]:
+            if not part_range[0] <= part[y, x] < part_range[1]:
                 continue
             for axis in range(2):
                 dx, dy = 1 - axis, axis

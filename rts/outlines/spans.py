@@ -28,11 +28,11 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     from rts.outlines import spans_loops
 
     met = np.zeros((2, *fronts.part.shape), np.uint8)
-    for own in sheets:
-        own.meet(fronts, width, met)
+    for sheet in sheets:
+        sheet.meet(fronts, width, met)
     joined = np.zeros(met.shape, np.bool_)
-    for own in sheets:
-        own.join(fronts, met, joined)
+    for sheet in sheets:
+        sheet.join(fronts, met, joined)
     gaps = np.empty_like(joined)
     parallel(spans_loops.wanted, len(fronts.part), fronts.part, joined, met, gaps, work=2 * fronts.part.size)
     gap, whole, numbers = _breaks_in(gaps, fronts, sheets)
@@ -43,8 +43,10 @@ def breaks_of_triangles(fronts: Fronts, sheets: Sequence[Sheets], width: np.ndar
     triangles = whole[:, [4, 5, 6, 7]]
     triangles[np.tile(whole[:, 2:4] < 0, 2)] = -1
     ends, parts = whole[:, 8:] == 1, whole[:, 2:4]
-    own = points[:, 0], near, slope, ends, points[:, 1:3], points[:, 3:], parts, joined, triangles
-    return Breaks(gap, *own, tangents(near, slope, parts, whole[:, 4:6], points[:, 0], sheets))
+    tangent = tangents(near, slope, parts, whole[:, 4:6], points[:, 0], sheets)
+    return Breaks(
+        gap, points[:, 0], near, slope, ends, points[:, 1:3], points[:, 3:], parts, joined, triangles, tangent
+    )
 
 
 def _breaks_in(
@@ -77,7 +79,7 @@ def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarr
     """
     from rts.outlines import spans_loops
 
-    several = [own.spans(gaps) for own in sheets]
+    several = [sheet.spans(gaps) for sheet in sheets]
     names, spans, parts = several[0] if len(several) == 1 else (np.concatenate(x) for x in zip(*several, strict=True))
     begins, order = spans_loops.by_gap(names[:, 0], len(gaps.gap))
     return begins, names.take(order, 0), spans.take(order, 0), parts.take(order)
@@ -104,11 +106,11 @@ def crossings(
         width: the width of a cell at a depth: `width[0] + width[1] * depth`.
     """
     slopes, depth = np.zeros((len(near), 2, 2)), np.zeros(len(near))
-    for own in sheets:
+    for sheet in sheets:
         for side in (0, 1):
-            at = np.flatnonzero((near == 2) & own.holds(parts[:, side]))
+            at = np.flatnonzero((near == 2) & sheet.holds(parts[:, side]))
             if len(at):
-                found, slopes[at, side] = own.at(triangles[at, side], points[at])
+                found, slopes[at, side] = sheet.at(triangles[at, side], points[at])
                 depth[at] = found.depth[0, 0]
     difference = np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
     flat = ~(difference > 1e-4 * (width[0] + width[1] * depth))

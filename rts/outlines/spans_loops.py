@@ -493,9 +493,9 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, row
     pieces, starts, at = np.empty(most, np.int32), np.empty(most), 2 * begins[first] + 4 * first
     for g in range(first, last):
         a, b = begins[g], begins[g + 1]
-        own, triangles, of, end, depth = spans[a:b], names[a:b, 1], parts[a:b], ends[g], end_depth[g]
-        n = _fronts(own, triangles, of, end, depth, pieces, starts)
-        known = own, triangles, of, end, depth, pieces[:n], starts[:n]
+        covers, triangles, of, end, depth = spans[a:b], names[a:b, 1], parts[a:b], ends[g], end_depth[g]
+        n = _fronts(covers, triangles, of, end, depth, pieces, starts)
+        known = covers, triangles, of, end, depth, pieces[:n], starts[:n]
         rows[g], counts[g] = at, _breaks(known, whole[at:], numbers[at:])
         _inner(known, counts[g], inner, whole[at:], numbers[at:])
         whole[at : at + counts[g], 0] = g

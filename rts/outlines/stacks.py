@@ -41,8 +41,8 @@ def breaks_of_stacks(
     tangent = tangents(near, slope, samples[:, :2, 0], samples[:, :2, 1], at, sheets)
     last, stack = samples[:, :2], samples[:, 2:]
     triangles = np.concatenate([last[..., 1], last[..., 1]], 1)
-    ends, own = whole[:, 4:] == 1, (points[:, :2], points[:, :2], whole[:, 2:4])
-    breaks = Breaks(gap, at, near, slope, ends, *own, joined, triangles, tangent)
+    ends, last_points = whole[:, 4:] == 1, points[:, :2]
+    breaks = Breaks(gap, at, near, slope, ends, last_points, last_points, whole[:, 2:4], joined, triangles, tangent)
     numbers = np.zeros(samples.shape[:2], np.int32)
     return breaks, Stacks(last[..., 0], stack[..., 0], stack[..., 1], points[:, 2:], sides, numbers)
 
@@ -57,15 +57,15 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
         solid = (part >= 0) & opaque[part]
         ends.part[solid], ends.depth[solid] = part[solid], depth[solid]
     met, marks = np.zeros((2, *size), np.uint8), False
-    for own in sheets:
-        own.meet(ends, width, met)
+    for sheet in sheets:
+        sheet.meet(ends, width, met)
     for layer in range(len(layers.part)):
         front = Fronts(*(np.ascontiguousarray(x[layer]) for x in layers))
         if layer and not (front.part >= 0).any():
             break
         joined, wanted = np.zeros(met.shape, np.bool_), np.empty(met.shape, np.bool_)
-        for own in sheets:
-            own.join(front, met, joined)
+        for sheet in sheets:
+            sheet.join(front, met, joined)
         parallel(spans_loops.wanted, len(front.part), front.part, joined, met, wanted, work=2 * front.part.size)
         marks = marks | wanted
     return np.asarray(marks)

@@ -27,15 +27,15 @@ def _alike(spans, i, j, place):
 
 
 @compiled
-def _link(own, spans, parts, low, high, after, before):
-    """Fill `after` and `before` (n,), in the order of `own`: the span that each one goes on with, or −1."""
-    n = len(own)
+def _link(index, spans, parts, low, high, after, before):
+    """Fill `after` and `before` (n,), in the order of `index`: the span that each one goes on with, or −1."""
+    n = len(index)
     after[:n], before[:n] = -1, -1
     for i in range(n):
         for j in range(n):
-            if i == j or before[j] >= 0 or parts[own[i]] != parts[own[j]] or not high[j] > high[i]:
+            if i == j or before[j] >= 0 or parts[index[i]] != parts[index[j]] or not high[j] > high[i]:
                 continue
-            if abs(low[j] - high[i]) <= TOUCH and _alike(spans, own[i], own[j], high[i]):
+            if abs(low[j] - high[i]) <= TOUCH and _alike(spans, index[i], index[j], high[i]):
                 after[i], before[j] = j, i
                 break
 
@@ -62,12 +62,12 @@ def _hides(opaque, z, seen, depth, g, k):
 
 
 @compiled
-def _settle(head, tail, own, spans, parts, opaque, seen, depth, g, after, low, high):
+def _settle(head, tail, index, spans, parts, opaque, seen, depth, g, after, low, high):
     """Move the ends of a run that lie at a centre to the side that the samples there say; True if the run is real.
 
     A run that covers a centre with no sample there touches the line with an edge alone.
     """
-    part = parts[own[head]]
+    part = parts[index[head]]
     for k in range(2):
         centre = float(k)
         start, end = low[head], high[tail]
@@ -76,7 +76,7 @@ def _settle(head, tail, own, spans, parts, opaque, seen, depth, g, after, low, h
         i = head
         while high[i] < centre and after[i] >= 0:
             i = after[i]
-        z = depth_at(spans, own[i], centre)
+        z = depth_at(spans, index[i], centre)
         found = _listed(part, z, seen, depth, g, k)
         if start < centre - CLOSE and end > centre + CLOSE:
             if found == 0 and not _hides(opaque, z, seen, depth, g, k):
@@ -105,10 +105,10 @@ def _before(spans, i, j, place, until):
 
 
 @compiled
-def _insert(stack, count, i, own, spans, place, until):
+def _insert(stack, count, i, index, spans, place, until):
     """Insert a span into a stack by depth; returns its index."""
     at = count
-    while at > 0 and _before(spans, own[i], own[stack[at - 1]], place, until):
+    while at > 0 and _before(spans, index[i], index[stack[at - 1]], place, until):
         stack[at] = stack[at - 1]
         at -= 1
     stack[at] = i
@@ -123,32 +123,32 @@ def _remove(stack, count, at):
 
 
 @compiled
-def _seen(stack, at, most, own, parts, opaque):
+def _seen(stack, at, most, index, parts, opaque):
     """True if an entry of a stack is among the first, and nothing opaque is before it."""
     if at >= most:
         return False
     for m in range(at):
-        if opaque[parts[own[stack[m]]]]:
+        if opaque[parts[index[stack[m]]]]:
             return False
     return True
 
 
 @compiled
-def _partner(i, own, parts, place, ends, neighbour):
+def _partner(i, index, parts, place, ends, neighbour):
     """Another run of the same part that ends (or starts) where one does: a sheet turns away there; or −1.
 
     Their depths differ where triangles in between are seen from the side.
 
     Args:
         i: the span with which the run ends.
-        own: the gap's spans.
+        index: the gap's spans.
         parts: (N,).
         place: where it ends.
         ends: (n,), where spans end (or start).
         neighbour: (n,), what they go on with there, or −1.
     """
-    for j in range(len(own)):
-        if j != i and neighbour[j] < 0 and parts[own[j]] == parts[own[i]] and abs(ends[j] - place) <= TOUCH:
+    for j in range(len(index)):
+        if j != i and neighbour[j] < 0 and parts[index[j]] == parts[index[i]] and abs(ends[j] - place) <= TOUCH:
             return j
     return -1
 
@@ -164,11 +164,11 @@ def _meeting(spans, i, j, low, high):
 
 
 @compiled
-def _next_meeting(stack, count, own, spans, place, until):
+def _next_meeting(stack, count, index, spans, place, until):
     """The next place at which two neighbours in a stack pass through one another, and the first's index; or −1."""
     best, at = np.inf, -1
     for m in range(count - 1):
-        i, j = own[stack[m]], own[stack[m + 1]]
+        i, j = index[stack[m]], index[stack[m + 1]]
         z = depth_at(spans, i, until)
         if depth_at(spans, j, until) < z - MARGIN * abs(z):
             there = _meeting(spans, i, j, place, until)
@@ -180,7 +180,7 @@ def _next_meeting(stack, count, own, spans, place, until):
 @compiled
 def _record(e, kind, at, partner, place, stack, count, scene, result):
     """Fill in a change of the stack, but for the samples of what ends there; see `changes`."""
-    own, spans, names, parts, opaque = scene
+    index, spans, names, parts, opaque = scene
     whole, place_of, samples, places, sides = result
     most, entries = sides.shape[2], samples.shape[1] - 2
     whole[e, 1], place_of[e] = kind, place
@@ -191,10 +191,10 @@ def _record(e, kind, at, partner, place, stack, count, scene, result):
         i = stack[m]
         if n == entries:
             break
-        samples[e, 2 + n, 0], samples[e, 2 + n, 1] = parts[own[i]], names[own[i], 1]
-        places[e, 2 + n] = min(max(place, spans[own[i], 0]), spans[own[i], 1])
+        samples[e, 2 + n, 0], samples[e, 2 + n, 1] = parts[index[i]], names[index[i], 1]
+        places[e, 2 + n] = min(max(place, spans[index[i], 0]), spans[index[i], 1])
         n += 1
-        if opaque[parts[own[i]]] and not (kind < 2 and (m == at or m == partner)) and m > (at if kind == 2 else -1):
+        if opaque[parts[index[i]]] and not (kind < 2 and (m == at or m == partner)) and m > (at if kind == 2 else -1):
             break
     for side in range(2):
         k, whole[e, 2 + side] = 0, -1
@@ -212,15 +212,15 @@ def _record(e, kind, at, partner, place, stack, count, scene, result):
                 break
     # The surface that changes, and what is behind it: parts before and behind the break.
     if kind == 2:
-        whole[e, 2], whole[e, 3] = parts[own[stack[at]]], parts[own[stack[at + 1]]]
+        whole[e, 2], whole[e, 3] = parts[index[stack[at]]], parts[index[stack[at + 1]]]
     else:
-        whole[e, 2 + kind] = parts[own[stack[at]]]
+        whole[e, 2 + kind] = parts[index[stack[at]]]
         k = sides[e, 1 - kind, at] if at < most else -1
         whole[e, 3 - kind] = samples[e, 2 + k, 0] if k >= 0 else -1
 
 
 @compiled
-def _complete(base, f, found, g, enders, own, spans, names, parts, after, before, inner, result):
+def _complete(base, f, found, g, enders, index, spans, names, parts, after, before, inner, result):
     """Fill in the samples of what ends at a change: the last ones, and those that tell colours."""
     whole, place_of, samples, places, sides = result
     e, kind = base + f, whole[base + f, 1]
@@ -228,41 +228,41 @@ def _complete(base, f, found, g, enders, own, spans, names, parts, after, before
     place = place_of[e]
     if kind == 2:
         for side in range(2):
-            i = own[enders[f, side]]
+            i = index[enders[f, side]]
             samples[e, side, 0], samples[e, side, 1], places[e, side] = parts[i], names[i, 1], place
         return
     for n in range(2):
         i = enders[f, n]
         if i < 0:
             continue
-        x = own[i]
+        x = index[i]
         if kind == 0:
             end = min(max(place - LAST, spans[x, 0], 0.0), place)
             beside = place_of[e - 1] if f > 0 else 0.0
             inward = end - min(inner, max(end - beside, 0.0) / 2)
-            while spans[own[i], 0] > inward and before[i] >= 0:
+            while spans[index[i], 0] > inward and before[i] >= 0:
                 i = before[i]
-            inward = max(inward, min(spans[own[i], 0], end))
+            inward = max(inward, min(spans[index[i], 0], end))
         else:
             end = max(min(place + LAST, spans[x, 1], 1.0), place)
             beside = place_of[e + 1] if f + 1 < found else 1.0
             inward = end + min(inner, max(beside - end, 0.0) / 2)
-            while spans[own[i], 1] < inward and after[i] >= 0:
+            while spans[index[i], 1] < inward and after[i] >= 0:
                 i = after[i]
-            inward = min(inward, max(spans[own[i], 1], end))
+            inward = min(inward, max(spans[index[i], 1], end))
         if n == 0:
             samples[e, kind, 0], samples[e, kind, 1], places[e, kind] = parts[x], names[x, 1], end
         for k in range(2, samples.shape[1]):
             if samples[e, k, 0] == parts[x] and samples[e, k, 1] == names[x, 1]:
-                samples[e, k, 1], places[e, k] = names[own[i], 1], inward
+                samples[e, k, 1], places[e, k] = names[index[i], 1], inward
                 break
 
 
 @compiled
 def _note(kind, at, partner, place, stack, count, scene, found, base, enders, result):
     """Count a change of the stack, if it is seen, and fill it in if there is room in `enders`; returns the number."""
-    own, _, _, parts, opaque = scene
-    if not _seen(stack, at, result[4].shape[2], own, parts, opaque):
+    index, _, _, parts, opaque = scene
+    if not _seen(stack, at, result[4].shape[2], index, parts, opaque):
         return found
     if found < len(enders):
         _record(base + found, kind, at, partner, place, stack, count, scene, result)
@@ -274,9 +274,9 @@ def _note(kind, at, partner, place, stack, count, scene, found, base, enders, re
 @compiled
 def _cross(place, until, stack, count, scene, found, base, enders, result):
     """Record runs that pass through one another between two places; returns the number of changes."""
-    own, spans = scene[0], scene[1]
+    index, spans = scene[0], scene[1]
     for _ in range(count * count):
-        there, m = _next_meeting(stack, count, own, spans, place, until)
+        there, m = _next_meeting(stack, count, index, spans, place, until)
         if m < 0:
             break
         place = max(place, there)
@@ -289,7 +289,7 @@ def _cross(place, until, stack, count, scene, found, base, enders, result):
 def _end(place, stack, count, scene, runs, found, base, enders, result):
     """Take out runs that end, or go on with another span; returns the stack's height and the number of changes."""
     low, high, after, before, live, inside = runs
-    own, parts, m = scene[0], scene[3], 0
+    index, parts, m = scene[0], scene[3], 0
     while m < count:
         i = stack[m]
         while high[i] <= place and after[i] >= 0:
@@ -298,7 +298,7 @@ def _end(place, stack, count, scene, runs, found, base, enders, result):
         if high[i] > place:
             m += 1
             continue
-        other, partner = _partner(i, own, parts, place, high, after), -1
+        other, partner = _partner(i, index, parts, place, high, after), -1
         for k in range(count):
             partner = k if k != m and other >= 0 and stack[k] == other else partner
         front = m if partner < 0 else min(m, partner)
@@ -316,15 +316,15 @@ def _end(place, stack, count, scene, runs, found, base, enders, result):
 def _start(place, farther, stack, count, scene, runs, found, base, enders, result):
     """Put in the runs that start at a place; returns the stack's height and the number of changes."""
     low, high, after, before, live, inside = runs
-    own, spans, parts = scene[0], scene[1], scene[3]
-    for i in range(len(own)):
+    index, spans, parts = scene[0], scene[1], scene[3]
+    for i in range(len(index)):
         if not live[i] or inside[i] or before[i] >= 0 or low[i] > place or high[i] <= place:
             continue
-        front = _insert(stack, count, i, own, spans, low[i], min(farther, high[i]))
+        front = _insert(stack, count, i, index, spans, low[i], min(farther, high[i]))
         inside[i], count = True, count + 1
-        other, partner = _partner(i, own, parts, low[i], low, before), -1
+        other, partner = _partner(i, index, parts, low[i], low, before), -1
         if other >= 0 and live[other] and not inside[other]:
-            partner = _insert(stack, count, other, own, spans, low[i], min(farther, high[other]))
+            partner = _insert(stack, count, other, index, spans, low[i], min(farther, high[other]))
             inside[other], count = True, count + 1
             front, partner = (front, partner) if partner > front else (partner, front + 1)
         found = _note(1, front, partner, place, stack, count, scene, found, base, enders, result)
@@ -334,24 +334,24 @@ def _start(place, farther, stack, count, scene, runs, found, base, enders, resul
 @compiled
 def _fill_runs(g, scene, seen, depth, runs, knots):
     """Fill in the runs of a gap, and the places where spans start and end, in order; returns the number of places."""
-    own, spans, _, parts, opaque = scene
+    index, spans, _, parts, opaque = scene
     low, high, after, before, live, inside = runs
-    for i in range(len(own)):
-        low[i], high[i], live[i], inside[i] = spans[own[i], 0], spans[own[i], 1], False, False
-    _link(own, spans, parts, low, high, after, before)
-    for i in range(len(own)):
+    for i in range(len(index)):
+        low[i], high[i], live[i], inside[i] = spans[index[i], 0], spans[index[i], 1], False, False
+    _link(index, spans, parts, low, high, after, before)
+    for i in range(len(index)):
         if before[i] >= 0:
             continue
         tail, start, j = i, low[i], i
         while after[tail] >= 0:
             tail = after[tail]
         real = high[tail] - start >= SHORT
-        real = real and _settle(i, tail, own, spans, parts, opaque, seen, depth, g, after, low, high)
+        real = real and _settle(i, tail, index, spans, parts, opaque, seen, depth, g, after, low, high)
         while j >= 0:
             live[j] = real
             j = after[j]
     count = 0
-    for i in range(len(own)):
+    for i in range(len(index)):
         for place in (low[i], high[i]):
             if live[i] and 0 < place < 1:
                 knots[count], count = place, count + 1
@@ -402,8 +402,8 @@ def changes(
     """
     result = whole, place_of, samples, places, sides
     for g in range(first, last):
-        own = np.arange(begins[g], begins[g + 1])
-        n, scene = len(own), (own, spans, names, parts, opaque)
+        index = np.arange(begins[g], begins[g + 1])
+        n, scene = len(index), (index, spans, names, parts, opaque)
         low, high, after, before = np.empty(n), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
         live, inside = np.empty(n, np.bool_), np.empty(n, np.bool_)
         runs, stack, knots = (low, high, after, before, live, inside), np.empty(n + 1, np.int32), np.empty(2 * n + 1)
@@ -411,7 +411,7 @@ def changes(
         known, count, found, place = _fill_runs(g, scene, seen, depth, runs, knots), 0, 0, 0.0
         for i in range(n):
             if live[i] and low[i] <= 0 < high[i]:
-                _insert(stack, count, i, own, spans, 0.0, min(knots[0], high[i]))
+                _insert(stack, count, i, index, spans, 0.0, min(knots[0], high[i]))
                 inside[i], count = True, count + 1
         for k in range(known):
             found = _cross(place, knots[k], stack, count, scene, found, at[g], enders, result)
@@ -424,4 +424,4 @@ def changes(
             counts[g] = found
             continue
         for f in range(found):
-            _complete(at[g], f, found, g, enders, own, spans, names, parts, after, before, inner, result)
+            _complete(at[g], f, found, g, enders, index, spans, names, parts, after, before, inner, result)

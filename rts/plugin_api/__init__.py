@@ -1,4 +1,4 @@
-"""The toolkit of plugins: submodules that a plugin may import beside `rts`, each loaded when imported.
+"""The home of plugins: all that one imports, in submodules, each loaded when imported.
 
-`from rts.plugin_api.arrays import unit`, for example. `docs/plugins.md` lists the names of each submodule.
+`from rts.plugin_api.bases import Surface`, for example. `docs/plugins.md` lists the names of each submodule.
 """

@@ -111,7 +111,7 @@ def known_vertices(name: str, vertices: Any, faces: np.ndarray) -> np.ndarray:
         raise InputError(f"{name} is {quoted(vertices)}; expected (V, 3) numbers, at least one row")
     values = check_numbers(name, vertices, shape)
     if values is None:
-        raise InputError(f"{name} is traced; make the energy outside of jit and vmap, or give it NumPy arrays")
+        raise InputError(f"{name} is traced; make it outside of jit and vmap, or give it NumPy arrays")
     if faces.max() >= len(values):
         raise InputError(
             f"faces name vertex {faces.max()}, but there are {len(values)} vertices; check the indices (they count "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -12,10 +12,11 @@ from rts.arrays.array_functions import averaged
 from rts.arrays.engines import Context, constants, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.arrays.trees import Array
 from rts.contracts.checks import check_background, check_splatter
-from rts.contracts.records import Sampled
+from rts.contracts.records import Sampled, Splats
 from rts.contracts.splatter import Splatter
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
+from rts.rendering.outputs import Outputs, fronts_of
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_splats
@@ -39,6 +40,7 @@ def render(
     background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
+    outputs: Sequence[str] | None = None,
 ) -> Array:
     """Render a scene, differentiably in everything that is a torch or jax array.
 
@@ -62,14 +64,30 @@ def render(
             for breaks of outlines: 8 a row and a column of the grid, or `capacity` / 4 if that is more.
         engine: name of the engine to compute with, "torch" or "jax". Needed where all arrays are NumPy, but a shader
             holds a network. None for the engine of the arrays.
+        outputs: names of what to return, computed together; None for the image alone:
+
+            - "color" (H, W, C + 1): the image, as without `outputs`; the only one with the background in it.
+            - "alpha" (H, W, 1): what share of the pixel is covered.
+            - "depth" (H, W, 1): linear depth along the camera's axis, in world units.
+            - "normal" (H, W, 3): of unit length, world space, on the side that the surface says, not the camera's.
+            - "position" (H, W, 3): world space.
+            - "uv" (H, W, 2): 0 on parts without.
+            - the name of another attribute of the G-buffer, such as "uv_footprint": all parts must have it.
+            - "depth_front" (H, W, 1): the depth of the surface in front at the pixel's centre, without edges. With
+              another splatter than "edges" its derivative is that of the surface's point, which may leave the centre.
+            - "part", "triangle" (H, W, 1) int32: the indices of this part, and of its triangle; −1 where empty.
+
+            "depth", "normal", "position", "uv" and attributes are means over what is covered of a pixel. They have
+            derivatives at outlines as colours do, and are 0 in pixels of which less than a thousandth is covered.
 
     Returns:
         (H, W, 4) premultiplied linear RGBA, row 0 on top; (H, W, C + 1), alpha last, for shaders with C `channels`.
         The dtype is the widest floating one of the torch or jax arrays in parts and camera; in a scene of NumPy
         arrays, the widest in any θ; at least float32. Other NumPy arrays, such as a camera in float64, do not widen it.
+        With `outputs` a dict: name → array.
 
     Raises:
-        InputError: an argument is wrong; the scene cannot be rendered.
+        InputError: an argument is wrong; the scene cannot be rendered; there is no output of this name.
         EngineError: torch and jax arrays in one scene, or arrays on two devices.
         PluginError: a plugin cannot be imported, such as for want of a package.
 
@@ -81,9 +99,15 @@ def render(
             centres.
         LayersWarning: surfaces or light behind the last layer are left out.
     """
-    scene = Scene.of(parts, camera, sampler, engine)
+    scene, wanted = Scene.of(parts, camera, sampler, engine), None if outputs is None else Outputs(outputs)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
-    return image_over(scene.at(size), size, check_background(background, size, scene.channels), settings)
+    background = check_background(background, size, scene.channels)
+    scene = scene.at(size)
+    return (
+        image_over(scene, size, background, settings)
+        if wanted is None
+        else outputs_over(scene, size, background, settings, wanted)
+    )
 
 
 def image_over(scene: Scene, size: tuple[int, int], background: Array | None, settings: RenderSettings) -> Array:
@@ -92,20 +116,55 @@ def image_over(scene: Scene, size: tuple[int, int], background: Array | None, se
     return over_background(warned_if_empty(image_of(scene, size, context, settings), scene), background)
 
 
+def outputs_over(
+    scene: Scene, size: tuple[int, int], background: Array | None, settings: RenderSettings, outputs: Outputs
+) -> dict[str, Array]:
+    """The outputs of a checked scene, the colours over a checked background; see `render`."""
+    context = scene.context if is_constant(background) else scene.context_with(background)
+    widened, settings = outputs.of_scene(scene), outputs.of_settings(settings).of(scene)
+    splatter = settings.splatter
+    assert splatter is not None
+
+    def drawn(sampled: Sampled, window: Camera) -> tuple[Array, ...]:
+        splats = to_splats(sampled, widened.parts, widened.camera, window, context)
+        return image_of_splats(splatter, splats, sampled.supersample), *fronts_of(outputs.fronts, sampled, splats)
+
+    image, *fronts = _by_bands(widened, size, context, settings, drawn)
+    found = outputs.taken(warned_if_empty(image, scene), fronts, scene.channels)
+    if "color" in found:
+        found["color"] = over_background(found["color"], background)
+    return found
+
+
 def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The image (H, W, C + 1) of a checked scene, without a background; for `context` see `splatted`."""
     settings = settings.of(scene)
-    bands, splatter = settings.bands(size), settings.splatter
+    splatter = settings.splatter
     assert splatter is not None
+
+    def drawn(sampled: Sampled, window: Camera) -> tuple[Array, ...]:
+        return (splatted(sampled, scene, window, context, splatter),)
+
+    return _by_bands(scene, size, context, settings, drawn)[0]
+
+
+def _by_bands(
+    scene: Scene,
+    size: tuple[int, int],
+    context: Context,
+    settings: RenderSettings,
+    draw: Callable[[Sampled, Camera], tuple[Array, ...]],
+) -> tuple[Array, ...]:
+    """The arrays (H, W, ·) that `draw` makes of the samples of the image, drawn whole, or in bands that are joined."""
+    bands = settings.bands(size)
     if len(bands) == 1:
-        sampled = _sampled(scene, scene.camera, size, settings)
-        return splatted(sampled, scene, scene.camera, context, splatter)
-    images = []
+        return draw(_sampled(scene, scene.camera, size, settings), scene.camera)
+    drawn = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(_sampled, scene, window, (rows, size[1]), settings)
-        images.append(context.engine.checkpoint(take, lambda s, w=window: splatted(s, scene, w, context, splatter)))
-    return namespace(*images).concat(images)
+        drawn.append(context.engine.checkpoint(take, lambda s, w=window: draw(s, w)))
+    return tuple(namespace(*arrays).concat(arrays) for arrays in zip(*drawn, strict=True))
 
 
 def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
@@ -197,8 +256,14 @@ def splatted(sampled: Sampled, scene: Scene, window: Camera, context: Context, s
         context: the engine to compute with, and an exemplar of its constants.
         splatter: a splatter.
     """
-    image = cropped_image(splatter, to_splats(sampled, scene.parts, scene.camera, window, context))
-    return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
+    splats = to_splats(sampled, scene.parts, scene.camera, window, context)
+    return image_of_splats(splatter, splats, sampled.supersample)
+
+
+def image_of_splats(splatter: Splatter, splats: Splats, supersample: int) -> Array:
+    """The image (H, W, C + 1) of splats, `supersample`² cells a pixel."""
+    image = cropped_image(splatter, splats)
+    return image if supersample == 1 else averaged(image, supersample)
 
 
 def warned_if_empty(image: Array, scene: Scene, name: str = "the image") -> Array:

@@ -85,14 +85,16 @@ def sampled_scene(
     check_memory(height, width, settings.most_layers, capacity, gradient=scene.context.engine.differentiates)
     grid, outlines = Grid.sampled(scene, camera, (height, width), settings.apron), settings.finds_outlines
     scene = with_entries(scene, grid) if outlines else scene
-    scene = with_joints(scene, grid) if joins and capacity is None else scene
+    scene = with_joints(scene, grid) if joins and capacity is None and not settings.fronts else scene
     # Inside of one colour nothing depends on where a sample lies.
     uniform = one_shader and outlines and settings.layers == 1 and len(scene.parts) == 1 and scene.parts[0].uniform
-    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines, uniform=uniform))
+    uniform = uniform and not settings.fronts
+    taken = partial(_taken, scene, grid, Request(capacity, triangles=outlines or settings.fronts, uniform=uniform))
     layers = settings.layers
     sampled = with_all_layers(taken, all(scene.opaque)) if layers == "auto" else taken(layers)
     if outlines:
-        sampled = with_outlines(sampled, scene, grid, capacity)
+        triangle = sampled.triangle if settings.fronts else None
+        sampled = with_outlines(sampled, scene, grid, capacity).replace(triangle=triangle)
     return replace(sampled, supersample=factor, apron=settings.apron)
 
 

@@ -29,12 +29,15 @@ class RenderSettings:
         layers: K, or "auto".
         supersample: samples along each side of a pixel.
         capacity: rows to allot for the samples of a part; None for as many as there are.
+        fronts: whether outputs of the samples in front are asked for: each cell then has a sample of its own, and
+            triangles are told, counted by part.
     """
 
     splatter: Splatter | None
     layers: int | Literal["auto"]
     supersample: int
     capacity: int | None
+    fronts: bool = False
 
     @classmethod
     def checked(

@@ -7,62 +7,38 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from rts.arrays.array_functions import described, kind_of, shape_of
 from rts.arrays.engine_base import Engine
-from rts.arrays.engines import Context, engine_of, exemplar, is_constant, namespace
+from rts.arrays.engines import Context, is_constant
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.result_checks import check_shaded
 from rts.errors import InputError
-from rts.operations.linear import affine_map, affine_map_of_views
+from rts.rendering.part_transforms import OneTransform, ViewTransforms
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
+from rts.shading.tangents import TANGENT, tangents
 from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
-class ViewTransforms(NamedTuple):
-    """A transform for each of N samples, of parts in several views.
-
-    Attributes:
-        matrices: (B, 4, 4), world from local, of each view.
-        view: (N,) int32, the view of each sample; see `rts.operations.by_view`.
-    """
-
-    matrices: Array
-    view: Array
-
-    @classmethod
-    def of(cls, transforms: Sequence[Array | None], view: Array) -> ViewTransforms:
-        """The transforms of samples, from that of each view; None for the identity."""
-        known = [transform for transform in transforms if transform is not None]
-        like = exemplar(*known)
-        context = Context(engine_of(*known), like)
-        matrices = context.constants([np.eye(4) if transform is None else transform for transform in transforms])
-        return cls(namespace(*matrices).stack(matrices), view)
-
-    def points(self, points: Array) -> Array:
-        """Points (N, 3), moved."""
-        return affine_map_of_views(self.matrices[:, :3, :], points, self.view)
-
-    def normals(self, normals: Array) -> Array:
-        """Normals (N, 3), of any length, moved; see `_cofactors`."""
-        columns = _cofactors(*(self.matrices[:, :3, i] for i in range(3)))
-        xp = namespace(self.matrices)
-        return affine_map_of_views(xp.stack([*columns, xp.zeros_like(columns[0])], axis=-1), normals, self.view)
-
-
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
-    """The part's G-buffer at the samples, local space.
+    """The part's G-buffer at the samples, local space, with deferred tangents if it has "uv" but no "tangent".
 
     The samples' own G-buffer is taken, if they have one, where the surface's θ is constant and the G-buffer has all
     that the shader reads.
     """
+    gbuffer = _evaluated(part, samples, context)
+    if "uv" in gbuffer and "normal" in gbuffer and TANGENT not in gbuffer:
+        gbuffer.defer(TANGENT, lambda: tangents(part.surface, context.constants(part.read), samples, gbuffer, context))
+    return gbuffer
+
+
+def _evaluated(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
+    """The G-buffer of the part's surface at the samples; see `evaluate`."""
     theta = part.read
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.reads
@@ -232,33 +208,17 @@ def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBuffer:
-    """The G-buffer with positions and normals moved by the part's transform."""
+    """The G-buffer with positions, normals and tangents moved by the part's transform."""
     if transform is None:
         return gbuffer
     world = GBuffer()
     world.like = gbuffer.like
     for name in gbuffer:
         world.defer(name, lambda name=name: gbuffer[name])
-    if isinstance(transform, ViewTransforms):
-        points, normals = transform.points, transform.normals
-    else:
-        points, normals = partial(affine_map, transform[:3, :]), partial(_move_normals, transform)
-    world.defer("position", lambda: points(gbuffer["position"]))
+    moves = transform if isinstance(transform, ViewTransforms) else OneTransform(transform)
+    world.defer("position", lambda: moves.points(gbuffer["position"]))
     if "normal" in gbuffer:
-        world.defer("normal", lambda: normals(gbuffer["normal"]))
+        world.defer("normal", lambda: moves.normals(gbuffer["normal"]))
+    if TANGENT in gbuffer:
+        world.defer(TANGENT, lambda: moves.tangents(gbuffer[TANGENT]))
     return world
-
-
-def _move_normals(transform: Array, normals: Array) -> Array:
-    """Normals (N, 3), of any length, under an affine map: times the cofactor matrix; a mirror keeps them outward."""
-    columns = _cofactors(*(transform[:3, i] for i in range(3)))
-    return sum(normals[:, i : i + 1] * columns[i] for i in range(3))
-
-
-def _cofactors(a: Array, b: Array, c: Array) -> list[Array]:
-    """The columns (..., 3) of the cofactor matrix of one with columns (..., 3), times the sign of its determinant."""
-    xp = namespace(a)
-    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    volume = xp.sum(a * cofactors[0], axis=-1, keepdims=True)
-    outside = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
-    return [own * outside for own in cofactors]

@@ -58,7 +58,7 @@ def splats_of(
     sampled: Sampled, parts: Sequence[CheckedPart], positions: Array, rgba: Array, context: Context, border: int = 0
 ) -> Splats:
     """The splats of samples with these positions and colours."""
-    cells = replace(sampled.cells, depth=None)
+    cells = replace(sampled.cells, depth=None, triangle=None)
     outlines = context_of(positions, rgba).constants(sampled.outlines)
     if not context.engine.owns(rgba):
         cells = context_of(positions, rgba).constants(cells)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,8 +150,8 @@ class HostCall:
         matrices = [m for camera in self._cameras for m in (camera.view, camera.projection)]
         operands = *matrices, *self._transform, *arrays, *leaves(self._inputs)
         results = iter(self._engine.call_host(host, specs, *operands))
-        ids, params, row, depth, overflow = (next(results) for _ in sample_specs)
-        more, filled, attributes = ({name: next(results) for name in x} for x in (beside, tables, self._attributes))
+        ids, params, row, depth, overflow = islice(results, len(sample_specs))
+        more, filled, attributes = (dict(zip(x, results, strict=False)) for x in (beside, tables, self._attributes))
         found = Samples(
             ids,
             params,

@@ -19,8 +19,8 @@ TRACED_LAYERS = {True: 2, False: 4}
 
 
 def planned(layers: int | Literal["auto"]) -> int:
-    """The number of layers to plan memory for: K, or 4 while "auto" has not found a number."""
-    return 4 if layers == "auto" else int(layers)
+    """The number of layers to plan memory for: K, or that of traced values while "auto" has not found one."""
+    return TRACED_LAYERS[False] if layers == "auto" else int(layers)
 
 
 def with_all_layers(taken: Callable[[int], Sampled], opaque: bool) -> Sampled:

@@ -1,4 +1,4 @@
-"""The bounding sphere of a scene, and a camera that sees all of it."""
+"""The bounding sphere of parts, and a camera that sees all of it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FARTHEST = 1e9
 
 
 class Bounds(NamedTuple):
-    """A sphere around a scene, world space.
+    """A sphere around parts, world space.
 
     Attributes:
         center: (3,) middle of the bounding box.
@@ -68,7 +68,7 @@ def orbit(
     azimuth: float,
     elevation: float,
     distance: float | None = None,
-    fov: float = 40.0,
+    fov: float = 45.0,
     up: str = "y",
 ) -> Camera:
     """A camera on a sphere around an object, looking at its centre.

@@ -27,7 +27,7 @@ class View:
         size: (height, width) of the image, pixels; needed where `image` is a function.
         name: the picture's name in its file.
         mask: (H, W) float32 from 0 to 1, 1 where the picture counts; or a function that returns it; None for all of it.
-        near: the depth at which the scene begins, in the units of the camera; None where that is not known.
+        near: the depth at which what is seen begins, in the units of the camera; None where that is not known.
         far: the depth at which it ends, or None.
         path: the file of the picture, or None.
         lens: the lens that took the picture in `path`, for images of this size; None for one that does not distort.

@@ -5,9 +5,7 @@ A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. Entries of 
     "color" (3,) or (4,)             factor on the base colour
     "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
                                      over gbuffer["uv_footprint"] by shaders with `mip=True`
-    "light"                          dict of "direction" (3,) or (L, 3) towards the light, world space, by default from
-                                     above the camera's left shoulder; "color" (3,) or (L, 3), by default 0.8;
-                                     "ambient" () or (3,), by default 0.2
+    "light"                          see `rts.shading.light`
     "specular" () or (3,)            of `blinn_phong`: the highlight's strength, by default 0.3
     "shininess" ()                   of `blinn_phong`: its exponent, by default 32
     "depth_range" (2,)               of `depth`: the depths of black and white; default the near and far planes
@@ -30,13 +28,11 @@ from rts.errors import InputError
 from rts.plugin_base import promised
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
+from rts.shading.light import light_of
 from rts.shading.textures import WRAPS, sample_texture
-from rts.shading.theta_entries import check_base, check_entry, entry_of
+from rts.shading.theta_entries import check_base, entry_of
 from rts.shading.uv_footprints import FOOTPRINT
 
-DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
-LIGHT_ENTRIES = ("direction", "color", "ambient")
-DEFAULT_LIGHT = (-0.3, 0.5, 0.81)  # In camera space.
 DEFAULT_SPECULAR, DEFAULT_SHININESS = 0.3, 32.0
 
 
@@ -125,13 +121,13 @@ class Unlit(Shader):
         position = gbuffer["position"]
         xp = namespace(position)
         if "texture" in theta and "uv" in gbuffer:
-            footprint, texture = gbuffer[FOOTPRINT] if self.mip else None, theta["texture"]
+            texture = theta["texture"]
             # Averages are of visible colours: transparent texels count by their alpha.
             weighed = self.mip and not self.opaque and shape_of(texture)[-1] == 4
             texture = (
                 xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1) if weighed else texture
             )
-            base = sample_texture(texture, gbuffer["uv"], self.wrap, footprint)
+            base = self.looked_up(texture, gbuffer)
             check_base("theta['texture']", base)
             if weighed:
                 alpha = base[:, 3:]
@@ -149,6 +145,10 @@ class Unlit(Shader):
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
         return color, alpha
+
+    def looked_up(self, texture: Array, gbuffer: GBuffer) -> Array:
+        """A texture (h, w, C) at the samples (N, C), with the options of this shader."""
+        return sample_texture(texture, gbuffer["uv"], self.wrap, gbuffer[FOOTPRINT] if self.mip else None)
 
     def premultiplied(self, color: Array, alpha: Array) -> Array:
         """Premultiplied (N, 4) of colour (N, 3) and alpha (N, 1); an opaque shader takes 1 for alpha."""
@@ -180,13 +180,14 @@ class Lambert(Unlit):
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
-        normal, behind = unit(gbuffer["normal"]), _is_behind(gbuffer, camera)
+        normal, behind = unit(gbuffer["normal"]), is_behind(gbuffer, camera)
         xp = namespace(color)
-        shade, lights = _lit(theta, camera)
-        for direction, brightness in lights:
+        light = light_of(theta, camera)
+        shade = light.diffuse(xp.where(behind, -normal, normal)) if light.directed else light.diffuse(normal)
+        for direction, brightness in light.lamps(gbuffer["position"]):
             cosine = dot(normal, direction)
-            shade = shade + _positive(xp.where(behind, -cosine, cosine)) * brightness
-        return self.premultiplied(xp.clip(color * shade, 0.0, 1.0), alpha)
+            shade = shade + positive(xp.where(behind, -cosine, cosine)) * brightness
+        return self.premultiplied(color * shade, alpha)
 
 
 @dataclass(frozen=True)
@@ -201,17 +202,18 @@ class BlinnPhong(Unlit):
         color, alpha = self.base_color(theta, gbuffer)
         normal, toward = facing_normals(gbuffer, camera)
         xp = namespace(color)
-        shade, lights = _lit(theta, camera)
+        light = light_of(theta, camera)
+        shade = light.diffuse(normal)
         specular = entry_of(theta, "specular", (), (1,), (3,)) if "specular" in theta else DEFAULT_SPECULAR
         shininess = entry_of(theta, "shininess", (), (1,)) if "shininess" in theta else DEFAULT_SHININESS
         highlight = xp.zeros_like(color)
-        for direction, brightness in lights:
+        for direction, brightness in light.lamps(gbuffer["position"]):
             cosine = dot(normal, direction)
-            shade = shade + _positive(cosine) * brightness
+            shade = shade + positive(cosine) * brightness
             # A power of zero has an infinite derivative for exponents below one, and a NaN one in its exponent.
             half = xp.clip(dot(normal, unit(direction + toward)), 1e-6, 1.0)
             highlight = highlight + xp.where(cosine > 0, half**shininess, 0 * half) * brightness
-        return self.premultiplied(xp.clip(color * shade + specular * highlight, 0.0, 1.0), alpha)
+        return self.premultiplied(color * shade + specular * highlight, alpha)
 
 
 def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array, Array]:
@@ -220,7 +222,7 @@ def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array
     return namespace(normal).where(dot(normal, toward) < 0, -normal, normal), toward
 
 
-def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
+def is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
     """(N, 1) bool, true where a sample's normal points away from the viewer; without derivative."""
     arrays = gbuffer["position"], gbuffer["normal"], camera
     engine = engine_of(arrays)
@@ -228,46 +230,7 @@ def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
     return dot(normal, camera.toward(position)) < 0
 
 
-def _lit(
-    theta: Mapping[str, Tree], camera: Camera | RowCameras
-) -> tuple[Array | float, list[tuple[Array, Array | float]]]:
-    """The ambient light; for each other light the unit vector towards it, (3,) or (N, 3), and its colour."""
-    light = theta.get("light", {})
-    if not isinstance(light, Mapping):
-        raise InputError(f"theta['light'] is a {type(light).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
-    for name, value in light.items():
-        if name not in LIGHT_ENTRIES:
-            raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(LIGHT_ENTRIES)}")
-        shape = shape_of(value)
-        if name == "ambient":
-            check_entry("['light']['ambient']", value, "() or (3,)", shape in ((), (1,), (3,)))
-        else:
-            ok = len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0
-            check_entry(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
-    colors = [DEFAULT_DIFFUSE]
-    if "color" in light:
-        colors = _separate_vectors(light["color"])
-    if "direction" in light:
-        vectors = value_of(light["direction"])
-        if vectors is not None and not vectors.any(axis=-1).all():
-            raise InputError("theta['light']['direction'] is zero; expected vectors towards the lights, of any length")
-        directions = _separate_vectors(unit(light["direction"]))
-    else:
-        directions = [camera.to_world(DEFAULT_LIGHT)]
-    if len(colors) not in (1, len(directions)):
-        raise InputError(f"theta['light'] has {len(directions)} directions but {len(colors)} colors")
-    if len(colors) == 1:
-        colors *= len(directions)
-    return light.get("ambient", DEFAULT_AMBIENT), list(zip(directions, colors, strict=True))
-
-
-def _separate_vectors(vectors: Array) -> list[Array]:
-    """The vectors (3,) of an array (3,) or (L, 3)."""
-    vectors = namespace(vectors).reshape(vectors, (-1, 3))
-    return [vectors[i, :] for i in range(vectors.shape[0])]
-
-
-def _positive(x: Array) -> Array:
+def positive(x: Array) -> Array:
     """The array with zeros in place of negative numbers, which have no derivative there."""
     return namespace(x).where(x > 0, x, 0 * x)  # NaN stays NaN.
 

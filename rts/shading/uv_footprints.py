@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import constants, namespace, stopped
 from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
-from rts.errors import InputError
 from rts.operations.linear import affine_map
 from rts.scene.camera import Camera
+from rts.shading.parameter_steps import check_two_parameters, steps_beside
 
 FOOTPRINT = "uv_footprint"
 """Name of the attribute in the G-buffer."""
@@ -51,11 +49,7 @@ def uv_footprint(
     Raises:
         InputError: samples have another number of parameters than two.
     """
-    if samples.params.shape[-1] != 2:
-        raise InputError(
-            f"{surface!r} has {samples.params.shape[-1]} parameters a sample; expected two: without them "
-            f"{FOOTPRINT!r}, which mipmaps need, is not known"
-        )
+    check_two_parameters(surface, samples, FOOTPRINT, "mipmaps")
     arrays = theta, camera, gbuffer["position"], gbuffer["uv"], samples.params
     theta, camera, position, uv, params = (stopped(constants(x, engine, like)) for x in arrays)
     xp = namespace(position)
@@ -63,15 +57,11 @@ def uv_footprint(
     pixel = affine_map(rows, position)
     linear = xp.concat([rows[:, :3], xp.zeros_like(rows[:, 3:])], axis=1)
     moves, changes = [], []
-    for i in range(2):
-        axis = engine.constant(surface.param_step * np.eye(2)[i : i + 1], params)
-        # A step towards the middle stays on the patch.
-        steps = xp.where(params < 0.5, axis, -axis)
-        beside = surface.evaluate(theta, replace(samples, params=params + steps))
-        offset = affine_map(linear, beside["position"] - position)
+    for moved, change in steps_beside(surface, theta, replace(samples, params=params), position, uv):
+        offset = affine_map(linear, moved)
         # The derivative of (p₀, p₁) / p₂.
         moves.append((offset[:, :2] * pixel[:, 2:3] - pixel[:, :2] * offset[:, 2:3]) / _safe(pixel[:, 2:3] ** 2))
-        changes.append(beside["uv"] - uv)
+        changes.append(change)
     (ax, ay), (bx, by) = ((m[:, 0:1], m[:, 1:2]) for m in moves)
     # Where the surface is seen edge-on, the determinant is zero, and uv changes without bound.
     determinant = _safe(ax * by - ay * bx)

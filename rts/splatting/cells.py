@@ -22,10 +22,10 @@ def check_rows(row: Array, count: int, name: str = "row") -> None:
 
 
 def nothing(rgba: Array, row: Array) -> Array:
-    """The image (H, W, 4) of no samples: zeros. An InputError if `row` (K, H, W) names a sample."""
+    """The image (H, W, C) of no samples: zeros. An InputError if `row` (K, H, W) names a sample."""
     check_rows(row, 0)
     xp = namespace(rgba, row)
-    return xp.stack([xp.zeros_like(row[0], dtype=rgba.dtype)] * 4, axis=-1)
+    return xp.stack([xp.zeros_like(row[0], dtype=rgba.dtype)] * rgba.shape[1], axis=-1)
 
 
 def unpack(values: Array, cells: Array) -> Array:
@@ -36,5 +36,5 @@ def unpack(values: Array, cells: Array) -> Array:
 
 
 def over(front: Array, back: Array) -> Array:
-    """`front` composited over `back`, both premultiplied RGBA (…, 4) (Porter and Duff 1984)."""
-    return front + (1 - front[..., 3:]) * back
+    """`front` composited over `back`, both premultiplied (…, C), alpha last (Porter and Duff 1984)."""
+    return front + (1 - front[..., -1:]) * back

@@ -22,8 +22,9 @@ LOST = 0.01
 def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     """The image (h, w, C + 1) of splats, the border cut off.
 
-    Channels depend on alpha, but not on one another. So the splatter makes one image of every three channels and alpha,
-    filled up with zeros. The alpha of the first image is returned. Warns of light that translucent samples lose.
+    Channels depend on alpha, but not on one another. So a splatter that takes no others makes one image of every three
+    channels and alpha, filled up with zeros. The alpha of the first image is returned. Warns of light that translucent
+    samples lose.
 
     Args:
         splatter: a splatter.
@@ -36,7 +37,7 @@ def cropped_image(splatter: Splatter, splats: Splats) -> Array:
     if not splats.opaque:
         _warn_of_lost_light(splatter, splats)
     count = shape_of(rgba)[1] - 1
-    if count == GROUP:
+    if count == GROUP or promised(splatter, "any_channels"):
         return _cropped(splatter, splats)
     xp, alpha, images = namespace(rgba), rgba[:, count:], []
     for first in range(0, count, GROUP):
@@ -72,9 +73,9 @@ def _warn_of_lost_light(splatter: Splatter, splats: Splats) -> None:
 
 
 def _cropped(splatter: Splatter, splats: Splats) -> Array:
-    """The image (h, w, 4) of splats with colours (N, 4), the border cut off."""
+    """The image (h, w, C + 1) of splats with colours (N, C + 1), the border cut off."""
     image = splatter.cropped(splats)
-    expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), GROUP + 1
+    expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), shape_of(splats.rgba)[1]
     if shape_of(image) != expected:
         raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
     return image

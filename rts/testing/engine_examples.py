@@ -26,7 +26,7 @@ def numbers(*shape: int, seed: int = 0) -> np.ndarray:
 IDS = np.array([(0, 2, 1), (3, 3, 0), (1, 2, 3), (2, 0, 1), (0, 1, 3), (3, 2, 2)], np.int32)
 WITH_DIVISOR = numbers(4, 4)
 WITH_DIVISOR[2, 3] += 6
-STEPS = LargeSteps(IDS, 4, 0.3)
+STEPS = LargeSteps(np.zeros((4, 3)), IDS, 0.3)
 
 OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
     "matmul": (matmul, [numbers(4, 4), numbers(4, 4, seed=1)]),

@@ -30,7 +30,7 @@ class ShaderConformance(Conformance):
     """Checks of a shader.
 
     Override the fixture `shader`: its name, an object or a function; `theta` if it reads entries of θ; and `gbuffer` if
-    it reads entries other than position, normal, uv and color.
+    it reads entries other than position, normal, uv, tangent and color.
     """
 
     @pytest.fixture
@@ -51,19 +51,23 @@ class ShaderConformance(Conformance):
     # ------------------------------------------------------------------------------------------- values
 
     def test_it_gives_a_premultiplied_color_for_each_sample(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Colours are (N, 4) in the G-buffer's dtype, within [0, 1], and none is above alpha.
+        """Colours are (N, 4) in the G-buffer's dtype: alpha from 0 to 1, colours from 0 on, and 0 where alpha is.
 
-        A shader with other `channels` gives (N, C + 1), of which only alpha must be within [0, 1].
+        A shader with other `channels` gives (N, C + 1), and numbers below 0, too.
         """
         rgba = _shaded(shader, theta, gbuffer)
         expected = ROWS, _instance(shader).channels + 1
         claim(rgba.shape == expected, f"the shader returned {rgba.shape}; expected {expected}")
         claim(rgba.dtype == np.float32, f"the shader returned {rgba.dtype} for float32; expected float32")
-        rgba = rgba if expected[1] == 4 else rgba[:, -1:]
-        low, high = rgba.min(), rgba.max()
-        claim(low >= -TOLERANCE and high <= 1 + TOLERANCE, f"colours run from {low:.3g} to {high:.3g}; expected 0 to 1")
-        above = (rgba[:, :-1] - rgba[:, -1:]).max(initial=0)
-        claim(above <= TOLERANCE, f"a colour exceeds its alpha by {above:.3g}; multiply colours by alpha")
+        alpha, least = rgba[:, -1], rgba[:, :-1].min()
+        low, high = alpha.min(), alpha.max()
+        claim(low >= -TOLERANCE and high <= 1 + TOLERANCE, f"alpha runs from {low:.3g} to {high:.3g}; expected 0 to 1")
+        claim(expected[1] != 4 or least >= -TOLERANCE, f"a colour is {least:.3g}; expected none below 0")
+        if gbuffer.get("color", rgba[:, :3]).shape[1] == 4:
+            clear = {**gbuffer, "color": gbuffer["color"] * np.array([1, 1, 1, 0], np.float32)}
+            rgba = _shaded(shader, theta, clear)
+            seen = np.abs(rgba[rgba[:, -1] == 0, :-1]).max(initial=0)
+            claim(seen <= TOLERANCE, f"a colour is {seen:.3g} where alpha is 0; multiply colours by alpha")
 
     def test_samples_are_shaded_one_by_one(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A sample's colour depends neither on the order of samples nor on the other samples."""
@@ -206,12 +210,16 @@ def random_gbuffer() -> dict[str, np.ndarray]:
     """Usual entries of the G-buffer, at random points about the origin."""
     rng = np.random.default_rng(0)
     normal = rng.standard_normal((ROWS, 3))
-    return {
-        "position": rng.uniform(-0.8, 0.8, (ROWS, 3)).astype(np.float32),
-        "normal": (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32),
-        "uv": rng.uniform(0.02, 0.98, (ROWS, 2)).astype(np.float32),
-        "color": rng.uniform(0, 1, (ROWS, 4)).astype(np.float32),
+    gbuffer = {
+        "position": rng.uniform(-0.8, 0.8, (ROWS, 3)),
+        "normal": normal / np.linalg.norm(normal, axis=1, keepdims=True),
+        "uv": rng.uniform(0.02, 0.98, (ROWS, 2)),
+        "color": rng.uniform(0, 1, (ROWS, 4)),
     }
+    across = np.cross(normal, rng.standard_normal((ROWS, 3)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    gbuffer["tangent"] = np.concatenate([across, np.sign(rng.standard_normal((ROWS, 1)))], axis=1)
+    return {name: value.astype(np.float32) for name, value in gbuffer.items()}
 
 
 def awkward(gbuffer: dict) -> dict:

@@ -16,6 +16,7 @@ from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.rendering.shade import evaluate, split_by_view
 from rts.rendering.splats import concatenated
+from rts.shading.tangents import TANGENT
 
 
 class Evaluated(NamedTuple):
@@ -50,7 +51,9 @@ class Evaluated(NamedTuple):
         pieces = []
         if samples.gbuffer is not None:  # Of constant surfaces.
             whole = GBuffer(samples.gbuffer)
-            return cls(_of_all(parts, [whole]), transforms, whole, None)
+            if not ("uv" in whole and any(part is not None and _reads_tangents(part) for part in parts)):
+                return cls(_of_all(parts, [whole]), transforms, whole, None)
+            samples = replace(samples, gbuffer=None)  # Tangents are made by the surface of each view.
         for part, ids, params in zip(parts, *rows, strict=True):
             of_view = replace(samples, ids=ids, params=params)
             if part is None or not ids.shape[0]:
@@ -72,6 +75,11 @@ class Evaluated(NamedTuple):
     def split(self, samples: Samples, counts: np.ndarray, engine: Engine) -> list[tuple[Samples, GBuffer]]:
         """The samples and the G-buffer of each view."""
         return self.pieces or split_by_view(samples, self.gbuffer, counts.tolist(), engine)
+
+
+def _reads_tangents(part: CheckedPart) -> bool:
+    """True if the part's shader may read tangents."""
+    return part.reads is None or TANGENT in part.reads
 
 
 def _of_all(parts: Sequence[CheckedPart | None], gbuffers: Sequence[GBuffer]) -> CheckedPart | None:

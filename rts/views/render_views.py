@@ -17,7 +17,8 @@ from rts.contracts.checks import check_background
 from rts.contracts.records import Sampled
 from rts.errors import InputError
 from rts.rendering.arguments import BackgroundLike, Layers, SamplerLike, SplatterLike
-from rts.rendering.image import image_of, over_background, splatted, warned_if_empty
+from rts.rendering.image import image_of, outputs_over, over_background, splatted, warned_if_empty
+from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
@@ -48,6 +49,7 @@ def render_views(
     background: BackgroundLike = None,
     capacity: int | None = None,
     engine: str | None = None,
+    outputs: Sequence[str] | None = None,
 ) -> Array:
     """Render several views, of one scene or of a scene each. Images equal a loop of `render` up to rounding.
 
@@ -75,9 +77,10 @@ def render_views(
         background: as in `render`, of every view; or (B, H, W, ·), one for each.
         capacity: as in `render`; of each view.
         engine: as in `render`.
+        outputs: as in `render`. With an output of the sample in front, views are rendered one after another.
 
     Returns:
-        (B, H, W, 4), as in `render`.
+        (B, H, W, 4), as in `render`; with `outputs` a dict: name → array (B, H, W, ·).
 
     Raises:
         InputError: an argument is wrong; the scene cannot be rendered.
@@ -88,7 +91,7 @@ def render_views(
         EmptyImageWarning: nothing is seen in a view; the warning says why.
         AspectWarning: a camera is for images of another ratio of width to height.
     """
-    camera_list = check_cameras(cameras)
+    wanted, camera_list = None if outputs is None else Outputs(outputs), check_cameras(cameras)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
     scenes = scenes_of_views(parts, camera_list, sampler, engine)
     context = context_of_scene([part for scene in distinct(scenes) for part in scene.parts], camera_list, engine=engine)
@@ -97,10 +100,20 @@ def render_views(
     background = _check_backgrounds(background, len(camera_list), size, channels)
     if not is_constant(background):
         context = scenes[0].context_with([scene.parts for scene in distinct(scenes)], camera_list, background)
-    images = _images(scenes, size, context, settings)
-    for b, view_scene in enumerate(scenes):
-        warned_if_empty(images[b], view_scene, f"view {b}")
-    return over_background(images, background)
+    if wanted is not None and wanted.fronts:
+        each_view = [outputs_over(view_scene, size, None, settings, wanted) for view_scene in scenes]
+        found = {name: namespace(x).stack([view[name] for view in each_view]) for name, x in each_view[0].items()}
+    else:
+        shown = scenes if wanted is None else wanted.of_scenes(scenes)
+        images = _images(shown, size, context, settings)
+        for b, view_scene in enumerate(scenes):
+            warned_if_empty(images[b], view_scene, f"view {b}")
+        if wanted is None:
+            return over_background(images, background)
+        found = wanted.taken(images, (), channels)
+    if "color" in found:
+        found["color"] = over_background(found["color"], background)
+    return found
 
 
 def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:

@@ -14,7 +14,8 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.result_checks import check_splats
 from rts.operations.projection import projective_map_of_views
-from rts.rendering.shade import ViewTransforms, add_footprint, shade, shaded_at_once, theta_of
+from rts.rendering.part_transforms import ViewTransforms
+from rts.rendering.shade import add_footprint, shade, shaded_at_once, theta_of
 from rts.rendering.splats import all_in_use, concatenated, of_inputs, on_rays, owned, splats_of
 from rts.sampling.scene import Grid
 from rts.sampling.tables import in_one_table

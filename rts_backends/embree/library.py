@@ -16,7 +16,7 @@ from pathlib import Path
 import embreex
 import numpy as np
 
-from rts import PluginError
+from rts.errors import PluginError
 
 GEOMETRY_TRIANGLES = 0
 BUFFER_INDEX, BUFFER_VERTEX = 0, 1

@@ -253,7 +253,7 @@ class JaxEngine(Engine):
         """`jax.value_and_grad`."""
         return jax.value_and_grad(f)
 
-    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Tree]) -> Any:
         """`jax.checkpoint` of `f`. The result of `make` is kept, since tracing `make` would fix its arrays' shapes."""
         operand = make()
         return jax.checkpoint(lambda: f(operand))()

@@ -14,7 +14,7 @@ from typing import Any
 
 import moderngl
 
-from rts import PluginError
+from rts.errors import PluginError
 
 VERSION = 330
 HINT = (

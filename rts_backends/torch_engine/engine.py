@@ -199,12 +199,12 @@ class TorchEngine(Engine):
 
         return call
 
-    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], torch.Tensor]) -> torch.Tensor:
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Tree]) -> Any:
         """See `Engine.checkpoint`: by `torch.utils.checkpoint`; under `torch.func` transforms all arrays are kept."""
         if not torch.is_grad_enabled() or transformed():
             return f(make())
 
-        def run() -> torch.Tensor:
+        def run() -> Tree:
             _running.checkpoint = True
             try:
                 return f(make())

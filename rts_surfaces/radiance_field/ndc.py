@@ -1,4 +1,4 @@
-"""Normalised device coordinates of forward-facing scenes, in which their radiance fields are trained.
+"""Normalised device coordinates of forward-facing data sets, in which their radiance fields are trained.
 
 A camera at the origin that looks along −z sees the world beyond its near plane. NDC map the visible space into the cube
 [−1, 1]³, infinity to z = 1 (Mildenhall et al. 2020, appendix C). Straight lines stay straight.
@@ -26,7 +26,8 @@ class Ndc:
 
     Attributes:
         scale: (x, y), focal length over half the width and half the height of the image.
-        near: depth of the near plane, 1 in the frame of NeRF's forward-facing scenes (`rts.load_views(frame="nerf")`).
+        near: depth of the near plane, 1 in the frame of NeRF's forward-facing data sets
+            (`rts.load_views(frame="nerf")`).
 
     Raises:
         InputError: a number is not positive.

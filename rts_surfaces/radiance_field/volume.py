@@ -61,7 +61,7 @@ def volume_render(
         camera: a perspective camera; rays pass through the centres of its pixels (for rays as NeRF's, take cameras of
             `load_views` with `pixel_center`).
         size: (height, width) in pixels.
-        near: depth at which rays begin; default 2, as in NeRF's Blender scenes; with `ndc`, always its near plane.
+        near: depth at which rays begin; default 2, as in NeRF's Blender data sets; with `ndc`, always its near plane.
         far: depth at which rays end; default 6; with `ndc`, always infinity.
         samples: (N_c, N_f), at least 3 and 1.
         background: the colour behind the field: "white", "black" or (3,) from 0 to 1; None for transparency.

@@ -19,7 +19,7 @@ import threading
 from pathlib import Path
 from typing import NamedTuple
 
-from rts import PluginError
+from rts.errors import PluginError
 from rts.plugin_api.files import cache_folder
 
 SOURCES = ("opensubdiv.cpp", "cage.h", "newton.h")

@@ -126,7 +126,7 @@ def ball(shader="lambert", move=(0.0, 0.0, 0.0), **theta):
 def example(name):
     try:
         return rts.plugin("surfaces", name).example()
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
 
 
@@ -222,7 +222,7 @@ def needed(name):
     try:
         if "sampler" in case.options:
             rts.plugin("samplers", case.options["sampler"])
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
     return case
 
@@ -297,7 +297,7 @@ def test_views_are_fitted_on_the_device(place):
 
 
 def test_large_steps_and_energies(place):
-    steps = rts.LargeSteps(FACES, len(BALL))
+    steps = rts.LargeSteps(BALL, FACES)
     bent = BALL + 0.05 * np.random.default_rng(3).normal(size=BALL.shape)
     for f in (
         lambda v: (steps.decode(steps.encode(v) * 1.1) ** 2).sum(),

@@ -132,7 +132,7 @@ def test_fragments_are_the_nearest_hits_of_each_ray(sampler, kind, camera):
 def test_fragments_at_points_are_the_nearest_hits_of_their_rays(name, kind, camera):
     try:
         sampler = rts.plugin("samplers", name)()
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
     near, far = (3.5, 4.0) if camera is CAMERAS["between close planes"] else (NEAR, FAR)
     vertices, faces = triangles(kind)

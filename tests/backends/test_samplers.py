@@ -42,7 +42,7 @@ def make(name):
         made = rts.plugin("samplers", name)()
         made.rasterize(made.prepare(Proxy(*quad())), host(CAMERAS["perspective"]), (4, 4), 1, "none")
         return made
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         return str(error)
 
 

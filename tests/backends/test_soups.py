@@ -30,7 +30,7 @@ def rasterize(name, soup, layers):
         try:
             _samplers[name] = rts.plugin("samplers", name)()
             rasterize(name, soup, 1)
-        except rts.PluginError as error:
+        except rts.errors.PluginError as error:
             _samplers[name] = str(error)
     if isinstance(_samplers[name], str):
         pytest.skip(_samplers[name])

@@ -1,3 +1,4 @@
+import inspect
 import json
 import re
 import subprocess
@@ -207,12 +208,25 @@ def test_the_pinned_versions_are_no_newer_than_those_tried():
 
 
 def test_render_frames_the_whole_object(model, tmp_path):
-    output = succeed("render", model, "-o", tmp_path / "new" / "a.png", "--size", "48x80")
-    assert "Mesh(12 faces), 48 x 80 pixels" in output and "a.png" in output
+    output = succeed("render", model, "-o", tmp_path / "new" / "a.png", "--size", "80x48")
+    assert "Mesh(12 faces), 80 x 48 pixels" in output and "a.png" in output
     alpha = rts.load_image(tmp_path / "new" / "a.png")[..., 3]
     assert alpha.shape == (48, 80)
     assert alpha.max() == 1
     assert max(alpha[0].max(), alpha[-1].max(), alpha[:, 0].max(), alpha[:, -1].max()) == 0
+
+
+def test_a_size_of_unequal_sides_says_which_is_the_height_until_0_4(model, tmp_path):
+    assert rts.__version__ < "0.4", "the line goes"
+    for size, line in (("80x48", "size 80x48 is 80 wide and 48 high; before rts 0.3 the height came first"), ("9", "")):
+        result = run("render", model, "-o", tmp_path / "a.png", "--size", size)
+        assert result.exit_code == 0 and result.stderr == (line and f"rts: warning: {line}\n")
+
+
+def test_the_field_of_view_is_that_of_the_library():
+    defaults = [inspect.signature(f).parameters for f in (rts.Camera.look_at, rts.Camera.perspective, orbit)]
+    angles = {(p.get("fov_y") or p["fov"]).default for p in defaults}
+    assert angles == {inspect.signature(f).parameters["fov"].default for f in (cli.render, cli.fit_pose)} == {45.0}
 
 
 def test_render_counts_the_parts_of_a_scene(model, tmp_path):
@@ -228,6 +242,37 @@ def test_engines_render_the_same(model, tmp_path, engine):
     succeed("render", model, "-o", tmp_path / "a.png", *common)
     succeed("render", model, "-o", tmp_path / "b.png", *common, "--engine", engine)
     np.testing.assert_allclose(rts.load_image(tmp_path / "a.png"), rts.load_image(tmp_path / "b.png"), atol=0.01)
+
+
+def test_render_writes_outputs_beside_the_picture_or_as_arrays(model, tmp_path):
+    from PIL import Image
+
+    names = "color,depth,normal,part,alpha"
+    said = succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, "--outputs", names, "--profile")
+    succeed("render", model, "-o", tmp_path / "a.npz", "--size", 32, "--outputs", f"{names},position")
+    known = np.load(tmp_path / "a.npz")
+    assert set(known) == {*names.split(","), "position"} and "Most takes" in said
+    pictures = {name: np.asarray(Image.open(tmp_path / f"a.{name}.png")) for name in ("depth", "normal", "part")}
+    most = float(said.partition("depth, 65535 is ")[2].split()[0])
+    np.testing.assert_allclose(pictures["depth"] * most / 65535, known["depth"][..., 0], atol=1e-3)
+    np.testing.assert_array_equal(pictures["part"], known["part"][..., 0] + 1)
+    there = known["alpha"][..., 0] > 0.5
+    np.testing.assert_allclose(pictures["normal"][there] / 127.5 - 1, known["normal"][there], atol=0.005)
+    assert "one .npz" in fail("render", model, "-o", tmp_path / "a.png", "--outputs", "position", code=2)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_render_is_lit_by_an_environment_and_exposed(model, tmp_path, up):
+    above = np.zeros((16, 32, 3), np.float32)
+    above[:4] = (0.0, 4.0, 0.0)
+    rts.save_image(tmp_path / "sky.hdr", above)
+    common = "render", model, "--size", 24, "--up", up, "--camera", "30,60", "--environment", tmp_path / "sky.hdr"
+    succeed(*common, "-o", tmp_path / "a.hdr")
+    image = rts.load_image(tmp_path / "a.hdr")
+    assert image[..., 1].max() > 0.5 and image[..., 0].max() == 0
+    succeed(*common, "-o", tmp_path / "a.png", "--exposure", "-3", "--shader", "pbr")
+    assert 0 < rts.load_image(tmp_path / "a.png")[..., 1].max() < 0.3
+    assert "--exposure is for a .png" in fail(*common, "-o", tmp_path / "a.hdr", "--exposure", "1", code=2)
 
 
 def test_render_options_reach_the_picture(model, tmp_path):
@@ -259,8 +304,6 @@ def test_the_depth_shader_covers_the_range_of_the_object(model, tmp_path):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--size", "0"], "'0' is no size"),
-        (["--size", "4x5x6"], "'4x5x6' is no size"),
         (["--camera", "north"], "'north' is no camera"),
         (["--camera", "1"], "'1' is no camera"),
         (["--background", "blurple"], "'blurple' is no colour"),
@@ -287,6 +330,8 @@ def test_wrong_usage_exits_with_2(model, options, expected):
         (["--fov", "1e-300"], "give another distance, or a wider field of view"),
         (["--fov", "-3"], "fov is -3.0"),
         (["--fov", "nan"], "fov is nan"),
+        (["--size", "0"], "'0' is no size; expected a number of pixels, or WIDTHxHEIGHT"),
+        (["--size", "4x5x6"], "'4x5x6' is no size"),
         (["--size", "100000000"], "100000000 x 100000000 pixels"),
         (["--size", f"{10**40}"], "choose a smaller size"),
         (["--splatter", "multi", "--layers", f"{10**20}"], "choose a smaller size"),

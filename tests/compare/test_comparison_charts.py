@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PROPERTIES
 
-from rts import InputError, PluginError
+from rts import InputError
+from rts.errors import PluginError
 from rts_compare import chart_style
 from rts_compare.html_page import write_page
 from rts_compare.pareto_front import best_within, front, marked

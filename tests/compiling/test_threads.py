@@ -15,7 +15,8 @@ from analytic import Ellipsoid
 from helpers import icosphere, quick, soup
 
 import rts
-from rts import Camera, Part, PluginError
+from rts import Camera, Part
+from rts.errors import PluginError
 
 pytestmark = pytest.mark.core
 
@@ -282,7 +283,7 @@ def child():
     for used in (sampler, rts.plugin("samplers", "opengl")()):
         try:
             render(used)
-        except rts.PluginError as error:
+        except rts.errors.PluginError as error:
             print(error, flush=True)
     np.testing.assert_allclose(render("raster"), expected, atol=1e-5)
     handles.clear()

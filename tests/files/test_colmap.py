@@ -76,7 +76,9 @@ def test_every_eighth_picture_is_for_tests(tmp_path):
     data_set(tmp_path)
     names = [v.name for v in rts.load_views(tmp_path, split="all")]
     assert [v.name for v in rts.load_views(tmp_path, split="test")] == [names[0], names[8]]
-    assert [v.name for v in rts.load_views(tmp_path)] == [*names[1:8], names[9]]
+    assert [v.name for v in rts.load_views(tmp_path, split="train")] == [*names[1:8], names[9]]
+    with pytest.warns(rts.errors.FileWarning, match="8 of the 10 pictures of .* every eighth .* split='train'"):
+        assert len(rts.load_views(tmp_path)) == 8
     refused("split is 'val'; expected 'train', 'test' or 'all'", tmp_path, split="val")
     refused("frame is 'nerf'", tmp_path, frame="nerf")
     data_set(tmp_path / "one", count=1)
@@ -86,10 +88,10 @@ def test_every_eighth_picture_is_for_tests(tmp_path):
 def test_points_may_be_missing_and_binary_tables_are_preferred(tmp_path):
     data_set(tmp_path)
     (tmp_path / "sparse/0/points3D.bin").unlink()
-    view = rts.load_views(tmp_path)[0]
+    view = rts.load_views(tmp_path, split="train")[0]
     assert view.near is None and tuple(view.camera.depth_range()) == pytest.approx((0.01, 1000))
     (tmp_path / "sparse/0/cameras.txt").write_text("damaged")
-    assert rts.load_views(tmp_path)[0].camera == view.camera
+    assert rts.load_views(tmp_path, split="train")[0].camera == view.camera
 
 
 @pytest.mark.parametrize("size", [(48, 64), (41, 55)])
@@ -97,12 +99,12 @@ def test_smaller_pictures_have_a_folder(tmp_path, size):
     listed = data_set(tmp_path)
     for *_, name, _ in listed:
         save(tmp_path / "images_2" / name, np.zeros(size))
-    view = rts.load_views(tmp_path, downscale=2)[-1]
+    view = rts.load_views(tmp_path, downscale=2, split="train")[-1]
     assert view.size == view.image.shape[:2] == size
     K, *_ = view.camera.to_opencv(size, pixel_center=0.5)
     sx, sy = size[1] / 128, size[0] / 96
     np.testing.assert_allclose(K, [[90 * sx, 0, 63 * sx], [0, 84 * sy, 49.5 * sy], [0, 0, 1]], rtol=1e-12)
-    quarter = rts.load_views(tmp_path, downscale=4)[-1]
+    quarter = rts.load_views(tmp_path, downscale=4, split="train")[-1]
     assert quarter.size == quarter.image.shape[:2] == (24, 32)
 
 
@@ -261,7 +263,7 @@ def test_fitted_cameras_of_any_engine_are_saved(tmp_path):
 
 def test_wrong_views_are_not_saved(tmp_path):
     data_set(tmp_path)
-    views = rts.load_views(tmp_path)
+    views = rts.load_views(tmp_path, split="train")
 
     def not_saved(message, path=tmp_path / "a.json", views=views):
         with pytest.raises(InputError) as caught:

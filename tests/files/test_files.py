@@ -554,7 +554,7 @@ def test_materials_that_no_library_has_are_warned_of(tmp_path):
     path = write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + "usemtl m\nf 1 2 3\nusemtl n\nf 1 3 4\n")
     with pytest.warns(rts.errors.FileWarning, match="m.obj uses materials that its libraries lack: 'n'") as caught:
         rts.load(path)
-    assert issubclass(rts.errors.FileWarning, rts.RtsWarning) and caught[0].filename == __file__
+    assert issubclass(rts.errors.FileWarning, rts.errors.RtsWarning) and caught[0].filename == __file__
 
 
 @pytest.mark.parametrize(

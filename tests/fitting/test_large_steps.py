@@ -17,8 +17,8 @@ pytestmark = pytest.mark.fitting
 RNG = np.random.default_rng(0)
 VERTICES, FACES = icosphere(1)
 VERTICES = VERTICES * np.array([1.0, 1.3, 0.8]) + 0.1 * RNG.normal(size=VERTICES.shape)
-STEPS = rts.LargeSteps(FACES, len(VERTICES))
-MILD = rts.LargeSteps(FACES, len(VERTICES), 0.05)  # For second derivatives, whose array code is quick.
+STEPS = rts.LargeSteps(VERTICES, FACES)
+MILD = rts.LargeSteps(VERTICES, FACES, 0.05)  # For second derivatives, whose array code is quick.
 TETRAHEDRON = [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]
 TRIANGLE = [(0, 1, 2)]
 
@@ -31,7 +31,7 @@ TRIANGLE = [(0, 1, 2)]
 @pytest.mark.parametrize("smoothness", [1e-9, 0.5, 19.0, 1e5])
 def test_where_all_are_neighbours_the_distance_from_the_mean_shrinks(target, faces, count, smoothness):
     # L is count · (I − the mean), whose eigenvalues are 0 and count.
-    steps, u = rts.LargeSteps(faces, count, smoothness), RNG.normal(size=(count, 3))
+    steps, u = rts.LargeSteps(np.zeros((count, 3)), faces, smoothness), RNG.normal(size=(count, 3))
     mean = u.mean(axis=0)
     found = to_numpy(steps.decode(arrays(target, u)))
     np.testing.assert_allclose(found, mean + (u - mean) / (1 + count * smoothness), atol=1e-6)
@@ -48,7 +48,7 @@ def test_a_wave_along_a_closed_band_shrinks_by_its_eigenvalue():
     for k in (1, 2, n // 2):
         wave = np.cos(2 * np.pi * k * i / n)[:, None] * [1.0, -2.0, 0.5]
         eigenvalue = 4 * (1 - math.cos(2 * math.pi * k / n))  # Four of the six neighbours lie across.
-        found = rts.LargeSteps(faces, n * n, smoothness).decode(wave)
+        found = rts.LargeSteps(np.zeros((n * n, 3)), faces, smoothness).decode(wave)
         np.testing.assert_allclose(found, wave / (1 + smoothness * eigenvalue), atol=1e-13)
 
 
@@ -57,7 +57,7 @@ def test_vertices_in_one_place_and_vertices_of_no_face_stay(target):
     one = arrays(target, np.full(VERTICES.shape, 7.3))
     np.testing.assert_array_equal(to_numpy(STEPS.encode(one)), to_numpy(one))
     np.testing.assert_allclose(to_numpy(STEPS.decode(one)), to_numpy(one), rtol=2e-7)
-    steps = rts.LargeSteps(FACES + 2, len(VERTICES) + 3)
+    steps = rts.LargeSteps(np.zeros((len(VERTICES) + 3, 3)), FACES + 2)
     u = arrays(target, np.concatenate([RNG.normal(size=(2, 3)), VERTICES, [(4.0, 5.0, 6.0)]]))
     for f in (steps.encode, steps.decode):
         np.testing.assert_array_equal(to_numpy(f(u))[[0, 1, -1]], to_numpy(u)[[0, 1, -1]])
@@ -67,7 +67,7 @@ def test_vertices_in_one_place_and_vertices_of_no_face_stay(target):
 @pytest.mark.parametrize("target", ALL)
 @pytest.mark.parametrize("smoothness", [0.1, 19.0, 300.0])
 def test_decoding_undoes_encoding(target, smoothness):
-    steps = rts.LargeSteps(FACES, len(VERTICES), smoothness)
+    steps = rts.LargeSteps(VERTICES, FACES, smoothness)
     for dtype, tolerance in ((np.float32, 1e-5), (np.float64, 1e-12))[: 1 if target == "jax" else 2]:
         vertices = arrays(target, VERTICES, dtype)
         found = steps.decode(steps.encode(vertices))
@@ -80,7 +80,7 @@ def test_an_edge_of_several_faces_counts_once():
     fan = [(0, 1, 2), (0, 1, 3), (1, 0, 4), (0, 1, 1)]
     u = np.arange(15.0).reshape(5, 3)
     expected = 1.0 * u[0] + 2.0 * sum(u[0] - u[j] for j in (1, 2, 3, 4))
-    np.testing.assert_allclose(rts.LargeSteps(fan, 5, 2.0).encode(u)[0], expected)
+    np.testing.assert_allclose(rts.LargeSteps(np.zeros((5, 3)), fan, 2.0).encode(u)[0], expected)
 
 
 def test_array_code_solves_as_the_factorisation_does():
@@ -88,7 +88,7 @@ def test_array_code_solves_as_the_factorisation_does():
     rim = np.arange(60)
     fan = np.stack([0 * rim, 1 + rim, 1 + (rim + 1) % 60], axis=-1)  # A vertex with 60 neighbours.
     for faces, smoothness in ((FACES, 19.0), (FACES, 1e-12), (fan, 50.0)):
-        steps = rts.LargeSteps(faces, 61, smoothness)
+        steps = rts.LargeSteps(np.zeros((61, 3)), faces, smoothness)
         u = RNG.normal(size=(61, 3))
         for dtype in (np.float64, np.float32):
             x, tolerance = torch.tensor(u.astype(dtype)), np.finfo(dtype).eps * (1 + steps._spread)
@@ -193,9 +193,8 @@ def test_copies_are_the_same_parametrisation():
         ({"faces": [(0.0, 1.0, 2.0)]}, "faces has dtype float64; expected integers"),
         ({"faces": [(0, 1, -1)]}, "faces holds the index -1"),
         ({"faces": [(1, 1, 1)]}, "faces have no edge"),
-        ({"count": 41}, "faces name vertex 41, but count says that there are 41 vertices"),
-        ({"count": 42.0}, "count is 42.0; expected the number of vertices"),
-        ({"count": True}, "count is True"),
+        ({"vertices": VERTICES[:41]}, "faces name vertex 41, but there are 41 vertices"),
+        ({"vertices": VERTICES[:, :2]}, r"expected \(V, 3\) numbers"),
         ({"smoothness": 0}, "smoothness is 0; expected a positive number"),
         ({"smoothness": -1.0}, "smoothness is -1.0; expected a positive number"),
         ({"smoothness": math.nan}, r"smoothness is array\(nan\); expected finite numbers"),
@@ -205,7 +204,7 @@ def test_copies_are_the_same_parametrisation():
 )
 def test_what_is_no_mesh_or_no_smoothness_is_refused(changes, message):
     with pytest.raises(rts.InputError, match=rf"^(?!.*\n).*{message}"):
-        rts.LargeSteps(**{"faces": FACES, "count": 42, **changes})
+        rts.LargeSteps(**{"vertices": VERTICES, "faces": FACES, **changes})
 
 
 @pytest.mark.parametrize("name, f", [("vertices", STEPS.encode), ("u", STEPS.decode)])
@@ -225,4 +224,14 @@ def test_rows_of_another_mesh_are_refused(name, f):
 def test_a_smoothness_that_is_traced_is_refused():
     jax = pytest.importorskip("jax")
     with pytest.raises(rts.InputError, match="smoothness is traced; expected a known number"):
-        jax.jit(lambda x: rts.LargeSteps(FACES, 42, x).decode(VERTICES))(19.0)
+        jax.jit(lambda x: rts.LargeSteps(VERTICES, FACES, x).decode(VERTICES))(19.0)
+
+
+def test_the_order_of_old_works_with_a_warning():
+    for arguments, named in [((FACES, 42), {}), ((FACES,), {"count": 42}), ((), {"faces": FACES, "count": 42})]:
+        with pytest.warns(DeprecationWarning, match=r"take LargeSteps\(vertices, faces\)"):
+            old = rts.LargeSteps(*arguments, **named)
+        np.testing.assert_array_equal(old.decode(VERTICES), STEPS.decode(VERTICES))
+    for count in (42.0, True, 0):
+        with pytest.warns(DeprecationWarning), pytest.raises(rts.InputError, match="count is .*positive integer"):
+            rts.LargeSteps(FACES, count=count)

@@ -447,6 +447,7 @@ def test_images_have_a_scale_that_suits_them():
     assert residuals(loss="huber").loss == rts.Loss("huber", 0.1)
     assert residuals(loss=rts.Loss("huber", 0.3)).loss == rts.Loss("huber", 0.3)
     assert residuals(f_scale=0.2).loss == rts.Loss() == rts.Loss("linear", 0.2)
+    assert residuals(loss="huber").loss == rts.Loss("huber") == rts.Loss("huber", 0.1)
     with pytest.raises(InputError, match="loss is .*and f_scale 0.2; expected one of them to say the scale"):
         residuals(loss=rts.Loss("huber"), f_scale=0.2)
     with pytest.raises(AttributeError):

@@ -189,13 +189,14 @@ def test_a_method_that_is_one_letter_off_is_refused_when_first_used(base, name, 
         part = part.replace(surface=kind(icosphere(0)[1]))
     else:
         options["sampler" if base is RASTER else "splatter"] = kind()
-    with pytest.raises(rts.PluginError, match=rf"Misspelt has a function '{name}'.*did you mean '{meant}'"):
+    with pytest.raises(rts.errors.PluginError, match=rf"Misspelt has a function '{name}'.*did you mean '{meant}'"):
         show(part, **options)
 
 
 def test_an_update_without_a_prepare_is_refused_where_a_sampler_is_made():
     own = {"update": method, "rasterize": method}
-    with pytest.raises(rts.PluginError, match="^Lone has an update, .* and no prepare; write prepare, or leave update"):
+    refused = "^Lone has an update, .* and no prepare; write prepare, or leave update"
+    with pytest.raises(rts.errors.PluginError, match=refused):
         type("Lone", (rts.TriangleSampler,), own)()
     complete = type("Complete", (rts.TriangleSampler,), {**own, "prepare": method})
     type("Derived", (complete,), {"update": method})()
@@ -225,7 +226,8 @@ def test_a_splatter_that_overrides_the_direct_call_is_told_what_that_is_for():
         def splat(self, positions, rgba, row):
             return super().splat(positions, rgba, row)
 
-    with pytest.raises(rts.PluginError, match=r"Old overrides 'splat', which is final: Splat packed .* direct calls"):
+    refused = "Old overrides 'splat', which is final: Splat packed .* direct calls"
+    with pytest.raises(rts.errors.PluginError, match=refused):
         show(mesh_part(icosphere(0)), splatter=Old())
 
 
@@ -469,7 +471,7 @@ def test_a_surface_that_has_the_methods_of_another_base_is_told_to_subclass_that
     class Lost(rts.Surface):
         sample_widths, evaluate, intersect = (0, 3), Ellipsoid.evaluate, Ellipsoid.intersect
 
-    with pytest.raises(rts.PluginError, match="Lost has the methods of rts.RaySurface; subclass that"):
+    with pytest.raises(rts.errors.PluginError, match="Lost has the methods of rts.RaySurface; subclass that"):
         show(rts.Part(Lost(), BALL))
 
 

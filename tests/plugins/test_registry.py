@@ -79,7 +79,7 @@ def modules_after(code):
         ("rts.engines", ("jax", "numpy", "torch")),
         ("rts.surfaces", ("mesh",)),
         ("rts.samplers", ("raster", "reference")),
-        ("rts.shaders", ("blinn_phong", "depth", "lambert", "normals", "silhouette", "textured", "unlit")),
+        ("rts.shaders", ("blinn_phong", "depth", "lambert", "normals", "pbr", "silhouette", "textured", "unlit")),
         ("rts.splatters", ("edges", "multi", "none", "single")),
     ],
 )
@@ -218,7 +218,7 @@ def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(instal
 
 def test_a_surface_that_cannot_be_loaded_is_an_attribute_error_too(monkeypatch):
     def broken(*_):
-        raise rts.PluginError("no compiler")
+        raise rts.errors.PluginError("no compiler")
 
     monkeypatch.delitem(vars(rts), "Bezier", raising=False)
     monkeypatch.setattr(registry, "plugin", broken)
@@ -331,7 +331,7 @@ def test_a_misspelt_group_lists_the_groups_and_suggests_one():
 def test_a_name_claimed_by_two_distributions_is_refused_naming_both(install):
     for name in ("first", "second"):
         install(name, {"rts.splatters": {"same": f"{name}_plugin:Same"}}, {f"{name}_plugin": "class Same: pass"})
-    with pytest.raises(rts.PluginError) as error:
+    with pytest.raises(rts.errors.PluginError) as error:
         rts.plugin("splatters", "same")
     assert "'same' is claimed by first 1.2 and second 1.2" in one_line(error)
     assert rts.plugin("splatters", "multi").__name__ == "Multi"
@@ -345,7 +345,7 @@ def test_a_claim_of_another_distribution_on_a_name_of_ours_is_passed_over(instal
     )
     registry._entry_points.clear()
     with pytest.warns(
-        rts.RtsWarning, match=f"'{name}' is the library's; the claim of rival 1.2 is passed over"
+        rts.errors.RtsWarning, match=f"'{name}' is the library's; the claim of rival 1.2 is passed over"
     ) as told:
         assert rts.plugin(group, name) is own
     assert registry.attribute("Mesh", rts.__all__) is Mesh  # Of the surfaces, and with NumPy arrays.
@@ -367,7 +367,7 @@ def test_a_broken_distribution_is_told_in_a_line_and_passed_over(install, tmp_pa
     install("whole", {"rts.samplers": {"strips": "whole_plugin:Strips"}}, {"whole_plugin": "class Strips: pass"})
     for name, data in damage.items():
         (tmp_path / "broken/broken-1.2.dist-info" / name).write_bytes(data)
-    with pytest.warns(rts.RtsWarning) as told:
+    with pytest.warns(rts.errors.RtsWarning) as told:
         assert {"raster", "strips"} < set(rts.plugins("samplers"))
     for group in registry.GROUPS:  # It is told once.
         rts.plugins(group)
@@ -395,7 +395,7 @@ def test_a_missing_package_of_an_extra_names_the_pip_command(install):
         {"needy_plugin": "import a_package_that_is_absent"},
         extras=("beams",),
     )
-    with pytest.raises(rts.PluginError) as error:
+    with pytest.raises(rts.errors.PluginError) as error:
         rts.plugin("samplers", "beams")
     message = one_line(error)
     assert "'a_package_that_is_absent'" in message and "pip install 'needy[beams]'" in message
@@ -408,7 +408,7 @@ def test_a_missing_package_without_an_extra_names_the_module_and_the_distributio
         {"rts.samplers": {"beams": "needy_plugin:Rays"}},
         {"needy_plugin": "import a_package_that_is_absent"},
     )
-    with pytest.raises(rts.PluginError) as error:
+    with pytest.raises(rts.errors.PluginError) as error:
         rts.plugin("samplers", "beams")
     message = one_line(error)
     assert "needy 1.2" in message and "'a_package_that_is_absent'" in message and "pip install" not in message
@@ -419,7 +419,7 @@ def test_an_engine_whose_framework_is_absent_names_our_extra(name, package):
     code = (
         f"import sys\nsys.modules[{package!r}] = None\nimport rts\n"
         f"try:\n    rts.plugin('engines', {name!r})\n"
-        f"except rts.PluginError as error:\n    print(error)"
+        f"except rts.errors.PluginError as error:\n    print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert f"needs the package '{package}': pip install 'rasterize-then-splat[{name}]'" in done.stdout
@@ -439,7 +439,7 @@ def test_an_engine_whose_framework_is_absent_names_our_extra(name, package):
 )
 def test_any_other_failure_to_import_shows_its_cause(install, source, words):
     install("faulty", {"rts.samplers": {"broken": "faulty_plugin:Broken"}}, {"faulty_plugin": source})
-    with pytest.raises(rts.PluginError) as error:
+    with pytest.raises(rts.errors.PluginError) as error:
         rts.plugin("samplers", "broken")
     message = str(error.value)
     for word in ("'broken'", "faulty 1.2", "fails to import", *words):
@@ -448,9 +448,9 @@ def test_any_other_failure_to_import_shows_its_cause(install, source, words):
 
 
 def test_a_plugin_that_explains_itself_is_heard(install):
-    source = "from rts import PluginError\nraise PluginError('install libosd-dev, then reinstall')"
+    source = "from rts.errors import PluginError\nraise PluginError('install libosd-dev, then reinstall')"
     install("polite", {"rts.surfaces": {"polite": "polite_plugin:Polite"}}, {"polite_plugin": source})
-    with pytest.raises(rts.PluginError) as error:
+    with pytest.raises(rts.errors.PluginError) as error:
         rts.plugin("surfaces", "polite")
     assert one_line(error) == "install libosd-dev, then reinstall"
 
@@ -500,7 +500,7 @@ def test_what_the_library_registers_are_classes_of_which_one_object_serves_a_nam
     for name in rts.plugins(group):
         try:
             found = rts.plugin(group, name)
-        except rts.PluginError:  # An optional package is missing.
+        except rts.errors.PluginError:  # An optional package is missing.
             continue
         if found.__module__.partition(".")[0] in ("rts", "rts_backends", "rts_surfaces"):
             assert isinstance(found, type)

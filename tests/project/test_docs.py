@@ -31,9 +31,10 @@ ELSEWHERE = {
     "rts plugins --matrix": "test_compatibility.py",
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
+    "rts render model.glb --shader pbr --environment room.hdr --exposure 0.5 -o picture.png": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
 }
-"""Commands that take long, and who runs them."""
+"""Commands that take long, or need files of their own, and who runs them."""
 
 
 def blocks(page, language):
@@ -72,8 +73,8 @@ def test_the_python_of_a_guide_runs(page, tmp_path, monkeypatch):
     for path in tmp_path.glob("*.png"):
         assert np.ptp(rts.load_image(path)) > 0.1, path.name
     if page.endswith("first_gradient.md"):
-        assert names["vertices"].grad.abs().max() > 0
-        np.testing.assert_allclose(names["fit"].parameters, names["truth"], atol=0.03)
+        assert names["radii"].grad.min() > 0
+        np.testing.assert_allclose(names["fit"].parameters, names["truth"], atol=0.01)
     if page.endswith("guides/gradients.md"):
         assert {reason.kind for reason in names["check"].reasons} == {"constant"}
         assert str(names["check"]).splitlines()[1] in "".join(blocks(page, "text"))

@@ -12,7 +12,8 @@ import pytest
 from helpers import icosphere
 
 import rts
-from rts import InputError, Part, PluginError
+from rts import InputError, Part
+from rts.errors import PluginError
 from rts.scene.camera import perspective
 from rts.testing.compatibility import APRON
 
@@ -46,7 +47,7 @@ def agrees(image):
 def error(call):
     try:
         call()
-    except rts.PluginError as problem:
+    except rts.errors.PluginError as problem:
         print("PluginError:", problem)
     else:
         raise AssertionError("no error")
@@ -374,7 +375,7 @@ def test_without_embrees_library_auto_passes_embree_by():
         print(auto.choose(part, static=True))
         try:
             rts.render(part, rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (12, 15), sampler="embree")
-        except rts.PluginError as error:
+        except rts.errors.PluginError as error:
             print(error)
     """
     ran = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120)

@@ -31,7 +31,7 @@ def test_a_tutorial_runs_and_writes_its_picture(script, tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RTS_QUICK", "1")
     with warnings.catch_warnings():
-        warnings.simplefilter("error", rts.RtsWarning)
+        warnings.simplefilter("error", rts.errors.RtsWarning)
         runpy.run_path(str(script), run_name="__main__")
     image = rts.load_image(tmp_path / f"{script.stem}.png")
     # Pictures side by side, none of them empty; the first is not yet the last.

@@ -426,5 +426,5 @@ def test_wrong_options_are_refused():
 
 def test_traced_vertices_at_rest_are_refused_with_what_to_do():
     jax = pytest.importorskip("jax")
-    with pytest.raises(rts.InputError, match="^vertices is traced; make the energy outside of jit"):
+    with pytest.raises(rts.InputError, match="^vertices is traced; make it outside of jit"):
         jax.jit(lambda x: ARAP(x, FACES)(x))(VERTICES)

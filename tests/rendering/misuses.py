@@ -21,7 +21,7 @@ POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 BARE = rts.sample(PART, CAMERA, SIZE, splatter="none")
 NDC = rts.Ndc((1.0, 1.0))
-STEPS = rts.LargeSteps(FACES, 4)
+STEPS = rts.LargeSteps(np.zeros((4, 3)), FACES)
 DOUBLE = Operation(
     "misuses.double",
     lambda x: 2 * x,
@@ -183,7 +183,8 @@ GROUPS = {
         residuals, "background", "sampler", "splatter", "layers", "supersample", "capacity", "channels"
     ),
     "LargeSteps": open_in(
-        lambda **o: rts.LargeSteps(**{"faces": FACES, "count": 4, **o}), "faces", "count", "smoothness"
+        lambda **o: rts.LargeSteps(**{"vertices": np.zeros((4, 3)), "faces": FACES, **o}),
+        *("vertices", "faces", "smoothness"),
     ),
     "LargeSteps.encode": {"vertices": STEPS.encode},
     "LargeSteps.decode": {"u": STEPS.decode},

@@ -114,6 +114,9 @@ CALLS = {
     "prepare.sampler": lambda v: rts.prepare(PART, v),
     "explain.parts": lambda v: rts.explain(v, CAMERA),
     "explain.camera": lambda v: rts.explain(PART, v),
+    "profile.parts": lambda v: rts.profile(v, CAMERA, SIZE),
+    "profile.repeats": lambda v: rts.profile(PART, CAMERA, SIZE, repeats=v),
+    "render.outputs": lambda v: rts.render(PART, CAMERA, SIZE, outputs=v),
     "Part.surface": lambda v: rts.render(PART.replace(surface=v), CAMERA, SIZE),
     "Part.theta": lambda v: rts.render(PART.replace(theta=v), CAMERA, SIZE),
     "Part.shader": lambda v: rts.render(PART.replace(shader=v), CAMERA, SIZE),
@@ -223,6 +226,7 @@ CALLS = {
     "load.surface": lambda v: rts.load("no such model.obj", surface=v),
     "load.merge": lambda v: rts.load("no such model.obj", merge=v),
     "load_image.path": rts.load_image,
+    "show.thing": rts.show,
     "save_image.path": lambda v: rts.save_image(v, np.zeros((2, 2, 4))),
     "save_image.image": lambda v: rts.save_image("never written.png", v),
     "save_animation.path": lambda v: rts.save_animation(v, [np.zeros((2, 2, 4))]),
@@ -280,8 +284,8 @@ def splatter():
 
 
 OPTIONAL = """
-    render.background render.capacity render.engine sample.splatter render_samples.background prepare.camera
-    prepare.size
+    render.background render.capacity render.engine render.outputs sample.splatter render_samples.background
+    prepare.camera prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
     ImageResiduals.weights ImageResiduals.f_scale fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
     fit.patience fit.schedule Stage.supersample pyramid.largest
@@ -313,6 +317,7 @@ ACCEPTED = {
 WORDS = {
     "save_image.path": "picture",
     "save_animation.path": "animation",
+    "show.thing": "image",
     "save_animation.frames": "frame",
 }
 """Words for an argument in messages, if they are not its name alone."""
@@ -352,7 +357,7 @@ def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, tmp
     assert not {value: said for value, said in complaints.items() if said}
 
 
-@pytest.mark.filterwarnings("ignore::rts.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize(
     "call", [pytest.param(c, marks=[pytest.mark.thorough] * c.startswith("tune.")) for c in misuses.CALLS]
 )

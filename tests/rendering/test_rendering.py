@@ -444,7 +444,7 @@ def test_every_error_is_an_error_of_the_library_and_of_its_python_kind():
     assert issubclass(rts.InputError, (rts.RtsError, ValueError))
     assert issubclass(rts.InputError, ValueError) and issubclass(rts.InputError, rts.RtsError)
     assert issubclass(rts.errors.EngineError, TypeError) and issubclass(rts.errors.EngineError, rts.RtsError)
-    assert issubclass(rts.PluginError, ImportError) and issubclass(rts.PluginError, rts.RtsError)
+    assert issubclass(rts.errors.PluginError, ImportError) and issubclass(rts.errors.PluginError, rts.RtsError)
 
 
 def test_plain_lists_of_numbers_are_arrays():

@@ -10,7 +10,8 @@ from analytic import Ellipsoid
 from helpers import arrays, icosphere, soup, to_numpy
 
 import rts
-from rts import Camera, GBuffer, InputError, Part, PluginError, TriangleSampler, registry
+from rts import Camera, GBuffer, InputError, Part, TriangleSampler, registry
+from rts.errors import PluginError
 from rts.plugin_api.records import Proxy
 from rts.plugin_base import overrides
 from rts.sampling import cache

@@ -240,7 +240,7 @@ def test_corners_that_are_not_there_are_refused_of_proxies_that_count_as_cheap(w
     part = part.replace(surface=Careless(part.surface.faces))
     try:
         rts.render(card(0.0), CAMERA, SIZE, sampler=name)
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
     with refused("has faces from .* but 4 vertices"):
         rts.render(part, CAMERA, SIZE, sampler=name)

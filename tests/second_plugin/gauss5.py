@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 import rts
+from rts.plugin_api.arrays import engine_of, namespace
+from rts.plugin_api.bases import Splatter
 
 
 @dataclass(frozen=True)
-class Gauss5(rts.Splatter):
+class Gauss5(Splatter):
     """Spreads front samples over 5 × 5 cells, whatever hides what."""
 
     sigma: float = 0.5
@@ -17,7 +19,7 @@ class Gauss5(rts.Splatter):
     layers, reach = 1, 2
 
     def image(self, splats):
-        xp, engine = rts.namespace(splats.positions), rts.engine_of(splats.positions)
+        xp, engine = namespace(splats.positions), engine_of(splats.positions)
         reach, (height, width) = self.reach, splats.row.shape[1:]
         if splats.rgba.shape[0] == 0:  # Nothing can be taken by index.
             return xp.stack([xp.zeros_like(splats.row[0], dtype=splats.rgba.dtype)] * 4, axis=-1)

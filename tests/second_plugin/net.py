@@ -3,11 +3,13 @@
 import numpy as np
 
 import rts
+from rts.plugin_api.arrays import namespace
+from rts.plugin_api.bases import Shader
 
 from .softplus import SOFTPLUS
 
 
-class Net(rts.Shader):
+class Net(Shader):
     opaque, reads = True, ("net",)
 
     def __call__(self, theta, gbuffer, camera):
@@ -15,7 +17,7 @@ class Net(rts.Shader):
         missing = [name for name in random_net() if name not in net]
         if missing:
             raise rts.InputError(f"shader 'net': θ['net'] lacks {', '.join(missing)}")
-        xp = rts.namespace(position, net["weights1"])
+        xp = namespace(position, net["weights1"])
         hidden = SOFTPLUS(xp.matmul(position, net["weights1"]) + net["biases1"], net["sharpness"])
         color = 0.5 + 0.5 * xp.tanh(xp.matmul(hidden, net["weights2"]) + net["biases2"])
         return xp.concat([color, xp.ones_like(color[:, :1])], axis=-1)

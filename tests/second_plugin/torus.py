@@ -3,6 +3,8 @@
 import numpy as np
 
 import rts
+from rts.plugin_api.arrays import engine_of, namespace
+from rts.plugin_api.bases import GBuffer, RaySurface
 from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import RayHits
 
@@ -16,12 +18,12 @@ def norm(xp, *xs):
 
 
 def distance(radii, points):
-    xp = rts.namespace(radii, points)
+    xp = namespace(radii, points)
     ring = norm(xp, points[..., 0], points[..., 2])
     return norm(xp, ring - radii[0], points[..., 1]) - radii[1]
 
 
-class Torus(rts.RaySurface):
+class Torus(RaySurface):
     """A sample is two angles, about the axis and about the ring."""
 
     sample_widths = (0, 2)
@@ -35,18 +37,18 @@ class Torus(rts.RaySurface):
 
     def evaluate(self, theta, samples):
         radii = theta["radii"]
-        xp = rts.namespace(radii)
+        xp = namespace(radii)
         angles = xp.astype(samples.params, radii.dtype)
         u, v = angles[:, 0], angles[:, 1]
         out = radii[0] + radii[1] * xp.cos(v)
         position = xp.stack([out * xp.cos(u), radii[1] * xp.sin(v), out * xp.sin(u)], axis=-1)
-        gbuffer = rts.GBuffer(position=position)
+        gbuffer = GBuffer(position=position)
         gbuffer.defer("normal", lambda: gradient(lambda p: distance(radii, p), position))
         return gbuffer
 
     def intersect(self, theta, origins, directions, layers):
-        radii, engine = theta["radii"], rts.engine_of(origins)
-        xp = rts.namespace(origins)
+        radii, engine = theta["radii"], engine_of(origins)
+        xp = namespace(origins)
         length = norm(xp, directions[:, 0], directions[:, 1], directions[:, 2])
         unit = directions / length[:, None]
         far = norm(xp, origins[:, 0], origins[:, 1], origins[:, 2]) + radii[0] + radii[1]

@@ -177,7 +177,7 @@ def cage():
 def test_on_curved_surfaces_it_is_what_uv_changes_by_from_pixel_to_pixel(make):
     try:
         surface, name, shape = make()
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
     x, y = np.meshgrid(np.linspace(-2, 2, 4), np.linspace(-2, 2, 4), indexing="ij")
     points = np.stack([x, y, 0.3 * x * y - 0.2 * x * x], axis=-1).astype(np.float32)

@@ -59,7 +59,7 @@ def test_forward_mode_and_reverse_mode_agree_for_every_surface_and_sampler(surfa
     try:
         with forward.dual_level():
             pushed = forward.unpack_dual(image([forward.make_dual(x, v) for x, v in floats])).tangent
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
     variables = [x.clone().requires_grad_() for x, _ in floats]
     pulled = torch.autograd.grad((image(variables) * weights).sum(), variables, materialize_grads=True)

@@ -278,7 +278,7 @@ NAMES = [*PARTS, "subdivision"]
 def example(name):
     try:
         return rts.plugin("surfaces", name).example()
-    except rts.PluginError as missing:
+    except rts.errors.PluginError as missing:
         pytest.skip(str(missing))
 
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.sampling
 
 try:
     Subdivision = rts.plugin("surfaces", "subdivision")
-except rts.PluginError as missing:
+except rts.errors.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
 from rts.testing.compatibility import APRON  # noqa: E402

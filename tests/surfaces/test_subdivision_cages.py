@@ -20,7 +20,7 @@ pytestmark = pytest.mark.sampling
 
 try:
     Subdivision = rts.plugin("surfaces", "subdivision")
-except rts.PluginError as missing:
+except rts.errors.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
 from rts_surfaces.subdivision.binding import Limit, Rules  # noqa: E402

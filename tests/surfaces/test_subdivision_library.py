@@ -9,7 +9,7 @@ import pytest
 from helpers import quick
 
 import rts
-from rts import PluginError
+from rts.errors import PluginError
 
 pytestmark = pytest.mark.sampling
 

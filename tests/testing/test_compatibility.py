@@ -31,7 +31,7 @@ def example(name):
     """A surface's example, or why there is none."""
     try:
         return compatibility.example(name) or "the surface gives no example"
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         return str(error)
 
 
@@ -79,7 +79,7 @@ def test_a_pair_shows_the_surface_or_says_why_not(surface, sampler, engine):
         return
     try:
         image = compatibility.attempt(part, sampler, engine)
-    except rts.PluginError as error:
+    except rts.errors.PluginError as error:
         pytest.skip(str(error))
     of_rays = sampler == "rays" or not hasattr(part.surface, "proxy")
     expected = shown(surface, "rays" if of_rays else "reference")

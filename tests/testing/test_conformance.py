@@ -13,14 +13,17 @@ from analytic import Ellipsoid
 from helpers import splats_of
 
 import rts
-from rts import GBuffer, InputError, Part, PluginError
+from rts import GBuffer, InputError, Part
 from rts.arrays.array_functions import without_border
 from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import map_leaves
 from rts.contracts.records import Request
+from rts.errors import PluginError
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import Fragments, RayHits
 from rts.registry import instance
 from rts.scene.row_cameras import RowCameras
+from rts.shading.pbr import Pbr
 from rts.shading.shaders import Depth, Normals, Unlit
 from rts.splatting import Multi, Plain, Single
 from rts.testing import (
@@ -265,6 +268,49 @@ class TestLambert(ShaderOfBuiltIn):
     def theta(self):
         light = {"direction": np.array([0.3, 0.6, 0.7], np.float32), "color": np.array([0.5, 0.6, 0.7], np.float32)}
         return {"color": np.array([0.9, 0.8, 1.0], np.float32), "light": light}
+
+
+class TestPbr(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "pbr"
+
+    @pytest.fixture
+    def theta(self):
+        rng = np.random.default_rng(0)
+        light = {
+            "direction": rng.standard_normal((2, 3)),
+            "color": rng.random((2, 3)),
+            "position": np.array([(0.5, 2.0, 1.5)]),
+            "intensity": np.array([(3.0, 2.0, 1.0)]),
+            "ambient": np.array(0.1),
+            "sh": np.array([3.0, *(0.3 * rng.standard_normal(15))])[:, None] * rng.uniform(0.5, 1, 3),
+            "environment": rng.random((4, 8, 3)),
+        }
+        theta = {
+            "color": np.array([0.9, 0.8, 1.0]),
+            "texture": rng.uniform(0.2, 0.9, (3, 4, 3)),
+            "metallic": rng.uniform(0.1, 0.9, (5, 4, 1)),
+            "roughness": rng.uniform(0.3, 0.9, (3, 6, 1)),
+            "normal_map": np.array([0, 0, 1]) + 0.3 * rng.standard_normal((4, 4, 3)),
+            "occlusion": rng.random((2, 2, 1)),
+            "emissive": rng.random((2, 3, 3)),
+            "light": light,
+        }
+        return map_leaves(lambda x: x.astype(np.float32), theta)
+
+
+class TestTranslucentPbr(ShaderOfBuiltIn):
+    """Numbers in place of maps, and the default light."""
+
+    @pytest.fixture
+    def shader(self):
+        return Pbr(opaque=False)
+
+    @pytest.fixture
+    def theta(self):
+        numbers = {"metallic": 0.3, "roughness": 0.4, "occlusion": 0.8, "emissive": (2.0, 0.0, 0.1)}
+        return {name: np.array(value, np.float32) for name, value in numbers.items()}
 
 
 class TestBlinnPhong(TestLambert):
@@ -741,8 +787,8 @@ def shading(change=lambda rgba, theta, gbuffer: rgba, **promises):
     return shader
 
 
-def straight(rgba, *_):
-    return namespace(rgba).concat([rgba[:, :3] / rgba[:, 3:], rgba[:, 3:]], axis=1)
+def straight(rgba, theta, gbuffer):
+    return namespace(rgba).concat(Unlit().base_color(theta, gbuffer), axis=1)
 
 
 def by_length(rgba, theta, gbuffer):

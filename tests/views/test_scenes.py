@@ -57,6 +57,8 @@ def pair(transforms, scenes, **options):
     """Images of one call, and of a loop."""
     once = rts.render_views(scenes(transforms), CAMERAS, SIZE, **options)
     loop = [rts.render(own, camera, SIZE, **options) for own, camera in zip(scenes(transforms), CAMERAS, strict=True)]
+    if isinstance(once, dict):
+        return once, {name: rts.namespace(x).stack([own[name] for own in loop]) for name, x in once.items()}
     return once, rts.namespace(once).stack(loop)
 
 
@@ -131,6 +133,41 @@ def test_residuals_of_several_views_take_scenes():
     assert np.abs(to_numpy(residuals(torch.zeros(())))).max() < 1e-5
     value, matrix, slope = residuals.normal_equations(torch.tensor(0.05))
     assert value > 1e-4 and matrix > 0 and slope > 0
+
+
+@pytest.mark.parametrize("engine", ["numpy", *TORCH])
+def test_outputs_of_scenes_are_those_of_a_loop(drawn, engine):
+    transforms, scenes = pieces()
+    transforms[1, 0] *= -1  # A mirror.
+    uv = np.float32([[1, 0.3], [0.2, -1], [0.4, 0.5]])
+
+    def with_uv(transforms):
+        return [
+            [part.replace(theta={**part.theta, "uv": part.theta["vertices"] @ uv}) for part in parts]
+            for parts in scenes(transforms)
+        ]
+
+    for names in (("color", "depth", "normal", "tangent", "alpha"), ("part", "depth", "depth_front")):
+        once, loop = pair(arrays(engine, transforms, np.float64), with_uv, outputs=names)
+        assert list(once) == [*names]
+        for name in names:
+            np.testing.assert_allclose(to_numpy(once[name]), to_numpy(loop[name]), rtol=0, atol=3e-5, err_msg=name)
+    assert drawn == [4]
+
+
+def test_residuals_of_outputs_take_scenes():
+    transforms, scenes = pieces("silhouette")
+    names = ("alpha", "depth")
+    targets = rts.render_views(scenes(transforms), CAMERAS, SIZE, outputs=names)
+
+    def moved(shift):
+        matrices = [torch.as_tensor(m) + shift * torch.eye(4)[:, 2:3] @ torch.eye(4)[3:] for m in transforms]
+        return scenes(matrices)
+
+    residuals = rts.ImageResiduals(moved, CAMERAS, SIZE, targets, weights={"depth": 0.1})
+    assert np.abs(to_numpy(residuals(torch.zeros(())))).max() < 1e-5
+    value, matrix, slope = residuals.normal_equations(torch.tensor(0.05))
+    assert value > 1e-6 and matrix > 0 and slope > 0
 
 
 def test_wrong_scenes_are_refused():

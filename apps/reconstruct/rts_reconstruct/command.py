@@ -90,7 +90,7 @@ def _viewer(port: int) -> Any:
     try:
         from rts_viewer import Watch
     except ImportError:
-        raise rts.PluginError("--watch needs the distribution rts-viewer: pip install ./apps/viewer") from None
+        raise rts.errors.PluginError("--watch needs the distribution rts-viewer: pip install ./apps/viewer") from None
     watch = Watch(port=port)
     _say(f"{watch.url} shows the fit")
     return watch

@@ -134,7 +134,7 @@ def _outlined(views: list[rts.View], named: str, background: Any) -> tuple[list[
         behind = _border(images, named, white)
     if white:
         told = f"the masks of {named} are white all over, so that they tell no object; colours alone are compared"
-        warnings.warn(told, rts.RtsWarning, 3)
+        warnings.warn(told, rts.errors.RtsWarning, 3)
     return [_with(view, _opaque, None if view.mask is None else _mask) for view in views], False, behind
 
 
@@ -181,7 +181,7 @@ def _check_shown(views: Sequence[rts.View], named: str) -> None:
     told = f"alpha or masks are black all over in {len(blank)} of {len(views)} views of {named}: {names}"
     if 2 * len(blank) >= len(views):
         raise rts.InputError(f"{told}; expected masks, or alpha, that are white where the object is")
-    warnings.warn(f"{told}; what these see is taken for empty: leave them out if it is not", rts.RtsWarning, 3)
+    warnings.warn(f"{told}; what these see is taken for empty: leave them out if it is not", rts.errors.RtsWarning, 3)
 
 
 def _border(images: Sequence[np.ndarray], named: str, white: bool) -> np.ndarray:

@@ -132,7 +132,7 @@ class Vertices:
     rate = 1.0
 
     def __init__(self, model: Model, smoothness: float, smooth: bool):
-        self._steps, self._faces = rts.LargeSteps(model.faces, len(model.vertices), smoothness), model.faces
+        self._steps, self._faces = rts.LargeSteps(model.vertices, model.faces, smoothness), model.faces
         self._surface = limit_of(model.faces) if smooth else rts.Mesh(model.faces)
         self.start = {"shape": torch.tensor(self._steps.encode(model.vertices)), "colors": torch.tensor(model.colors)}
 
@@ -163,7 +163,7 @@ def _remeshed(model: Model, faces: int) -> Model:
         found = remesh_botsch(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), ROUNDS, length)
         vertices, corners = (np.asarray(x) for x in found)
     else:
-        warnings.warn("the mesh is no manifold; faces are split, not remeshed", rts.RtsWarning, 3)
+        warnings.warn("the mesh is no manifold; faces are split, not remeshed", rts.errors.RtsWarning, 3)
         vertices, corners = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         while 2 * len(corners) < faces:
             vertices, corners = trimesh.remesh.subdivide(vertices, corners)[:2]

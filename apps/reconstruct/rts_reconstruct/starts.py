@@ -126,4 +126,4 @@ def _check_seen(vertices: np.ndarray, views: Sequence[rts.View]) -> None:
         )
     if blind:
         names = ", ".join(str(views[i].name or i) for i in blind[:3]) + (", …" if len(blind) > 3 else "")
-        warnings.warn(f"{len(blind)} of {len(views)} views see nothing of the start: {names}", rts.RtsWarning, 3)
+        warnings.warn(f"{len(blind)} of {len(views)} views see nothing of the start: {names}", rts.errors.RtsWarning, 3)

@@ -159,7 +159,7 @@ def test_remeshing_keeps_shape_and_colours():
 def test_a_mesh_that_is_no_manifold_is_split():
     fan = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]], np.int32)
     model = Model(np.eye(5, 3, dtype=np.float32), fan, np.zeros((5, 3), np.float32), np.zeros((1, 6), np.float32))
-    with pytest.warns(rts.RtsWarning, match="no manifold"):
+    with pytest.warns(rts.errors.RtsWarning, match="no manifold"):
         assert len(stages.remeshed(model, 50).faces) == 48
 
 

@@ -46,7 +46,7 @@ class Page:
             import viser
             from viser.transforms import SO3
         except ImportError as error:
-            raise rts.PluginError(f"the viewer needs viser ({error}): pip install ./apps/viewer") from error
+            raise rts.errors.PluginError(f"the viewer needs viser ({error}): pip install ./apps/viewer") from error
         check_address(host, port)
         before, (address, free) = set(threading.enumerate()), hidden_address()
         with _quiet():

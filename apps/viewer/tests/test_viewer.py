@@ -187,7 +187,7 @@ def test_a_wrong_address_is_refused_in_one_line(options, told):
 
 def test_without_viser_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(rts.PluginError, match=r"needs viser.*pip install \./apps/viewer"):
+    with pytest.raises(rts.errors.PluginError, match=r"needs viser.*pip install \./apps/viewer"):
         with watching():
             pass
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
-from rts.errors import InputError
+from rts.errors import FileWarning, InputError, warn
 from rts.files.paths import inside
 from rts.files.views.colmap_tables import Entry, Points, read_cameras, read_entries, read_points
 from rts.files.views.pictures import Folder, picture_folder, picture_size, with_mask
@@ -30,21 +30,23 @@ def cameras_in(folder: Path) -> Path | None:
     return None
 
 
-def colmap(path: Path, split: str, downscale: int) -> list[Pose]:
-    """The pictures of a COLMAP model, in the order of their names, given its file of cameras."""
-    if split not in ("train", "test", "all"):
+def colmap(path: Path, split: str | None, downscale: int) -> list[Pose]:
+    """The pictures of a COLMAP model, in the order of their names, given its file of cameras; None warns of "train"."""
+    if split not in (None, "train", "test", "all"):
         raise InputError(f"split is {quoted(split)}; expected 'train', 'test' or 'all' for COLMAP, which has no others")
     file = _beside(path, "images")
     cameras, entries = read_cameras(path), sorted(read_entries(file), key=lambda entry: entry.name)
     points_file = path.with_name(f"points3D{path.suffix}")
     points = read_points(points_file) if points_file.is_file() else None
-    entries = [e for i, e in enumerate(entries) if split == "all" or (i % EVERY == 0) == (split == "test")]
-    if not entries:
-        raise InputError(f"{file} has no pictures of the split {split!r}; expected some, or ask for split='all'")
+    chosen = [e for i, e in enumerate(entries) if split == "all" or (i % EVERY == 0) == (split == "test")]
+    if not chosen:
+        raise InputError(
+            f"{file} has no pictures of the split {split or 'train'!r}; expected some, or ask for split='all'"
+        )
     folder = picture_folder(_root(path.parent), downscale, path)
-    pictures = _pictures(file, folder, entries)
+    pictures = _pictures(file, folder, chosen)
     poses = []
-    for entry, picture in zip(entries, pictures, strict=True):
+    for entry, picture in zip(chosen, pictures, strict=True):
         place = f"{file}, image {entry.image}"
         if entry.camera not in cameras:
             raise InputError(f"{place} refers to camera {entry.camera}, which {path} lacks; export the model again")
@@ -54,6 +56,12 @@ def colmap(path: Path, split: str, downscale: int) -> list[Pose]:
         matrix, bounds = from_opencv(entry.rotation, entry.translation), _bounds(entry, points)
         pose = Pose(picture, entry.name, size, folder.downscale, matrix, lens, *bounds)
         poses.append(with_mask(pose, folder.mask(entry.name), folder.reduced))
+    if split is None:
+        warn(
+            f"{len(chosen)} of the {len(entries)} pictures of {file} are taken; every eighth is kept for tests: say "
+            f"split='train' if that is right, else 'all' or 'test'",
+            FileWarning,
+        )
     return poses
 
 
@@ -86,7 +94,7 @@ def _pictures(file: Path, folder: Folder, entries: list[Entry]) -> list[Path]:
 
 
 def _bounds(entry: Entry, points: Points | None) -> tuple[float | None, float | None]:
-    """Depths between which the scene lies, by the points that the picture sees; None where it sees none."""
+    """Depths between which what is seen lies, by the points that the picture sees; None where it sees none."""
     if points is None:
         return None, None
     seen = points.positions[points.rows[points.images == entry.image]]

@@ -15,7 +15,7 @@ from rts.files.views.pictures import EXTENSIONS, picture_folder, picture_size, w
 from rts.files.views.poses import LARGEST, Pose, fitted, rigid
 
 SCALE_OF_NEAREST = 0.75
-"""In NeRF's frame of LLFF scenes the nearest bound is 1 / 0.75."""
+"""In NeRF's frame of LLFF data sets the nearest bound is 1 / 0.75."""
 HEADER, ROW = 5, 17
 """Columns of the matrix (3, 5) of an LLFF pose, and numbers in a row of poses_bounds.npy."""
 
@@ -76,7 +76,7 @@ def _nerf_frame(poses: list[Pose]) -> list[Pose]:
     right = np.cross(up, back)
     axes = [right, np.cross(back, right), back]
     if min(np.linalg.norm(axis) for axis in axes) < 1e-6:
-        raise InputError("the cameras look all ways, so that they have no mean; expected a scene that faces forward")
+        raise InputError("the cameras look all ways, so that they have no mean; expected cameras that face forward")
     mean = np.eye(4)
     mean[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in axes], axis=1)
     mean[:3, 3] = position

@@ -30,13 +30,13 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 PLANES = (0.01, 1000.0)
 """Near and far planes of cameras whose file tells no bounds."""
 MARGIN = 100.0
-"""Factor by which a camera's planes lie nearer, and farther, than the bounds of the scene in its file."""
+"""Factor by which a camera's planes lie nearer, and farther, than the bounds of depth in its file."""
 
 
 def load_views(
     path: Any,
     *,
-    split: str = "train",
+    split: str | None = None,
     downscale: int = 1,
     linear: bool = True,
     background: Literal["white", "black"] | ColorLike | None = None,
@@ -83,7 +83,7 @@ def load_views(
             COLMAP model aside: the others come before it.
         split: which transforms_….json of a folder: "train", "val" or "test". COLMAP tells none: "test" is every eighth
             picture in the order of names, the first one among them, as in mip-NeRF 360; "train" all others, "all" all.
-            LLFF and OpenCV have all.
+            LLFF and OpenCV have all. None is "train", and a warning says how many of COLMAP's are left out.
         downscale: n, for images of 1/n of the size: means of n × n premultiplied pixels, encoded as `linear` says. In
             LLFF and COLMAP the folder `images_n` is used instead, if it exists, and its masks `masks_n`, or `masks`.
         linear: True if images are to be linear, as `rts.load_image` gives them; False for the numbers of the file, sRGB
@@ -93,8 +93,8 @@ def load_views(
         pixel_center: place in each returned pixel, in x and in y, through which its ray passes. The centre is 0.5.
             NeRF's rays passed through 0 of the pixels it was trained on; so through (n − 1) / 2n of pixels that are
             means of n × n of those (0.375 for 100² of 400²).
-        frame: "file" for the world of the file; "nerf" for that in which NeRF is trained on LLFF scenes: about the mean
-            of all cameras, which looks along −z, and so large that the nearest bound is 1 / 0.75. Blender's is the
+        frame: "file" for the world of the file; "nerf" for that in which NeRF is trained on LLFF data sets: about the
+            mean of all cameras, which looks along −z, and so large that the nearest bound is 1 / 0.75. Blender's is the
             same in both; COLMAP and OpenCV have the first alone.
         near: near plane of the cameras; default 0.01, or a hundredth of the nearest bound.
         far: far plane; default 1000, or a hundred times the farthest bound.
@@ -102,13 +102,16 @@ def load_views(
 
     Returns:
         A list of views: `camera` (float64 NumPy), `size`, `image` (float32), `mask` (float32, or None), `name`, `path`,
-        and `near` and `far` of the scene: LLFF's bounds; of COLMAP, the percentiles 0.1 and 99.9 of the depths of the
-        points that the picture sees; None where the file tells none.
+        and `near` and `far`, depths between which what is seen lies: LLFF's bounds; of COLMAP, the percentiles 0.1 and
+        99.9 of the depths of the points that the picture sees; None where the file tells none.
 
     Raises:
         InputError: a file is missing, damaged or incomplete; a matrix is no rotation and position; an image or a mask
             is missing, damaged, or of a size that does not fit; a camera model that is not followed; pickles, which are
             never loaded; or an argument is none of these.
+
+    Warns:
+        FileWarning: pictures of a COLMAP model are left out, and no `split` was given.
     """
     path = _checked(as_path(path), split, downscale, pixel_center, frame)
     if linear not in (True, False) or cache not in (True, False):
@@ -150,10 +153,10 @@ def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: A
         raise InputError(f"pixel_center is {quoted(pixel_center)}; expected a number such as 0.5, in pixels")
     if not isinstance(frame, str) or frame not in ("file", "nerf"):
         raise InputError(f"frame is {quoted(frame)}; expected 'file' or 'nerf'")
-    if not isinstance(split, str):
+    if not (split is None or isinstance(split, str)):
         raise InputError(f"split is {quoted(split)}; expected a name such as 'train'")
     if path.is_dir():
-        return _cameras_of_folder(path, split)
+        return _cameras_of_folder(path, split or "train")
     if not path.is_file():
         raise InputError(f"there is no file {path}; check the path (relative paths start at {Path.cwd()})")
     if path.suffix.lower() not in (".json", ".npy") and path.name not in CAMERAS:
@@ -186,7 +189,7 @@ def _cameras_of_folder(path: Path, split: str) -> Path:
     return existing[0]
 
 
-def _poses(path: Path, split: str, downscale: int, frame: str) -> list[Pose]:
+def _poses(path: Path, split: str | None, downscale: int, frame: str) -> list[Pose]:
     """The entries of a file of cameras."""
     kind = path.suffix.lower()
     if kind == ".npy":
@@ -195,7 +198,7 @@ def _poses(path: Path, split: str, downscale: int, frame: str) -> list[Pose]:
     if kind == ".json" and "views" not in tree:
         return blender(path, tree, downscale)
     if frame == "nerf":
-        raise InputError(f"frame is 'nerf', which is for scenes of LLFF's format; expected 'file' for {path}")
+        raise InputError(f"frame is 'nerf', which is for data sets of LLFF's format; expected 'file' for {path}")
     return opencv(path, tree, downscale) if kind == ".json" else colmap(path, split, downscale)
 
 

@@ -32,7 +32,7 @@ class Pose(NamedTuple):
         downscale: reduction that is still to be made.
         camera_to_world: (4, 4) rigid; camera axes as in OpenGL.
         lens: the lens, for pictures of that size.
-        near: depth at which the scene begins, or None.
+        near: depth at which what is seen begins, or None.
         far: depth at which it ends, or None.
         mask: the mask's picture, or None.
         mask_size: (height, width) of it, pixels.

@@ -21,6 +21,7 @@ Where light passes through, C and the colours on both sides of a break are compo
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,8 @@ from rts.splatting.edges.weights import BORDER
 FIELDS = tuple(field.name for field in fields(Outlines) if field.default is MISSING)
 """The fields of outlines that the operation takes: those of one layer."""
 
+_fields_of = attrgetter(*FIELDS)
+
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Steps (x, y) from a square's first corner to all of them, clockwise from the upper left."""
 
@@ -52,6 +55,7 @@ class Edges(SummingSplatter):
     layers = 1
     reads = frozenset({"outlines"})
     translucent = True
+    any_channels = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`; without `Splats.outlines`, an image without edges."""
@@ -66,11 +70,11 @@ class Edges(SummingSplatter):
         check_rows(outlines.inner, rgba.shape[0], "outlines.inner")
         check_rows(outlines.pair, rgba.shape[0], "outlines.pair")
         if outlines.stack is None:
-            return EDGES(positions, rgba, row[0, ...], *(getattr(outlines, name) for name in FIELDS))
+            return EDGES(positions, rgba, row[0, ...], *_fields_of(outlines))
         check_rows(outlines.stack, rgba.shape[0], "outlines.stack")
-        own = Operands.of(splats, outlines)
-        image = EDGES(own.positions, own.rgba, own.row, *(getattr(own.outlines, name) for name in FIELDS))
-        return image + own.motion
+        whole = Operands.of(splats, outlines)
+        image = EDGES(whole.positions, whole.rgba, whole.row, *_fields_of(whole.outlines))
+        return image + whole.motion
 
     def normal_equations(
         self,
@@ -84,7 +88,7 @@ class Edges(SummingSplatter):
     ) -> tuple[Array, Array, Array] | None:
         """See `SummingSplatter`; None without outlines, where light passes through, and off the host."""
         outlines, engine = splats.outlines, engine_of(splats.positions)
-        own = (
+        tree = (
             splats.positions,
             splats.rgba,
             splats.row[0, ...],
@@ -95,14 +99,14 @@ class Edges(SummingSplatter):
             weights,
             background,
         )
-        operands = collected(own)
+        operands = collected(tree)
         if outlines is None or outlines.stack is not None or splats.rgba.shape[0] == 0 or not engine.on_host(*operands):
             return None
 
         def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(arrays)
-            positions, rgba, row, found, *tangents_and_fields = map_leaves(lambda _: next(it), own)
-            known = positions, rgba, row, *(getattr(found, name) for name in FIELDS)
+            positions, rgba, row, found, *tangents_and_fields = map_leaves(lambda _: next(it), tree)
+            known = positions, rgba, row, *_fields_of(found)
             return edges_weights.normal_equations(known, tuple(tangents_and_fields), splats.border, loss)
 
         count, dtype = t_positions.shape[0], np.float64 if floating_bits(splats.positions) == 64 else np.float32
@@ -111,10 +115,11 @@ class Edges(SummingSplatter):
 
 
 def _without_outlines(splats: Splats) -> Array:
-    """The image (H, W, 4) as if all cells showed one surface, or stacks of the same layers."""
+    """The image (H, W, C) as if all cells showed one surface, or stacks of the same layers."""
     row = splats.row[:1, ...] if splats.opaque else splats.row
     cells = CELLS(splats.positions, splats.rgba, row, _all_joined(row[0, ...] >= 0))
-    return cells[..., :4] + (cells[..., 4:] - stopped(cells[..., 4:]))
+    colors, motion = cells[..., : splats.rgba.shape[1]], cells[..., splats.rgba.shape[1] :]
+    return colors + (motion - stopped(motion))
 
 
 def _specification(positions: Array, rgba: Array, row: Array, *arrays: Array) -> Array:
@@ -222,7 +227,7 @@ class _Segments(NamedTuple):
         square: (S, 2) int, x and y of the first corner's cell.
         lone: (S,) bool.
         path: (3, S, 2), x and y of start, corner and end, from the first corner's centre.
-        side: (S, 2) int, the sides of the square that start and end lie on.
+        square_sides: (S, 2) int, the sides of the square that start and end lie on.
         ties: (S, 2) int, the breaks at start and end.
         jump: (2, S, C), at start and end, the colour on the right of the way less that on the left.
         right: (2, S, C), the colour on the right.
@@ -235,7 +240,7 @@ class _Segments(NamedTuple):
     square: Array
     lone: Array
     path: Array
-    side: Array
+    square_sides: Array
     ties: Array
     jump: Array
     right: Array
@@ -247,7 +252,7 @@ class _Segments(NamedTuple):
     @classmethod
     def of(cls, outlines: Outlines, breaks: _Breaks) -> _Segments:
         """The segments between breaks."""
-        xp, side = namespace(breaks.place), outlines.side
+        xp, side = namespace(breaks.place), outlines.square_sides
         lone, first = outlines.ties[:, 1] < 0, outlines.ties[:, 0]
         ties = xp.stack([first, xp.where(lone, first, outlines.ties[:, 1])], axis=-1)
         side = xp.stack([side[:, 0], xp.where(lone, (side[:, 0] + 2) % 4, side[:, 1])], axis=-1)
@@ -304,11 +309,11 @@ class _Segments(NamedTuple):
                 change = change + share[:, None] * flux
             on_right, x, y = self._on_the_right(k), self.square[:, 0] + dx, self.square[:, 1] + dy
             share = xp.where(on_right, area - 0.25, area)
-            beside = (self.side[:, 0] == k) | (self.side[:, 0] == (k + 3) % 4)
+            beside = (self.square_sides[:, 0] == k) | (self.square_sides[:, 0] == (k + 3) % 4)
             share = xp.where(self.lone & ~beside, 0.0, share)[:, None]
-            own = xp.where(on_right[:, None], self.right, self.right - self.jump)
+            beside = xp.where(on_right[:, None], self.right, self.right - self.jump)
             centre = xp.take(flat, y * color.shape[1] + x, axis=0)
-            differs = xp.where(self._knows(k, on_right)[:, None], centre - (own[0] + own[1]) / 2, 0.0)
+            differs = xp.where(self._knows(k, on_right)[:, None], centre - (beside[0] + beside[1]) / 2, 0.0)
             change = change + share * mean - xp.abs(share) * differs
             nothing = (self.ties[:, 0] == self.ties[:, 1]) & ~self.lone
             parts.append((x, y, xp.where(nothing[:, None], 0.0, change)))
@@ -318,9 +323,9 @@ class _Segments(NamedTuple):
         """(S,) True where the segment's side towards a corner is the surface that is seen at this corner."""
         xp, found, fails = namespace(self.path), False, False
         for e in (0, 1):
-            own = xp.where(self.before[e] == on_right, 0, 1)
-            found = found | (self.next[k, e] == own)
-            fails = fails | (self.next[k, e] == 1 - own) | ~xp.where(own == 0, self.seen[e, :, 0], self.seen[e, :, 1])
+            side = xp.where(self.before[e] == on_right, 0, 1)
+            found = found | (self.next[k, e] == side)
+            fails = fails | (self.next[k, e] == 1 - side) | ~xp.where(side == 0, self.seen[e, :, 0], self.seen[e, :, 1])
         return found & ~fails
 
     def normals(self, breaks: _Breaks) -> Array:
@@ -339,14 +344,14 @@ class _Segments(NamedTuple):
         """Places (S,) of start and end on the square's sides, clockwise from the upper left corner: 0 to 4."""
         xp, places = namespace(self.path), []
         for i in (0, 1):
-            x, y, side = self.path[2 * i][:, 0], self.path[2 * i][:, 1], self.side[:, i]
+            x, y, side = self.path[2 * i][:, 0], self.path[2 * i][:, 1], self.square_sides[:, i]
             places.append(xp.where(side == 0, x, xp.where(side == 1, 1 + y, xp.where(side == 2, 3 - x, 4 - y))))
         return places
 
     def _on_the_right(self, k: int) -> Array:
         """(S,) True where a corner lies on the right of the way: clockwise between the end and the start."""
         # Clockwise, corner k begins side k, so all that lies on sides from k on comes after it.
-        start, end = self.side[:, 0] >= k, self.side[:, 1] >= k
+        start, end = self.square_sides[:, 0] >= k, self.square_sides[:, 1] >= k
         places = self._places()
         return namespace(start).where(places[0] < places[1], start | ~end, start & ~end)
 

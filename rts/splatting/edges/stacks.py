@@ -31,9 +31,9 @@ class Stack(NamedTuple):
     """Layers front to back, in cells or beside breaks.
 
     Attributes:
-        color: (K, ..., 4), premultiplied; 0 where there is no layer.
+        color: (K, ..., C), premultiplied, alpha last; 0 where there is no layer.
         motion: (K, ..., 2), of the layers' samples; 0 where there is no layer.
-        whole: (..., 4), the composite.
+        whole: (..., C), the composite.
     """
 
     color: Array
@@ -49,18 +49,18 @@ class Stack(NamedTuple):
         return cls(color, motion, functools.reduce(lambda back, k: over(color[k, ...], back), *_from_the_back(color)))
 
     def weights(self) -> tuple[Array, Array]:
-        """The light (K, ..., 1) that passes to each layer, and the composite (K, ..., 4) behind it; constants."""
+        """The light (K, ..., 1) that passes to each layer, and the composite (K, ..., C) behind it; constants."""
         color = stopped(self.color)
         xp, count = namespace(color), color.shape[0]
-        through, behind = [xp.ones_like(color[0, ..., 3:])], [xp.zeros_like(color[0, ...])]
+        through, behind = [xp.ones_like(color[0, ..., -1:])], [xp.zeros_like(color[0, ...])]
         for k in range(count - 1):
-            through.append(through[-1] * (1 - color[k, ..., 3:]))
+            through.append(through[-1] * (1 - color[k, ..., -1:]))
             behind.append(over(color[count - 1 - k, ...], behind[-1]))
         return xp.stack(through), xp.stack(behind[::-1])
 
 
 def _from_the_back(color: Array) -> tuple[range, Array]:
-    """The indices of layers (K, ..., 4) before the last, back to front, and the last."""
+    """The indices of layers (K, ..., C) before the last, back to front, and the last."""
     return range(color.shape[0] - 2, -1, -1), color[-1, ...]
 
 
@@ -69,10 +69,10 @@ class Operands(NamedTuple):
 
     Attributes:
         positions: (M, 3), of cells, which stand still; then of both sides of breaks, of the layer that ends there.
-        rgba: (M, 4), the composites.
+        rgba: (M, C), the composites.
         row: (H, W), those of cells.
         outlines: whose samples are composites.
-        motion: (H, W, 4), to be added to the image: without value, with the derivative of motions inside.
+        motion: (H, W, C), to be added to the image: without value, with the derivative of motions inside.
     """
 
     positions: Array
@@ -87,7 +87,7 @@ class Operands(NamedTuple):
         positions, rgba, row = splats.positions, splats.rgba, splats.row
         xp, (height, width), breaks = namespace(rgba), row.shape[1:], outlines.place.shape[0]
         cells, sides = CELLS(positions, rgba, row, outlines.joined), _Sides.of(splats, outlines)
-        whole, motion = cells[..., :4], cells[..., 4:]
+        whole, motion = cells[..., : rgba.shape[1]], cells[..., rgba.shape[1] :]
         numbers = [_numbered(sides.front[i * breaks : (i + 1) * breaks], (height * width) + i * breaks) for i in (0, 1)]
         rows = xp.stack(numbers, axis=-1)
         centres = xp.reshape(_centres(row, rgba), (-1, 2))
@@ -95,7 +95,7 @@ class Operands(NamedTuple):
             motion = motion + sides.motion(splats)
         return cls(
             xp.concat([xp.concat([centres, xp.zeros_like(centres[:, :1])], axis=-1), sides.ending]),
-            xp.concat([xp.reshape(whole, (-1, 4)), sides.stack.whole]),
+            xp.concat([xp.reshape(whole, (-1, rgba.shape[1])), sides.stack.whole]),
             xp.reshape(_numbered(xp.reshape(row[0, ...], (-1,)), 0), (height, width)),
             replace(outlines, rows=rows, inner=rows),
             motion,
@@ -103,7 +103,7 @@ class Operands(NamedTuple):
 
 
 def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> Array:
-    """Composites (H, W, 4) of cells, and then −Σ D_k · m_k (H, W, 4), without value; (H, W, 8).
+    """Composites (H, W, C) of cells, and then −Σ D_k · m_k (H, W, C), without value; (H, W, 2 C).
 
     Slopes are means of the differences from and to the next cells of the same layers.
     """
@@ -113,13 +113,13 @@ def _specification(positions: Array, rgba: Array, row: Array, joined: Array) -> 
         here = (joined[axis, ...][None, ...] & there & xp.roll(there, -1, axis=2 - axis))[..., None]
         rise = xp.where(here, xp.roll(color, -1, axis=2 - axis) - color, 0.0)
         slope = (rise + xp.roll(rise, 1, axis=2 - axis)) / 2
-        change = through * (slope - slope[..., 3:] * behind)
+        change = through * (slope - slope[..., -1:] * behind)
         total = total - xp.sum(change * cells.motion[..., axis, None], axis=0)
     return xp.concat([cells.whole, total], axis=-1)
 
 
 def _shape(positions: tuple[int, ...], rgba: tuple[int, ...], row: tuple[int, ...], *_: Any) -> tuple[int, ...]:
-    return *row[1:], 8
+    return *row[1:], 2 * rgba[1]
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
@@ -146,7 +146,7 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 
 CELLS = Operation("rts.edges_stacks", _specification, (2, 2, 3, 3), _shape, _forward, _push, _pull, differentiable=2)
-"""(H, W, 8) of positions (N, 3), colours (N, 4), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
+"""(H, W, 2 C) of positions (N, 3), colours (N, C), `row` (K, H, W) and `Outlines.joined`: see `_specification`."""
 
 
 def _centres(row: Array, like: Array) -> Array:
@@ -221,13 +221,13 @@ class _Sides(NamedTuple):
         return xp.permute_dims(xp.concat([~xp.any(same, axis=2), ~xp.any(same, axis=1)]), (1, 0))
 
     def motion(self, splats: Splats) -> Array:
-        """The change (H, W, 4) as colours move between centres and breaks, layer by layer.
+        """The change (H, W, C) as colours move between centres and breaks, layer by layer.
 
         As `_beside_breaks` of `rts.splatting.edges.splatter` for opaque layers, whose own part of it, of the
         composites and of the motion of breaks, is taken off.
         """
-        outlines, own, row = self.outlines, self.stack, splats.row
-        xp, engine, (layers, height, width) = namespace(own.whole), engine_of(own.whole), row.shape
+        outlines, stack, row = self.outlines, self.stack, splats.row
+        xp, engine, (layers, height, width) = namespace(stack.whole), engine_of(stack.whole), row.shape
         gap, place, unit = outlines.gap, outlines.place, _normals(outlines)
         along = _steps(gap, unit)
         normal, way = xp.concat([unit, unit]), xp.concat([-along, along])
@@ -236,15 +236,15 @@ class _Sides(NamedTuple):
         centre = xp.concat([_on_gaps(outlines, xp.full_like(place, i)) for i in (0, 1)])
         rows = xp.take(xp.reshape(row, (layers, -1)), cell, axis=1)
         here = Stack.of(splats.positions, splats.rgba, rows, centre[None, ...])
-        rise, (through, behind) = stopped(own.color - here.color), here.weights()
+        rise, (through, behind) = stopped(stack.color - here.color), here.weights()
         # What ends there moves along the normal of its outline; other layers know nothing of this.
         across = xp.sum(normal * way, axis=-1)
-        moves, ends = (own.motion + here.motion) / 2, self._ends()
+        moves, ends = (stack.motion + here.motion) / 2, self._ends()
         moves = xp.where(ends, xp.sum(moves * normal, axis=-1) * across, xp.sum(moves * way, axis=-1))[..., None]
-        change = xp.sum(through * (rise - rise[..., 3:] * behind) * moves, axis=0)
+        change = xp.sum(through * (rise - rise[..., -1:] * behind) * moves, axis=0)
         # What is added for the composite, as if it moved with the break.
         with_break = xp.sum((self.ending[:, :2] - self.points) / 2 * normal, axis=-1) * across
-        change = change - stopped(own.whole - here.whole) * with_break[:, None]
+        change = change - stopped(stack.whole - here.whole) * with_break[:, None]
         counts = xp.concat([outlines.ends[:, i] for i in (0, 1)]) & (self.front >= 0)
         length = xp.clip(xp.concat([place, 1 - place]), 0.0, 1.0)
         share = (xp.clip(length, None, 0.5) / xp.where(length > 1e-6, length, 1.0))[:, None]

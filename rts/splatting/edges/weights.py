@@ -31,7 +31,7 @@ class _Weights(NamedTuple):
         origins: (B, 2, 2), x and y of these.
         moves: (B, 2, 3, 2).
         share: (S, 4, 2).
-        own: (S, 4, 2) int8.
+        cell_side: (S, 4, 2) int8.
         flux: (S, 4, 2, 4, 2).
         cells: (B, 2, 3) int32.
         sides: (B, 2, 5).
@@ -43,7 +43,7 @@ class _Weights(NamedTuple):
     origins: np.ndarray
     moves: np.ndarray
     share: np.ndarray
-    own: np.ndarray
+    cell_side: np.ndarray
     flux: np.ndarray
     cells: np.ndarray
     sides: np.ndarray
@@ -59,20 +59,21 @@ class _Weights(NamedTuple):
         points = gap[:, None, 1::-1] + 0.5 + np.asarray(outlines.points, np.float64)[..., None] * step[:, None]
         moves, cells, sides = np.empty((count, 2, 3, 2)), np.empty((count, 2, 3), np.int32), np.empty((count, 2, 5))
         path, share, flux = np.empty((segments, 3, 2)), np.empty((segments, 4, 2)), np.empty((segments, 4, 2, 4, 2))
-        own = np.empty((segments, 4, 2), np.int8)
+        cell_side = np.empty((segments, 4, 2), np.int8)
         loops.weigh_breaks(outlines.near, outlines.slope, moves)
         paired = np.flatnonzero(outlines.pair[:, 0] >= 0)
         movers, origins = np.array(outlines.rows), points.copy()
         movers[paired], origins[paired] = outlines.pair[paired], points[paired, outlines.near[paired]][:, None]
         moves[paired] = 0.5 * np.eye(3, 2)
         ties = outlines.ties
-        known = outlines.square, ties, outlines.side, outlines.corner, outlines.pull, path, share, own, flux
+        geometry = ties, outlines.square_sides, outlines.corner, outlines.pull
+        known = outlines.square, *geometry, path, share, cell_side, flux
         seen = outlines.rows >= 0
         at = outlines.place, gap, outlines.ends, seen
         parallel(loops.weigh_segments, segments, BORDER, *at, *known, work=400 * segments)
         normal = np.empty((count, 2))
         loops.weigh_sides(*at, ties, path, outlines.joined, normal, cells, sides)
-        return cls(shown, points, movers, origins, moves, share, own, flux, cells, sides)
+        return cls(shown, points, movers, origins, moves, share, cell_side, flux, cells, sides)
 
 
 def forward(operands: Arrays, out: np.ndarray) -> _Weights:
@@ -171,9 +172,9 @@ def normal_equations(
     kept = forward(operands, image)
     r = (seen(image, 1.0) - (target if weights is None else target * weights)).reshape(-1)
     jacobian = np.empty((len(t_positions), r.size), dtype)
-    for own, tangent in enumerate(t_positions):
-        push(operands, (tangent, None if t_rgba is None else t_rgba[own]), image, kept)
-        jacobian[own] = seen(image, 0.0).reshape(-1)
+    for i, tangent in enumerate(t_positions):
+        push(operands, (tangent, None if t_rgba is None else t_rgba[i]), image, kept)
+        jacobian[i] = seen(image, 0.0).reshape(-1)
     value = np.mean(r * r) if loss is None else loss(r)
     if loss is not None and loss.robust:
         w, curvatures = loss.weights(r)
@@ -184,7 +185,7 @@ def normal_equations(
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:
     """The first operands of `edges_loops.add_segments`."""
     ties = outlines.square, outlines.ties, outlines.beyond
-    return *ties, weights.share, weights.own, weights.flux, row, weights.shown
+    return *ties, weights.share, weights.cell_side, weights.flux, row, weights.shown
 
 
 def _jumps(rgba: np.ndarray, weights: _Weights) -> np.ndarray:

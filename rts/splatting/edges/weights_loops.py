@@ -86,8 +86,9 @@ def _add_flux(flux, pull, i, lone, t, first, second, dx, dy):
 
 @loop
 def weigh_segments(
-    first, last, border, place, gap, near_ends, seen, square, ties, side, corner, pull, path, share, own, flux
-):
+    first, last, border, place, gap, near_ends, seen, square, ties, square_sides, corner, pull, path, share, cell_side,
+    flux,
+):  # fmt: skip
     """Fill in the weights of segments; see `rts.contracts.records.Outlines`.
 
     Args:
@@ -100,12 +101,12 @@ def weigh_segments(
         seen: (B, 2) bool, is there a sample before and behind?
         square: (S, 2).
         ties: (S, 2).
-        side: (S, 2).
+        square_sides: (S, 2).
         corner: (S, 2).
         pull: (S, 4).
         path: (S, 3, 2) to fill: start, corner and end, from the first corner's centre.
         share: (S, 4, 2) to fill: for each of the square's cells, weights of the jumps at start and end.
-        own: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that the cell's
+        cell_side: (S, 4, 2) int8 to fill: for each cell, the side of both breaks (0 or 1) with the surface that its
             centre shows; −1 if another may lie between.
         flux: (S, 4, 2, 4, 2) to fill: for each cell and jump, weights of the motions, along x and y, of the four breaks
             that pull.
@@ -113,11 +114,11 @@ def weigh_segments(
     cuts, area = np.empty(4), np.empty(4)
     for s in range(first, last):
         if ties[s, 0] == ties[s, 1]:
-            path[s], share[s], own[s], flux[s] = 0.0, 0.0, -1, 0.0
+            path[s], share[s], cell_side[s], flux[s] = 0.0, 0.0, -1, 0.0
             continue
         lone = ties[s, 1] < 0
-        side0 = side[s, 0]
-        side1 = (side0 + 2) % 4 if lone else side[s, 1]
+        side0 = square_sides[s, 0]
+        side1 = (side0 + 2) % 4 if lone else square_sides[s, 1]
         _point(place, gap, ties[s, 0], square, s, path[s, 0])
         if lone:
             along = gap[ties[s, 0], 2]
@@ -172,7 +173,7 @@ def weigh_segments(
             at_end = -1 if lone else _next_side(ties[s, 1], side1, k, near_ends)
             known = (at_start == first or at_end == second) and at_start != 1 - first and at_end != 1 - second
             known = known and seen[ties[s, 0], first] and seen[ties[s, 0] if lone else ties[s, 1], second]
-            own[s, k, 0], own[s, k, 1] = (first, second) if known else (-1, -1)
+            cell_side[s, k, 0], cell_side[s, k, 1] = (first, second) if known else (-1, -1)
 
 
 @loop
@@ -385,7 +386,7 @@ def _pull_rates(s, ties, beyond, flux, rate, g_motion):
 
 
 @loop
-def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump, steady, motion, out):
+def add_segments(square, ties, beyond, share, cell_side, flux, row, shown, rgba, jump, steady, motion, out):
     """Add to an image (H, W, C) the changes that segments make.
 
     Args:
@@ -393,7 +394,7 @@ def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump,
         ties: (S, 2).
         beyond: (S, 2).
         share: (S, 4, 2), see `weigh_segments`.
-        own: (S, 4, 2).
+        cell_side: (S, 4, 2).
         flux: (S, 4, 2, 4, 2).
         row: (H, W) int32.
         shown: (B, 2), the samples that tell colours.
@@ -409,7 +410,7 @@ def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump,
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
-            known, rate[:] = own[s, k, 0] >= 0, 0.0
+            known, rate[:] = cell_side[s, k, 0] >= 0, 0.0
             if len(motion):
                 _fill_rates(s, ties, beyond, flux[s, k], motion, rate)
             for c in range(channels):
@@ -419,13 +420,13 @@ def add_segments(square, ties, beyond, share, own, flux, row, shown, rgba, jump,
                 if len(jump) and known:
                     # What is taken away of the cell's own surface has the colour at its centre.
                     here = _of(rgba, row[y, x], c)
-                    value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, own[s, k, 0]], c))
-                    value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, own[s, k, 1]], c))
+                    value -= abs(share[s, k, 0]) * (here - _of(rgba, shown[start, cell_side[s, k, 0]], c))
+                    value -= abs(share[s, k, 1]) * (here - _of(rgba, shown[end, cell_side[s, k, 1]], c))
                 out[y, x, c] += value
 
 
 @loop
-def pull_segments(square, ties, beyond, share, own, flux, row, shown, steady, g, g_rgba, g_jump, g_motion):
+def pull_segments(square, ties, beyond, share, cell_side, flux, row, shown, steady, g, g_rgba, g_jump, g_motion):
     """Add to gradients of colours, jumps (B, C) and motions (B, 2) those of `add_segments`; empty ones: not wanted."""
     channels, rate = g.shape[2], np.empty(2)
     for s in range(len(square)):
@@ -433,7 +434,7 @@ def pull_segments(square, ties, beyond, share, own, flux, row, shown, steady, g,
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
-            known, rate[:] = own[s, k, 0] >= 0, 0.0
+            known, rate[:] = cell_side[s, k, 0] >= 0, 0.0
             for c in range(channels):
                 rate[0] += g[y, x, c] * steady[start, c]
                 rate[1] += g[y, x, c] * steady[end, c]
@@ -442,8 +443,8 @@ def pull_segments(square, ties, beyond, share, own, flux, row, shown, steady, g,
                     g_jump[end, c] += share[s, k, 1] * g[y, x, c]
                 if len(g_rgba) and known:
                     one, other = abs(share[s, k, 0]) * g[y, x, c], abs(share[s, k, 1]) * g[y, x, c]
-                    _add_to(g_rgba, shown[start, own[s, k, 0]], c, one)
-                    _add_to(g_rgba, shown[end, own[s, k, 1]], c, other)
+                    _add_to(g_rgba, shown[start, cell_side[s, k, 0]], c, one)
+                    _add_to(g_rgba, shown[end, cell_side[s, k, 1]], c, other)
                     _add_to(g_rgba, row[y, x], c, -one - other)
             if len(g_motion) and (rate[0] != 0 or rate[1] != 0):
                 _pull_rates(s, ties, beyond, flux[s, k], rate, g_motion)
@@ -535,10 +536,10 @@ def pull_sides(row, rows, shown, cells, sides, steady, g, g_rgba, g_positions):
                 near, far = g[y, x, c], g[there_y, there_x, c]
                 move += (sides[b, i, 0] * near + (1 - sides[b, i, 0]) * far) * (steady[last, c] - steady[here, c])
                 if len(g_rgba):
-                    own, other = sides[b, i, 1] * near, sides[b, i, 2] * far
-                    g_rgba[last, c] += other
-                    g_rgba[former, c] += own - other
-                    g_rgba[here, c] -= own
+                    g_near, g_far = sides[b, i, 1] * near, sides[b, i, 2] * far
+                    g_rgba[last, c] += g_far
+                    g_rgba[former, c] += g_near - g_far
+                    g_rgba[here, c] -= g_near
             if len(g_positions) and move != 0:
                 for a in range(2):
                     g_positions[rows[b, i], a] += sides[b, i, 3 + a] * move

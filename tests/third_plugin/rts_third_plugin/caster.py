@@ -2,13 +2,13 @@
 
 import numpy as np
 
-import rts
+from rts.plugin_api.bases import TriangleSampler
 from rts.plugin_api.records import Fragments
 
 TURN = np.array([0.5377, 0.3186, 0.7806])  # A direction along which no edge of a model is likely to lie.
 
 
-class Caster(rts.TriangleSampler):
+class Caster(TriangleSampler):
     """Casts every ray at every triangle. A ray through an edge counts as turned a little, all rays in the same way."""
 
     def rasterize(self, prepared, camera, size, layers, cull):

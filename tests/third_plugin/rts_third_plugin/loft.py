@@ -5,13 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 import rts
+from rts.plugin_api.arrays import engine_of, namespace
+from rts.plugin_api.bases import GBuffer, TriangleSurface
 from rts.plugin_api.checks import check_numbers
 from rts.plugin_api.operations import interpolate
 from rts.plugin_api.records import Proxy
 
 
 @dataclass(frozen=True)
-class Loft(rts.TriangleSurface):
+class Loft(TriangleSurface):
     """A skin over closed polygons: θ["curves"] (sections, points, 3), counter-clockwise seen from the last section."""
 
     sections: int
@@ -35,7 +37,7 @@ class Loft(rts.TriangleSurface):
     def evaluate(self, theta, samples):
         self.check(theta)
         curves = theta["curves"]
-        xp = rts.namespace(curves)
+        xp = namespace(curves)
 
         def normal():
             around = xp.roll(curves, -1, axis=1) - xp.roll(curves, 1, axis=1)
@@ -44,10 +46,10 @@ class Loft(rts.TriangleSurface):
 
         def uv():
             u, v = np.meshgrid(np.linspace(0, 1, self.points + 1), np.linspace(0, 1, self.sections))
-            corners = rts.engine_of(curves).constant(np.stack([u, v], axis=-1).reshape(-1, 2), curves)
+            corners = engine_of(curves).constant(np.stack([u, v], axis=-1).reshape(-1, 2), curves)
             return interpolate(corners, samples.ids, 0, samples.params)
 
-        gbuffer = rts.GBuffer(position=interpolate(rows(curves), samples.ids, 0, samples.params))
+        gbuffer = GBuffer(position=interpolate(rows(curves), samples.ids, 0, samples.params))
         gbuffer.defer("normal", normal)
         gbuffer.defer("uv", uv)
         return gbuffer
@@ -62,5 +64,5 @@ class Loft(rts.TriangleSurface):
 
 def rows(grid):
     """The rows (sections * (points + 1), 3) of a grid whose first column is repeated as its last."""
-    xp = rts.namespace(grid)
+    xp = namespace(grid)
     return xp.reshape(xp.concat([grid, grid[:, :1]], axis=1), (-1, grid.shape[2]))

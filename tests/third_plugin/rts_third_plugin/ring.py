@@ -3,11 +3,13 @@
 import numpy as np
 
 import rts
+from rts.plugin_api.arrays import namespace
+from rts.plugin_api.bases import GBuffer, TriangleSurface
 from rts.plugin_api.checks import check_numbers
 from rts.plugin_api.records import Proxy
 
 
-class Ring(rts.TriangleSurface):
+class Ring(TriangleSurface):
     """θ["radii"] (2,), of the ring and of its tube. A sample is (u, v): turns about the axis and about the tube."""
 
     sample_widths = (0, 2)  # No integers, and u, v.
@@ -32,7 +34,7 @@ class Ring(rts.TriangleSurface):
 
     def evaluate(self, theta, samples):
         self.check(theta)
-        gbuffer = rts.GBuffer(position=position(theta["radii"], samples.params))
+        gbuffer = GBuffer(position=position(theta["radii"], samples.params))
         gbuffer.defer("normal", lambda: around(samples.params)[1])
         gbuffer.defer("uv", lambda: samples.params)
         return gbuffer
@@ -44,7 +46,7 @@ class Ring(rts.TriangleSurface):
 
 def around(params):
     """Directions (N, 3) from the axis to the middle of the tube, and from there to the surface."""
-    xp = rts.namespace(params)
+    xp = namespace(params)
     u, v = 2 * np.pi * params[:, 0], 2 * np.pi * params[:, 1]
     out = xp.stack([xp.cos(u), xp.zeros_like(u), xp.sin(u)], axis=-1)
     up = xp.stack([xp.zeros_like(u), xp.sin(v), xp.zeros_like(u)], axis=-1)

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import rts
-from rts.plugin_api.arrays import unit
+from rts.plugin_api.arrays import namespace, unit
+from rts.plugin_api.bases import Shader
 from rts.plugin_api.checks import check_numbers
 
 
 @dataclass(frozen=True)
-class Toon(rts.Shader):
+class Toon(Shader):
     """Lights θ["tint"] (3,) from the viewer, in bands. They meet in short ramps, which have a derivative."""
 
     levels: int = 3
@@ -20,7 +20,7 @@ class Toon(rts.Shader):
     def __call__(self, theta, gbuffer, camera):
         check_numbers('theta["tint"]', theta.get("tint"), (3,))
         normal, toward = gbuffer["normal"], camera.toward(gbuffer["position"])
-        xp = rts.namespace(normal, theta["tint"])
+        xp = namespace(normal, theta["tint"])
         cosine = xp.sum(unit(normal) * unit(toward), axis=-1, keepdims=True)
         level = self.levels * cosine * cosine
         band = xp.floor(level)

@@ -1,0 +1,14 @@
+"""Types of what the library's functions return, for annotations: `rts.results.Fit` is that of `rts.fit`.
+
+Images are arrays, and have no type of their own.
+"""
+
+from rts.diagnostics.gradient_images import GradientImage
+from rts.diagnostics.gradients import GradientCheck
+from rts.diagnostics.notebooks import Shown
+from rts.diagnostics.profile import Profile
+from rts.fitting.fit import Fit
+from rts.rendering.renderer import PreparedParts, Renderer
+from rts.sampling.auto import Choice
+
+__all__ = ["Choice", "Fit", "GradientCheck", "GradientImage", "PreparedParts", "Profile", "Renderer", "Shown"]

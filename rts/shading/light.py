@@ -1,0 +1,171 @@
+"""Light: θ["light"], checked, as the built-in shaders see it.
+
+θ["light"] is a dict. All entries are in world space, and differentiable:
+
+    "direction" (3,) or (L, 3)       towards distant lights, of any length; by default from above the camera's left
+                                     shoulder
+    "color" (3,) or (L, 3)           of distant lights, by default 0.8: irradiance / π, so that a white diffuse surface
+                                     that faces the light has this colour
+    "position" (3,) or (P, 3)        of point lights
+    "intensity" (3,) or (P, 3)       of point lights, by default 1: the "color" that they have at a distance of 1, and
+                                     less with the square of the distance
+    "ambient" () or (3,)             light from all around, by default 0.2: its radiance
+    "sh" (1, 3), (4, 3), (9, 3)      radiance from each direction, as coefficients of `rts.shading.harmonics`
+      or (16, 3)
+    "environment" (h, w, 3)          radiance from each direction, as an image; see `rts.shading.prefiltered`
+
+The defaults hold while θ["light"] has none of "position", "sh" and "environment". A light with one of them has no
+distant lights unless it has a "direction" or a "color", and no ambient light unless it has "ambient".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rts.arrays.array_functions import dot, shape_of, unit
+from rts.arrays.engines import namespace, value_of
+from rts.arrays.trees import Array, Tree
+from rts.errors import InputError
+from rts.scene.camera import Camera
+from rts.scene.row_cameras import RowCameras
+from rts.shading.environment import blurs, prefiltered, reflected
+from rts.shading.spherical_harmonics import COUNTS, irradiance, radiance
+from rts.shading.theta_entries import check_entry
+
+AMBIENT, COLOR = 0.2, 0.8
+DIRECTION = (-0.3, 0.5, 0.81)
+"""The default direction, in camera space."""
+FURTHER = ("position", "sh", "environment")
+"""Entries besides which there are no defaults."""
+PLURALS = {"color": "colors", "intensity": "intensities"}
+ENTRIES = ("direction", "color", "position", "intensity", "ambient", "sh", "environment")
+
+
+@dataclass
+class Light:
+    """Checked light.
+
+    Attributes:
+        distant: for each distant light the unit vector towards it, (3,) or (N, 3), and its colour.
+        points: for each point light its position (3,) and intensity.
+        ambient: the radiance from all around, a number, () or (3,); None for none.
+        sh: coefficients (n, 3); None for none.
+        environment: the result of `prefiltered`; None for none.
+    """
+
+    distant: list[tuple[Array, Any]] = field(default_factory=list)
+    points: list[tuple[Array, Any]] = field(default_factory=list)
+    ambient: Any = None
+    sh: Array | None = None
+    environment: Mapping[str, Array] | None = None
+
+    def lamps(self, positions: Array) -> Iterator[tuple[Array, Any]]:
+        """For each distant or point light the unit vectors towards it, (3,) or (N, 3), and irradiances / π at points.
+
+        Args:
+            positions: (N, 3) world.
+        """
+        yield from self.distant
+        for position, intensity in self.points:
+            offset = position - positions
+            square = dot(offset, offset)
+            # A light has no effect on the point where it is.
+            yield unit(offset), intensity / namespace(square).where(square > 0, square, square + 1)
+
+    def diffuse(self, normals: Array) -> Any:
+        """The irradiance / π of surfaces with unit normals (N, 3), of all light but lamps: a number, (3,) or (N, 3)."""
+        total = 0.0 if self.ambient is None else self.ambient
+        if self.sh is not None:
+            total = total + irradiance(self.sh, normals)
+        if self.environment is not None:
+            total = total + irradiance(self.environment["sh"], normals)
+        return total
+
+    @property
+    def directed(self) -> bool:
+        """True if `diffuse` depends on normals."""
+        return self.sh is not None or self.environment is not None
+
+    @property
+    def surrounds(self) -> bool:
+        """True if light comes from all around."""
+        return self.ambient is not None or self.directed
+
+    def reflected(self, directions: Array, roughness: Array) -> Any:
+        """Radiance from unit directions (N, 3), blurred for roughnesses (N, 1), of all light but lamps."""
+        total = 0.0 if self.ambient is None else self.ambient
+        if self.sh is not None:
+            total = total + radiance(self.sh, directions, blurs(roughness))
+        if self.environment is not None:
+            total = total + reflected(self.environment, directions, roughness)
+        return total
+
+
+def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
+    """The light in θ, or the default light.
+
+    Raises:
+        InputError: θ["light"] is no dict, has an unknown entry, or an entry of another shape or dtype, that is not
+            finite, or that does not go with the others.
+    """
+    entries = theta.get("light", {})
+    if not isinstance(entries, Mapping):
+        raise InputError(f"theta['light'] is a {type(entries).__name__}; expected a dict of {', '.join(ENTRIES)}")
+    for name, value in entries.items():
+        _check(name, value)
+    usual = not any(name in entries for name in FURTHER)
+    light = Light(ambient=entries.get("ambient", AMBIENT if usual else None), sh=entries.get("sh"))
+    if usual or "direction" in entries or "color" in entries:
+        if "direction" in entries:
+            vectors = value_of(entries["direction"])
+            if vectors is not None and not vectors.any(axis=-1).all():
+                raise InputError(
+                    "theta['light']['direction'] is zero; expected vectors towards the lights, of any length"
+                )
+            directions = _separate_vectors(unit(entries["direction"]))
+        else:
+            directions = [camera.to_world(DIRECTION)]
+        light.distant = _paired("direction", directions, "color", entries, COLOR)
+    if "position" in entries:
+        light.points = _paired("position", _separate_vectors(entries["position"]), "intensity", entries, 1.0)
+    elif "intensity" in entries:
+        raise InputError("theta['light'] has an intensity of point lights, but no position; give both, or a color")
+    if "environment" in entries:
+        environment = entries["environment"]
+        light.environment = environment if isinstance(environment, Mapping) else prefiltered(environment)
+    return light
+
+
+def _check(name: str, value: Any) -> None:
+    """Refuse an entry of θ["light"] with a wrong name, shape or dtype, or that is not finite."""
+    if name not in ENTRIES:
+        raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(ENTRIES)}")
+    place, shape = f"['light'][{name!r}]", shape_of(value)
+    if name == "ambient":
+        check_entry(place, value, "() or (3,)", shape in ((), (1,), (3,)))
+    elif name == "sh":
+        check_entry(place, value, "(n, 3), n = 1, 4, 9 or 16", len(shape) == 2 and shape in [(n, 3) for n in COUNTS])
+    elif name == "environment":
+        if isinstance(value, Mapping):
+            if set(value) != {"sh", "image", "levels"}:
+                raise InputError(f"theta{place} has {sorted(value)}; expected an image, or what prefiltered made of it")
+        else:
+            check_entry(place, value, "(h, w, 3)", len(shape) == 3 and shape[2] == 3 and 0 not in shape)
+    else:
+        check_entry(place, value, "(3,) or (L, 3)", len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0)
+
+
+def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, Any], default: float) -> list[tuple]:
+    """Each place of a light with its brightness, of which one may serve all."""
+    values = _separate_vectors(entries[name]) if name in entries else [default]
+    if len(values) not in (1, len(places)):
+        raise InputError(f"theta['light'] has {len(places)} {place}s but {len(values)} {PLURALS[name]}")
+    return list(zip(places, values * len(places) if len(values) == 1 else values, strict=True))
+
+
+def _separate_vectors(vectors: Array) -> list[Array]:
+    """The vectors (3,) of an array (3,) or (L, 3)."""
+    vectors = namespace(vectors).reshape(vectors, (-1, 3))
+    return [vectors[i, :] for i in range(vectors.shape[0])]

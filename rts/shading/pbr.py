@@ -1,0 +1,97 @@
+"""The shader `pbr`: metals and dielectrics of any roughness, with maps, by glTF 2.0, Appendix B."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rts.arrays.array_functions import described, dot, shape_of, unit
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array, Tree
+from rts.contracts.gbuffer import GBuffer
+from rts.errors import InputError
+from rts.scene.camera import Camera
+from rts.scene.row_cameras import RowCameras
+from rts.shading import microfacets
+from rts.shading.light import light_of
+from rts.shading.shaders import Unlit, is_behind
+from rts.shading.tangents import TANGENT
+from rts.shading.theta_entries import check_base, entry_of
+
+DIELECTRIC = 0.04
+"""The reflectance of dielectrics at normal incidence."""
+
+
+@dataclass(frozen=True)
+class Pbr(Unlit):
+    """Metallic-roughness shading of glTF 2.0 (Appendix B), two-sided.
+
+    A metal reflects its base colour. Anything else reflects 4 %, and the rest of its light has the base colour. Grazing
+    light is reflected entirely (Schlick); highlights have the shape of GGX, with Smith's height-correlated shadowing.
+    Light from all around is reflected by the split-sum approximation (Karis 2013), without shadows.
+
+    It reads, besides what `Unlit` reads and `rts.shading.light` has, these entries of θ, all differentiable:
+
+        "metallic" () or (h, w, 1)       0, the default, to 1
+        "roughness" () or (h, w, 1)      perceptual, 0 to 1, the default; below 0.045 it counts as 0.045
+        "normal_map" (h, w, 3)           directions x along u, y along v, z outward, of any length; not colours
+        "occlusion" () or (h, w, 1)      the share of light from all around that comes in, by default 1
+        "emissive" (3,) or (h, w, 3)     light of its own, by default none
+
+    Maps are looked up as the texture is. A normal map needs the G-buffer's "tangent".
+    """
+
+    takes_views = True
+    reads = (
+        *("normal", "color", "uv", "texture", "light", "metallic", "roughness", "normal_map", TANGENT),
+        *("occlusion", "emissive"),
+    )
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
+        """See `rts.Shader`."""
+        color, alpha = self.base_color(theta, gbuffer)
+        xp, light = namespace(color), light_of(theta, camera)
+        metallic, roughness = self._entry(theta, gbuffer, "metallic", 1), self._entry(theta, gbuffer, "roughness", 1)
+        metallic = 0.0 if metallic is None else metallic
+        roughness = 1.0 if roughness is None else xp.clip(roughness, microfacets.SMOOTHEST, 1.0)
+        reflectance = DIELECTRIC + metallic * (color - DIELECTRIC)
+        base = (1 - metallic) * (1 - reflectance) * color
+        normal, toward = self._normals(theta, gbuffer, camera), unit(camera.toward(gbuffer["position"]))
+        shown = xp.zeros_like(color)
+        for direction, brightness in light.lamps(gbuffer["position"]):
+            a, b, c = microfacets.of_light(normal, toward, direction, roughness)
+            shown = shown + (reflectance * a + b + base * c) * brightness
+        if light.surrounds:
+            (a, b, c), mean, blurred, flat = microfacets.around(normal, toward, roughness)
+            diffuse, reflected = light.diffuse(normal), light.reflected(mean, blurred)
+            reflected = reflected + flat * (diffuse - reflected)
+            around = (reflectance * a + b) * reflected + base * c * diffuse
+            occlusion = self._entry(theta, gbuffer, "occlusion", 1)
+            shown = shown + (around if occlusion is None else occlusion * around)
+        emissive = self._entry(theta, gbuffer, "emissive", 3)
+        return self.premultiplied(shown if emissive is None else shown + emissive, alpha)
+
+    def _normals(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
+        """Unit normals (N, 3), bent by the normal map; frames seen from behind are turned over, as glTF says."""
+        normal, xp = unit(gbuffer["normal"]), namespace(gbuffer["normal"])
+        bent = self._entry(theta, gbuffer, "normal_map", 3)
+        if bent is not None:
+            frame = gbuffer[TANGENT]
+            tangent = unit(frame[:, :3] - dot(normal, frame[:, :3]) * normal)
+            bitangent = frame[:, 3:] * xp.linalg.cross(normal, tangent)
+            normal = unit(bent[:, :1] * tangent + bent[:, 1:2] * bitangent + bent[:, 2:] * normal)
+        return xp.where(is_behind(gbuffer, camera), -normal, normal)
+
+    def _entry(self, theta: Mapping[str, Tree], gbuffer: GBuffer, name: str, channels: int) -> Any:
+        """A number (), a colour (3,), or a map's values (N, channels) at the samples; None if θ has no such entry."""
+        if name not in theta:
+            return None
+        shape = shape_of(theta[name])
+        if len(shape) != 3 and name != "normal_map":
+            return entry_of(theta, name, *(((), (1,)) if channels == 1 else ((3,),)))
+        if len(shape) != 3 or shape[2] != channels or 0 in shape:
+            raise InputError(f"theta[{name!r}] {described(theta[name])}; expected a map (h, w, {channels})")
+        values = self.looked_up(theta[name], gbuffer)
+        check_base(f"theta[{name!r}]", values)
+        return values

@@ -1,0 +1,52 @@
+"""Tangents: the direction in which u grows on a surface, by derivatives of the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from rts.arrays.array_functions import dot, unit
+from rts.arrays.engines import Context, namespace
+from rts.arrays.trees import Array, Tree
+from rts.contracts.records import Samples
+from rts.contracts.surface import Surface
+from rts.shading.parameter_steps import check_two_parameters, steps_beside
+
+TANGENT = "tangent"
+"""Name of the attribute in the G-buffer."""
+
+
+def tangents(
+    surface: Surface,
+    theta: Mapping[str, Tree],
+    samples: Samples,
+    gbuffer: Mapping[str, Array],
+    context: Context,
+) -> Array:
+    """Unit tangents along u, and the sign of the bitangent (N, 4), local space; differentiable in positions and uv.
+
+    The bitangent, along v, is sign · normal × tangent (MikkTSpace). A tangent is zero where uv does not change along
+    the surface. The surface is evaluated once for each parameter, `Surface.param_step` away from the sample's: exact
+    where position and uv are linear in the parameters, as on a mesh.
+
+    Args:
+        surface: a surface of two parameters a sample.
+        theta: the entries that the surface reads, arrays of the engine.
+        samples: the samples.
+        gbuffer: "position" (N, 3), "normal" (N, 3) and "uv" (N, 2) of the samples, local space.
+        context: the engine to compute with.
+
+    Raises:
+        InputError: samples have another number of parameters than two.
+    """
+    check_two_parameters(surface, samples, TANGENT, "normal maps")
+    params, position, uv = context.constants((samples.params, gbuffer["position"], gbuffer["uv"]))
+    xp, beside = namespace(position), replace(samples, params=params)
+    moves, changes = zip(*steps_beside(surface, theta, beside, position, uv), strict=True)
+    (au, av), (bu, bv) = ((change[:, :1], change[:, 1:2]) for change in changes)
+    mirrored = au * bv - av * bu < 0
+    along_u, along_v = moves[0] * bv - moves[1] * av, moves[1] * au - moves[0] * bu
+    along_u = xp.where(mirrored, -along_u, along_u)
+    turns_left = dot(xp.linalg.cross(gbuffer["normal"], along_u), xp.where(mirrored, -along_v, along_v)) >= 0
+    one = xp.ones_like(position[:, :1])
+    return xp.concat([unit(along_u), xp.where(turns_left, one, -one)], axis=1)

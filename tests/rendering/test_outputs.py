@@ -1,0 +1,217 @@
+"""Outputs of a render by name, against closed forms."""
+
+import numpy as np
+import pytest
+import torch
+
+import rts
+from tests.helpers import ALL, arrays, icosphere, mesh_part, to_numpy
+
+pytestmark = pytest.mark.rendering
+
+SIZE = 24
+NEAR, FAR = 2.0, 5.0
+"""Depths of a card and of a wall behind it."""
+EDGE = 0.13
+"""Where the card ends, NDC."""
+CAMERA = rts.Camera.look_at((0, 0, 0), (0, 0, -1), fov_y=90)
+SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
+REAL = ("color", "depth", "normal", "position", "alpha", "depth_front")
+
+
+def card(depth, left, right, half=9.0, **more):
+    """A part square to the camera at a depth, from x = left to right, of NDC."""
+    x = depth * np.array([left, right, right, left], np.float64)
+    y = depth * half * np.array([-1, -1, 1, 1], np.float64)
+    return rts.Part(rts.Mesh(SQUARE), {"vertices": np.stack([x, y, np.full(4, -depth)], axis=1), **more}, "silhouette")
+
+
+def pixels(ndc):
+    """Columns from the left side of the image to an x in NDC."""
+    return SIZE * (1 + ndc) / 2
+
+
+def moved(part, shift):
+    """The part, its vertices moved to the right by a number of pixels."""
+    depth = -float(part.theta["vertices"][0, 2])
+    vertices = torch.as_tensor(part.theta["vertices"]) + shift * torch.tensor([2 * depth / SIZE, 0, 0])
+    return part.replace(theta={**part.theta, "vertices": vertices})
+
+
+def test_a_card_before_a_wall_mixes_depth_by_area_and_moves_it():
+    shift = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    scene = [moved(card(NEAR, -9, EDGE), shift), card(FAR, -9, 9)]
+    found = rts.render(scene, CAMERA, (SIZE, SIZE), outputs=("depth", "depth_front", "part", "alpha"))
+    share = np.clip(pixels(EDGE) - np.arange(SIZE), 0, 1)
+    np.testing.assert_allclose(to_numpy(found["depth"])[5, :, 0], NEAR * share + FAR * (1 - share), atol=1e-5)
+    front = np.arange(SIZE) + 0.5 < pixels(EDGE)
+    np.testing.assert_allclose(to_numpy(found["depth_front"])[5, :, 0], np.where(front, NEAR, FAR), atol=1e-5)
+    np.testing.assert_array_equal(to_numpy(found["part"])[5, :, 0], np.where(front, 0, 1))
+    np.testing.assert_allclose(to_numpy(found["alpha"]), 1, atol=1e-6)
+    found["depth"][5].sum().backward()
+    np.testing.assert_allclose(float(shift.grad), NEAR - FAR, atol=1e-3)
+
+
+def test_means_are_of_what_is_covered_of_a_pixel():
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
+    shift = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    scene = moved(card(NEAR, -0.5, EDGE, uv=uv), shift)
+    names = ("depth", "normal", "position", "uv", "alpha", "color")
+    tensors = rts.render(scene, CAMERA, (SIZE, SIZE), outputs=names, background=(1.0, 0.0, 0.0))
+    found = {name: x[SIZE // 2] for name, x in to_numpy(tensors).items()}
+    column = int(pixels(EDGE))
+    share = pixels(EDGE) - column
+    middle = (column + share / 2) * 2 / SIZE - 1
+    np.testing.assert_allclose(found["alpha"][column], [share], atol=1e-6)
+    np.testing.assert_allclose(found["depth"][column], [NEAR], atol=1e-5)
+    np.testing.assert_allclose(found["normal"][column], [0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(found["position"][column, 0], NEAR * middle, atol=1e-3)
+    np.testing.assert_allclose(found["uv"][column, 0], (middle + 0.5) / (0.5 + EDGE), atol=1e-3)
+    np.testing.assert_allclose(found["color"][column], [1, share, share, 1], atol=1e-6)
+    for name in ("depth", "normal", "position", "uv", "alpha"):
+        np.testing.assert_array_equal(found[name][0], 0)
+    # Depth is the same wherever the card is; it covers one pixel more on the right, and one less on the left.
+    (slope,) = torch.autograd.grad(tensors["depth"].sum(), shift, retain_graph=True)
+    np.testing.assert_allclose(float(slope), 0, atol=1e-4)
+    (slope,) = torch.autograd.grad(tensors["alpha"][SIZE // 2, SIZE // 2 :].sum(), shift)
+    np.testing.assert_allclose(float(slope), 1, atol=1e-4)
+
+
+def test_depth_in_front_has_the_derivative_at_the_pixel_not_at_the_point():
+    depth = torch.tensor([2.0, 4.0, 4.0, 2.0], dtype=torch.float64)
+    shift = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    x, y = torch.tensor([-2.0, 2.0, 2.0, -2.0]), torch.tensor([-9.0, -9.0, 9.0, 9.0])
+    slanted = rts.Part(rts.Mesh(SQUARE), {"vertices": torch.stack([x + shift, y, -depth], dim=1)}, "silhouette")
+    front = rts.render(slanted, CAMERA, (SIZE, SIZE), outputs=("depth_front",))["depth_front"][SIZE // 2]
+    ndc = (np.arange(SIZE) + 0.5) * 2 / SIZE - 1
+    # On z = 3 + (x − s) / 2 and x = ndc z.
+    expected = 3 / (1 - ndc / 2)
+    there = (np.abs(ndc * expected) < 1.5).nonzero()[0]
+    np.testing.assert_allclose(to_numpy(front)[there, 0], expected[there], atol=1e-5)
+    front[there].sum().backward()
+    np.testing.assert_allclose(float(shift.grad), (-0.5 / (1 - ndc / 2))[there].sum(), rtol=0.01)
+
+
+@pytest.mark.parametrize("engine", ALL)
+def test_outputs_are_those_of_renders_one_by_one(engine):
+    ball, wall = mesh_part(icosphere(1)), card(4.0, -0.5, 0.9)
+    camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    scene = arrays(engine, [ball, wall])
+    together = rts.render(scene, camera, (20, 20), outputs=(*REAL, "part", "triangle"))
+    assert list(together) == [*REAL, "part", "triangle"]
+    np.testing.assert_array_equal(to_numpy(together["color"]), to_numpy(rts.render(scene, camera, (20, 20))))
+    for name in REAL:
+        alone = rts.render(scene, camera, (20, 20), outputs=[name])[name]
+        np.testing.assert_allclose(to_numpy(together[name]), to_numpy(alone), atol=1e-5)
+    several = rts.render_views(scene, [camera, camera], (20, 20), outputs=REAL)
+    for name in REAL:
+        np.testing.assert_allclose(to_numpy(several[name])[1], to_numpy(together[name]), atol=1e-5)
+    triangle, part = to_numpy(together["triangle"])[..., 0], to_numpy(together["part"])[..., 0]
+    assert triangle[part == 0].max() < len(ball.surface.faces) and set(triangle[part == 1]) <= {0, 1}
+    assert (triangle[part < 0] == -1).all()
+
+
+@pytest.mark.parametrize("options", [{"splatter": "multi"}, {"supersample": 2}, {"layers": 3}], ids=str)
+def test_other_settings_give_the_same_up_to_their_own_edges(options):
+    scene = mesh_part(icosphere(2), shader="lambert")
+    camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    usual = rts.render(scene, camera, (24, 24), outputs=("depth", "normal", "part"))
+    found = rts.render(scene, camera, (24, 24), outputs=("depth", "normal", "part"), **options)
+    inside = usual["depth"][..., 0] > 0
+    assert np.abs(found["depth"] - usual["depth"])[inside & (found["depth"][..., 0] > 0)].mean() < 0.03
+    assert (found["part"] >= 0).sum() > 100
+
+
+def test_light_that_passes_weighs_what_lies_behind():
+    glass = card(NEAR, -9, 9, color=np.array([1, 1, 1, 0.25])).replace(
+        shader=rts.plugin("rts.shaders", "unlit")(opaque=False)
+    )
+    found = rts.render([glass, card(FAR, -9, 9)], CAMERA, (8, 8), outputs=("depth", "alpha"))
+    np.testing.assert_allclose(found["depth"], 0.25 * NEAR + 0.75 * FAR, atol=1e-5)
+
+
+def test_attributes_of_the_surface_are_outputs():
+    colors = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], np.float64)
+    part = card(NEAR, -9, 9, colors=colors).replace(shader="silhouette")
+    with pytest.raises(rts.InputError, match="outputs has 'colours'.*did you mean 'color'"):
+        rts.render(part, CAMERA, (8, 8), outputs=("colours",))
+    with pytest.raises(rts.InputError, match="'uv' is an attribute that no part has"):
+        rts.render(part, CAMERA, (8, 8), outputs=("uv",))
+    for wrong in ("depth", (), [3]):
+        with pytest.raises(rts.InputError, match="expected a tuple of names"):
+            rts.render(part, CAMERA, (8, 8), outputs=wrong)
+
+
+def test_uv_is_zero_on_parts_without():
+    uv = np.array([[0.5, 0.5]] * 4)
+    found = rts.render([card(NEAR, -9, EDGE, uv=uv), card(FAR, -9, 9)], CAMERA, (SIZE, SIZE), outputs=("uv",))["uv"]
+    np.testing.assert_allclose(found[5, 0], 0.5, atol=1e-6)
+    np.testing.assert_allclose(found[5, -1], 0, atol=1e-6)
+
+
+@pytest.mark.thorough
+def test_outputs_inside_of_jit_are_those_outside():
+    jax = pytest.importorskip("jax")
+    part, camera = arrays("jax", mesh_part(icosphere(1))), rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    names = ("color", "depth", "depth_front", "part", "triangle")
+    found = jax.jit(lambda p: rts.render(p, camera, (16, 16), outputs=names))(part)
+    for name, expected in rts.render(part, camera, (16, 16), outputs=names).items():
+        np.testing.assert_allclose(found[name], expected, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------------------ residuals
+
+
+def test_a_pose_is_found_from_depth_where_colours_do_not_tell():
+    ball, camera = mesh_part(icosphere(2), shader="silhouette"), rts.Camera.look_at((0, 0, 0), (0, 0, -1), fov_y=60)
+    wall = card(6.0, -9, 9)
+
+    def scene(parameters):
+        return [ball.replace(transform=rts.rigid(parameters["pose"])), wall]
+
+    truth = {"pose": torch.tensor([0.0, 0.0, 0.0, 0.1, -0.05, -3.5])}
+    found = rts.render(scene(truth), camera, (20, 20), outputs=("depth", "normal"))
+    target = {name: x.detach() for name, x in found.items()}
+    residuals = rts.ImageResiduals(scene, camera, (20, 20), target, weights={"normal": 0.5})
+    assert residuals(truth).shape == (20 * 20 * 4,) and abs(residuals(truth)).max() < 1e-6
+    result = rts.fit(residuals, {"pose": torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -3.0])}, method="lm", steps=15)
+    np.testing.assert_allclose(to_numpy(result.parameters["pose"])[3:], to_numpy(truth["pose"])[3:], atol=5e-3)
+    coarse = residuals.at_stage(rts.Stage(0.5))
+    assert coarse(truth).shape == (10 * 10 * 4,)
+    views = rts.ImageResiduals(
+        lambda p: scene(p), [camera, camera], (20, 20), {"depth": torch.stack([target["depth"]] * 2)}
+    )
+    assert views(truth).shape == (2, 400) and abs(views(truth)).max() < 1e-4
+
+
+def test_depth_counts_where_it_was_measured_and_something_is_seen():
+    part = card(NEAR, -0.5, EDGE)
+    target = np.full((SIZE, SIZE), 3.0)
+    target[:, SIZE // 2 :] = 0
+    residuals = rts.ImageResiduals(lambda p: part, CAMERA, (SIZE, SIZE), {"depth": target}, weights={"depth": 2.0})
+    found = residuals({}).reshape(SIZE, SIZE)[3]
+    share = np.clip(np.arange(SIZE) + 1 - pixels(-0.5), 0, 1) * (np.arange(SIZE) < SIZE // 2)
+    np.testing.assert_allclose(found, 2 * (NEAR - 3.0) * share, atol=1e-5)
+
+
+def test_wrong_targets_of_outputs_are_refused():
+    ball, camera = mesh_part(icosphere(1), shader="silhouette"), rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+
+    def residuals(target, weights=None, cameras=camera):
+        return rts.ImageResiduals(lambda p: ball, cameras, (8, 8), target, weights=weights)
+
+    for target, message in (
+        ({"depth": np.zeros((4, 4))}, r"target\['depth'\].*expected real numbers \(8, 8\)"),
+        ({"part": np.zeros((8, 8))}, r"target\['part'\]"),
+        ({"depth": np.full((8, 8), np.nan)}, "NaN.*weight of 0"),
+        ({}, "expected a tuple of names"),
+        ({"depth": np.zeros((8, 8))}, "all zero, so that nothing is compared"),
+    ):
+        with pytest.raises(rts.InputError, match=message):
+            residuals(target)
+    with pytest.raises(rts.InputError, match="weights is .*by names of targets: depth"):
+        residuals({"depth": np.ones((8, 8))}, {"dept": 1.0})
+    with pytest.raises(rts.InputError, match="expected 2 targets of each output"):
+        residuals({"depth": np.ones((8, 8))}, cameras=[camera, camera])
+    with pytest.raises(rts.InputError, match="expected 1 numbers a pixel"):
+        residuals({"depth": np.ones((8, 8, 3))})({})

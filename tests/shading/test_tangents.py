@@ -1,0 +1,102 @@
+"""Tangents of surfaces, and normal maps, by closed form and against finite differences."""
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, FRONT, SIZE, arrays, finite_difference, gradient, mesh_part, quad, rigid, show
+
+import rts
+from rts import Camera
+
+pytestmark = pytest.mark.rendering
+
+UV = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+EYE = Camera.look_at((0.4, 0.7, 4), (0, 0, 0), fov_y=50, aspect=1.2)
+
+
+def tangent_of(theta, gbuffer, camera):
+    """The first three numbers, mapped from [−1, 1] to [0, 1], and the sign as alpha 1 or 1/2."""
+    tangent = gbuffer["tangent"]
+    xp = rts.namespace(tangent)
+    alpha = 0.75 + 0.25 * tangent[:, 3:]
+    return xp.concat([alpha * (tangent[:, :3] * 0.5 + 0.5), alpha], axis=1)
+
+
+tangent_of.takes_views, tangent_of.reads = True, ("tangent",)
+
+
+def seen(uv, **options):
+    """Tangent and sign in the middle of a square that faces the camera."""
+    part = mesh_part(quad(-1, 1, -1, 1), theta={"uv": np.asarray(uv, np.float32)}, shader=tangent_of, **options)
+    pixel = np.asarray(show(part, FRONT, splatter="none"))[SIZE[0] // 2, SIZE[1] // 2]
+    return np.round([*(2 * pixel[:3] / pixel[3] - 1), 4 * pixel[3] - 3], 5)
+
+
+def test_tangents_are_where_u_grows_and_the_sign_says_where_v_does():
+    np.testing.assert_allclose(seen(UV), [1, 0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(seen(0.1 * UV[:, ::-1]), [0, 1, 0, -1], atol=1e-5)
+    np.testing.assert_allclose(seen(UV * [-3, 1]), [-1, 0, 0, -1], atol=1e-5)
+    np.testing.assert_allclose(seen(UV * [1, -1]), [1, 0, 0, -1], atol=1e-5)
+    sheared = UV + 0.5 * UV[:, ::-1] * [1, 0]  # u grows along x alone where v stays.
+    np.testing.assert_allclose(seen(sheared), [1, 0, 0, 1], atol=1e-5)
+
+
+def test_tangents_move_with_the_part_and_a_mirror_changes_their_sign():
+    turn = rigid((0, 0, 1), 30)
+    np.testing.assert_allclose(seen(UV, transform=turn), [np.cos(np.pi / 6), 0.5, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(seen(UV, transform=np.diag([-1.0, 1, 1, 1])), [-1, 0, 0, -1], atol=1e-5)
+
+
+def test_views_together_have_the_tangents_of_each():
+    part = mesh_part(quad(-1, 1, -1, 1), theta={"uv": UV}, shader=tangent_of)
+    views = rts.render_views(part, [FRONT, EYE], SIZE, splatter="none")
+    for view, camera in zip(views, (FRONT, EYE), strict=True):
+        np.testing.assert_allclose(view, rts.render(part, camera, SIZE, splatter="none"), atol=1e-6)
+
+
+def test_tangents_of_curved_surfaces_are_their_derivatives():
+    # A quarter of a cylinder about y: u runs around it, so tangents are at right angles to normal and axis.
+    k = 0.5522847498
+    curve = np.array([(1, 0), (1, k), (k, 1), (0, 1)])
+    points = np.array([[(x, y, z) for x, z in curve] for y in (-0.6, -0.2, 0.2, 0.6)], np.float32)
+
+    def shader(theta, gbuffer, camera):
+        tangent, normal = gbuffer["tangent"], gbuffer["normal"]
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        off = abs((tangent[:, :3] * normal).sum(axis=1)) + abs(tangent[:, 1])
+        return np.stack([off, off, off, np.ones_like(off)], axis=1)
+
+    uv = np.array([(i / 3, j / 3) for j in range(4) for i in range(4)], np.float32)
+    part = rts.Part(rts.Bezier(np.arange(16)[None]), {"points": points.reshape(-1, 3), "uv": uv}, shader)
+    image = rts.render(part, Camera.look_at((3, 0.2, 3), (0.6, 0, 0.6), fov_y=40), (24, 24), splatter="none")
+    assert image[..., 3].sum() > 50 and image[..., :3].max() < 5e-3
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_shading_with_a_normal_map_has_the_derivatives_of_finite_differences(target):
+    rng = np.random.default_rng(0)
+    vertices, faces = quad(-1, 1, -1, 1)
+    vertices = vertices + 0.2 * rng.standard_normal(vertices.shape).astype(np.float32)
+    constant = {"normal_map": rng.uniform(-0.4, 0.4, (3, 4, 3)) + [0, 0, 0.8], "roughness": np.array(0.5)}
+    moving = {"vertices": vertices.astype(np.float64), "uv": UV + 0.1 * rng.standard_normal((4, 2))}
+    weights = rng.standard_normal((10, 12, 3))
+    part = rts.Part(rts.Mesh(faces), arrays("numpy", {**constant, **moving}, np.float64), "pbr")
+    frozen = rts.sample(part, EYE, (10, 12), splatter="none")
+
+    def f(theta, fixed, weights):
+        image = rts.render_samples(frozen, part.replace(theta={**fixed, **theta}), EYE, splatter="none")
+        return (image[..., :3] * weights).sum()
+
+    expected = finite_difference(lambda theta: f(theta, constant, weights), moving, 1e-5)
+    fixed, factors = arrays(target, (constant, weights))
+    found = gradient(target, lambda theta: f(theta, fixed, factors), arrays(target, moving))
+    for name in moving:
+        np.testing.assert_allclose(found[name], expected[name], atol=2e-3 * abs(expected[name]).max())
+
+
+def test_surfaces_of_other_parameters_have_no_tangents():
+    from rts.shading.tangents import tangents
+
+    samples = rts.sample(mesh_part(quad()), FRONT, SIZE).samples[0]
+    wrong = samples.replace(params=np.zeros((len(samples.ids), 3)))
+    with pytest.raises(rts.InputError, match="expected two: without them 'tangent'"):
+        tangents(rts.Mesh(quad()[1]), {}, wrong, {}, None)
