@@ -57,15 +57,17 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
-    xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
+    xp, samples, moved, first = namespace(found.rows), [], [], 0
     for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        count = of_cells.ids.shape[-2]
-        rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
+        moved.append(first + of_cells.ids.shape[-2])
         whole = in_one_table([of_cells, extra])
         if engine_of(whole.ids).padded(whole.ids):
             whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
         first += whole.ids.shape[-2]
+    rows, owners = found.rows, xp.reshape(xp.clip(found.parts, 0), (-1,))
+    moved = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
+    rows = xp.where(rows >= 0, rows + xp.reshape(moved, rows.shape), rows)
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
