@@ -122,7 +122,9 @@ def _found_on_host(
         known = [entered(arrays) for arrays in items]
         scenes = [own._replace(context=Context(engine_of(), None)) for own, *_ in known]
         batch = found_in_batch(scenes, [x[1] for x in known], [x[2] for x in known], most)
-        return batch and [in_arrays(own.parts, *one) for own, one in zip(scenes, batch, strict=True)]
+        if batch is None:
+            return None
+        return [in_arrays(own.parts, *one) for own, one in zip(scenes, batch, strict=True)]
 
     def in_arrays(parts: Sequence[CheckedPart], found: Found, more: Sequence[Samples]) -> list[np.ndarray]:
         arrays_of = []

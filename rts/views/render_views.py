@@ -127,26 +127,22 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of several views, without a background."""
-    of_each = [settings.of(scene) for scene in distinct(scenes)]
-    settings, cells = of_each[0], [settings.supersample * n + 2 * settings.apron for n in size]
-    views: list[View | None] = [None] * len(scenes)
-    whole = settings.layers != "auto" and len(settings.bands(size)) == 1 and settings.capacity is None
-    if whole and at_once((cells[0], cells[1])) > 1 and all(own == settings for own in of_each):
-        grids = [Grid.sampled(scene, scene.camera, _cells(size, settings), settings.apron) for scene in scenes]
-        views = [View.of(scene, grid) for scene, grid in zip(scenes, grids, strict=True)]
+    of_scene = {id(scene.parts): settings.of(scene) for scene in distinct(scenes)}
+    of_views = [of_scene[id(scene.parts)] for scene in scenes]
+    views = [_view(scene, size, own) for scene, own in zip(scenes, of_views, strict=True)]
     kinds: dict[Any, list[int]] = {}
     for b, view in enumerate(views):
-        kinds.setdefault(None if view is None else view.kind, []).append(b)
-    if len(of_each) == 1 and len(kinds) > 1:  # Views of one scene have another way to share a picture.
+        kinds.setdefault(None if view is None else (of_views[b], view.kind), []).append(b)
+    if len(of_scene) == 1 and len(kinds) > 1:  # Views of one scene have another way to share a picture.
         kinds = {None: list(range(len(scenes)))}
     images: list[Any] = [None] * len(scenes)
     for kind, indices in kinds.items():
         own = [scenes[b] for b in indices]
         if kind is not None and len(indices) > 1:
             together = [view for b in indices if (view := views[b]) is not None]
-            drawn = _drawn_at_once(together, (cells[0], cells[1]), context, settings)
+            drawn = _drawn_at_once(together, context, of_views[indices[0]])
         elif len(distinct(own)) == 1 and len(own) > 1:
-            drawn = _images_of_scene(own, size, context, settings)
+            drawn = _images_of_scene(own, size, context, of_views[indices[0]])
         else:
             drawn = [image_of(scene, size, context, settings) for scene in own]
         if len(indices) == len(scenes) and not isinstance(drawn, list):
@@ -156,8 +152,17 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     return namespace(*images).stack(images)
 
 
-def _drawn_at_once(views: Sequence[View], cells: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
-    """The images (B, H, W, C + 1) of views of one kind, of so many cells each."""
+def _view(scene: Scene, size: tuple[int, int], settings: RenderSettings) -> View | None:
+    """The view of a scene that can be drawn along with others; None for one that has to be drawn by itself."""
+    if settings.layers == "auto" or len(settings.bands(size)) > 1 or settings.capacity is not None:
+        return None
+    grid = Grid.sampled(scene, scene.camera, _cells(size, settings), settings.apron)
+    return View.of(scene, grid) if at_once(grid.size) > 1 else None
+
+
+def _drawn_at_once(views: Sequence[View], context: Context, settings: RenderSettings) -> Array:
+    """The images (B, H, W, C + 1) of views of one kind."""
+    cells = views[0].grid.size
     chunks = _chunks(views, at_once(cells))
     place = Picture.of(len(chunks[0]), cells)
     pictures = [sampled_at_once(chunk, place._replace(views=len(chunk)), settings) for chunk in chunks]

@@ -103,13 +103,15 @@ class JaxEngine(Engine):
         def counted(results: Sequence) -> list[np.ndarray | np.generic]:
             return [*results, np.int32(max((len(results[i]) for i in packed), default=0))]
 
-        many = getattr(fn, "many", None)
-        function = host.Function(
-            lambda *operands: counted(noticed(fn, *operands)),
-            many and (lambda items: list(map(counted, noticed(many, items)))),
-        )
+        def one(*operands: Any) -> list[np.ndarray | np.generic]:
+            return counted(noticed(fn, *operands))
+
+        def together(items: Any) -> list[Any]:
+            return [counted(results) for results in noticed(many, items)]
+
+        many: Any = getattr(fn, "many", None)
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
-        *results, used = host.call(function, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
+        *results, used = host.call(one, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args, many=many and together)
         for i in packed:
             self._used.note(results[i], used)
         return tuple(results)

@@ -29,6 +29,10 @@ except ImportError:  # jax before 0.6.1.
     buffer_callback = None
 
 
+HostFunction = Callable[..., Sequence[Any]]
+"""A function of NumPy arrays that gives NumPy arrays; or of those of several items."""
+
+
 class Function(NamedTuple):
     """A function of the host.
 
@@ -37,8 +41,8 @@ class Function(NamedTuple):
         many: the same for several items at once, from the operands of each to the results of each; None for none.
     """
 
-    one: Callable[..., Sequence[np.ndarray | np.generic]]
-    many: Callable[[Sequence[Sequence[np.ndarray]]], Sequence[Sequence[np.ndarray | np.generic]]] | None = None
+    one: HostFunction
+    many: HostFunction | None = None
 
     def of_batch(self, mapped: Sequence[bool]) -> Function:
         """The function of a batch: operands that are `mapped` have an axis of items first, and so have all results.
@@ -111,14 +115,16 @@ def _emitted(ctx: Any, *operands: Any, function: Filler, shapes: Shapes) -> Sequ
     return emit(ctx, results, None, operands, ctx.avals_in, ctx.avals_out, has_side_effect=False)[0]
 
 
-def call(function: Function, shapes: Shapes, *operands: Any) -> list[jax.Array]:
+def call(function: HostFunction, shapes: Shapes, *operands: Any, many: HostFunction | None = None) -> list[jax.Array]:
     """The results of a host function in any traced program, which keeps the function alive.
 
     Results that the program does not use are not copied. A result that is shorter along an axis than its shape says is
-    padded with zeros; a longer one raises a ValueError. Under `vmap` the function is called once, if it takes `many`
-    items; else for each item.
+    padded with zeros; a longer one raises a ValueError. Under `vmap` the function is called for each item, or `many`
+    once for all, if it is given.
     """
-    return _call.bind(*operands, function=function, shapes=tuple(shapes), used=tuple(range(len(shapes))))
+    return _call.bind(
+        *operands, function=Function(function, many), shapes=tuple(shapes), used=tuple(range(len(shapes)))
+    )
 
 
 _call = Primitive("rts_host_call")

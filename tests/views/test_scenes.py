@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, box, gradient, icosphere, relative_error, rigid, to_numpy
+from mixed_scenes import mixed_of
 
 import rts
 from rts import Camera, InputError
@@ -119,6 +120,17 @@ def test_scenes_of_numpy_and_of_surfaces_that_share_no_pass_are_those_of_a_loop(
     images = rts.render_views(mixed, CAMERAS, SIZE)
     expected = [rts.render(own, camera, SIZE) for own, camera in zip(mixed, CAMERAS, strict=True)]
     np.testing.assert_allclose(images, np.stack(expected), rtol=0, atol=2e-5)
+
+
+def test_scenes_of_the_generator_are_those_of_a_loop(drawn):
+    cameras = [Camera.look_at((16 * np.sin(b), 4, 16 * np.cos(b)), (0, 0, 0), fov_y=60) for b in range(6)]
+    scenes = [[part.replace(cull="none") for part in mixed_of(b).parts] for b in range(6)]
+    options = {"layers": 3, "engine": TORCH[0].split("-")[0]}
+    once = to_numpy(rts.render_views(scenes, cameras, SIZE, **options))
+    loop = [to_numpy(rts.render(own, camera, SIZE, **options)) for own, camera in zip(scenes, cameras, strict=True)]
+    # Opaque scenes have one layer, and share a picture of their own.
+    assert drawn == [5]
+    np.testing.assert_allclose(once, np.stack(loop), rtol=0, atol=1e-9)
 
 
 def test_residuals_of_several_views_take_scenes():
