@@ -3,11 +3,13 @@
     python -m benchmarks.many_parts
     python -m benchmarks.many_parts --parts 10 100 --links 11
     python -m benchmarks.many_parts --parts --scenes 16
+    python -m benchmarks.many_parts --parts --poses 64
 
 A part is a closed cylinder of 512 faces, with a matrix of its own, seen as a silhouette. Both ways take turns in one
 run; memory is the most that one step takes. With `--links`, a chain of so many parts is fitted by Levenberg–Marquardt.
 With `--scenes`, so many meshes of 320 to 2,700 faces are rendered, each by a camera of its own: by one call of
-`rts.render_views`, and by a loop of `rts.render`.
+`rts.render_views`, and by a loop of `rts.render`. With `--poses`, the losses and gradients of so many poses of a mesh
+of 320 faces are computed with jax, by a loop over `jit` and by `jit(vmap)`.
 """
 
 from __future__ import annotations
@@ -169,12 +171,40 @@ def batches(count: int) -> None:
                 print(f"| {shader}, {side}², {what} | {times} | {memory[0]:.1f} | {memory[1]:.1f} |", flush=True)
 
 
+def poses(count: int, side: int = 64, rounds: int = 15) -> None:
+    """Print the times of losses of many poses, and of their gradients, with jax."""
+    import jax
+
+    ball = trimesh.creation.icosphere(2)
+    surface, vertices = rts.Mesh(ball.faces), np.asarray(ball.vertices, np.float32)
+    camera = rts.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40)
+
+    def loss(pose: jax.Array) -> jax.Array:
+        part = rts.Part(surface, {"vertices": vertices}, "silhouette", transform=rts.rigid(pose))
+        return (rts.render(part, camera, (side, side)) ** 2).mean()
+
+    every = jax.numpy.asarray(0.1 * np.random.default_rng(0).normal(size=(count, 6)), "float32")
+    one, together = jax.jit(jax.value_and_grad(loss)), jax.jit(jax.vmap(jax.value_and_grad(loss)))
+    times: dict[str, list[tuple[float, float]]] = {"loop over jit": [], "jit(vmap)": []}
+    for number in range(rounds + 2):
+        for name, run in zip(times, (lambda: [one(pose) for pose in every], lambda: together(every)), strict=True):
+            start = time.perf_counter(), time.process_time()
+            jax.block_until_ready(run())
+            if number > 1:
+                times[name].append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    print("\n| poses | ms | CPU ms |\n| --- | --- | --- |")
+    for name, found in times.items():
+        wall, cpu = 1e3 * np.median(found, axis=0)
+        print(f"| {name} | {wall:.0f} | {cpu:.0f} |", flush=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="*", type=int, default=PARTS)
     parser.add_argument("--shader", default="silhouette")
     parser.add_argument("--links", type=int, default=0)
     parser.add_argument("--scenes", type=int, default=0)
+    parser.add_argument("--poses", type=int, default=0)
     args = parser.parse_args(arguments)
     print(f"| parts | each, ms | merged, ms | ratio | each, MB | merged, MB |\n{'| --- ' * 6}|")
     for count in args.parts:
@@ -188,6 +218,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         chain(args.links)
     if args.scenes:
         batches(args.scenes)
+    if args.poses:
+        poses(args.poses)
 
 
 if __name__ == "__main__":
