@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rts.arrays.trees import Tree
 from rts.contracts.records import Samples
 from rts.outlines.found import Found
 from rts.outlines.gaps import Fronts
@@ -19,7 +20,11 @@ OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "
 
 
 def found_in_batch(
-    scenes: Sequence[Scene], grids: Sequence[Grid], centres: Sequence[Fronts], most: int | None
+    scenes: Sequence[Scene],
+    grids: Sequence[Grid],
+    centres: Sequence[Fronts],
+    inputs: Sequence[Sequence[Tree]],
+    most: int | None,
 ) -> list[tuple[Found, list[Samples]]] | None:
     """Outlines and the samples beside breaks, as of `found_in_views`, of each item of a batch.
 
@@ -27,14 +32,15 @@ def found_in_batch(
         scenes: the scene of each item, with arrays of the host.
         grids: its cells, as many for all.
         centres: what is seen at their centres.
+        inputs: of the proxies of the parts of each, on the host.
         most: the number of breaks that there is room for in each item, if it is limited.
 
     Returns:
         None where not all items can be drawn at once, or one has more breaks than there is room for.
     """
     views = []
-    for scene, grid in zip(scenes, grids, strict=True):
-        view = View.of(scene, grid)
+    for one in zip(scenes, grids, inputs, strict=True):
+        view = View.of(*one)
         if view is None or (views and view.kind != views[0].kind):
             return None
         views.append(view)

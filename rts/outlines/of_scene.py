@@ -121,7 +121,8 @@ def _found_on_host(
     def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]] | None:
         known = [entered(arrays) for arrays in items]
         scenes = [own._replace(context=Context(engine_of(), None)) for own, *_ in known]
-        batch = found_in_batch(scenes, [x[1] for x in known], [x[2] for x in known], most)
+        _, grids, centres, of_proxies = zip(*known, strict=True)
+        batch = found_in_batch(scenes, grids, centres, of_proxies, most)
         if batch is None:
             return None
         return [in_arrays(own.parts, *one) for own, one in zip(scenes, batch, strict=True)]

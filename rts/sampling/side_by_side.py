@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays.trees import map_leaves
+from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.records import Proxy
 from rts.sampling.camera_checks import check_camera
 from rts.sampling.entries import entry_of, host_value, is_known, on_host, proxy_inputs
@@ -47,10 +47,11 @@ class View(NamedTuple):
     kind: tuple
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid) -> View | None:
+    def of(cls, scene: Scene, grid: Grid, inputs: Sequence[Tree] | None = None) -> View | None:
         """A view that can be drawn along with others; None for one that has to be drawn by itself.
 
         Its parts must be such as can be `Joint`, of few triangles, all of one sampler. All vertices must lie in it.
+        `inputs` of each part's proxy, on the host, are read where it has no entry; None to make them.
         """
         sampler, cull, like = scene.samplers[0], scene.parts[0].cull, scene.context.like
         if not isinstance(sampler, TriangleSampler) or (like is not None and scene.context.engine.padded(like)):
@@ -66,11 +67,12 @@ class View(NamedTuple):
             return None
         proxies, seen, mirrored = [], [], False
         sign = Camera(np.eye(4), p).kept_sign(cull)
-        for part, entry in zip(scene.parts, scene.entries, strict=True):
+        for index, (part, entry) in enumerate(zip(scene.parts, scene.entries, strict=True)):
             local = on_host(grid.camera.within(part.transform).for_size(grid.size))
             local = check_camera(local, *([] if part.transform is None else [host_value(part.transform)]))
             if entry is None:
-                entry = entry_of(part, sampler, map_leaves(host_value, proxy_inputs(part)), local, grid.size)
+                own = map_leaves(host_value, proxy_inputs(part)) if inputs is None else inputs[index]
+                entry = entry_of(part, sampler, own, local, grid.size)
             if not 0 < len(entry.proxy.faces) <= MOST:
                 return None
             rows = np.concatenate([p[:2] @ local.view, local.view[2:3]])
