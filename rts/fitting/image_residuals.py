@@ -41,7 +41,8 @@ from rts.views.scenes import are_scenes
 
 Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]
-SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
+Scenes = Sequence[Sequence[Part] | Prepared]
+SceneFunction = Callable[[Tree], "Parts | Scenes | tuple[Parts | Scenes, Cameras]"]
 
 
 class ImageResiduals(Residuals):
