@@ -2,9 +2,14 @@
 
     python -m benchmarks.many_parts
     python -m benchmarks.many_parts --parts 10 100 --links 11
+    python -m benchmarks.many_parts --parts --scenes 16
+    python -m benchmarks.many_parts --parts --poses 64
 
 A part is a closed cylinder of 512 faces, with a matrix of its own, seen as a silhouette. Both ways take turns in one
 run; memory is the most that one step takes. With `--links`, a chain of so many parts is fitted by Levenberg–Marquardt.
+With `--scenes`, so many meshes of 320 to 2,700 faces are rendered, each by a camera of its own: by one call of
+`rts.render_views`, and by a loop of `rts.render`. With `--poses`, the losses and gradients of so many poses of a mesh
+of 320 faces are computed with jax, by a loop over `jit` and by `jit(vmap)`.
 """
 
 from __future__ import annotations
@@ -112,11 +117,94 @@ def chain(count: int) -> None:
         print(f"| {name} | {seconds:.1f} | {number} | {off:.1e} |", flush=True)
 
 
+def batch(count: int, side: int, shader: str, what: str) -> dict[str, Callable[[], object]]:
+    """Images of meshes with a scene and a camera each, and with their gradient in `what`, "pose" or "vertices"."""
+    meshes, cameras = [], []
+    for b in range(count):
+        mesh = trimesh.creation.icosphere(2 + b % 2)
+        if b % 4 > 1:
+            mesh = trimesh.creation.torus(0.8, 0.3, major_sections=24 + 4 * b % 64, minor_sections=16)
+        vertices = np.asarray(mesh.vertices, np.float32)
+        vertices = 0.6 * vertices * (1 + 0.2 * np.sin(3 * vertices[:, :1] + b))
+        meshes.append((rts.Mesh(mesh.faces), vertices))
+        cameras.append(rts.Camera.look_at((3 * np.sin(b), 1, 3 * np.cos(b)), (0, 0, 0)))
+
+    def scenes() -> list[list[rts.Part]]:
+        poses = torch.zeros((count, 6), requires_grad=True)
+        if what == "pose":
+            moves = [rts.rigid(pose) for pose in poses]
+            own = [rts.Part(m, {"vertices": v}, shader, transform=t) for (m, v), t in zip(meshes, moves, strict=True)]
+        else:
+            own = [rts.Part(m, {"vertices": torch.tensor(v, requires_grad=True)}, shader) for m, v in meshes]
+        return [[part] for part in own]
+
+    def step(together: bool, gradient: bool) -> Callable[[], object]:
+        def run() -> None:
+            every = scenes()
+            if together:
+                images = rts.render_views(every, cameras, (side, side))
+            else:
+                views = zip(every, cameras, strict=True)
+                images = torch.stack([rts.render(own, camera, (side, side)) for own, camera in views])
+            loss = images.square().mean()
+            if gradient:
+                loss.backward()
+
+        return run
+
+    kinds = [(way, name) for way in ("loop", "batch") for name in ("value", "gradient")]
+    return {f"{way}, {name}": step(way == "batch", name == "gradient") for way, name in kinds}
+
+
+def batches(count: int) -> None:
+    """Print the times of batches of meshes beside a loop."""
+    columns = "shader, side, in", "loop, ms", "batch, ms", "ratio", "values alone", "loop, MB", "batch, MB"
+    print(f"\n| {' | '.join(columns)} |\n{'| --- ' * len(columns)}|")
+    for shader in ("silhouette", "lambert"):
+        for side in (64, 128):
+            for what in ("pose", "vertices"):
+                functions = batch(count, side, shader, what)
+                t = {name: found["ms"] for name, found in in_turn(functions, ROUNDS).items()}
+                loop, once, ratio = t["loop, gradient"], t["batch, gradient"], t["loop, value"] / t["batch, value"]
+                memory = [most_memory(functions[f"{way}, gradient"]) for way in ("loop", "batch")]
+                times = f"{loop:.0f} | {once:.0f} | {loop / once:.2f} | {ratio:.2f}"
+                print(f"| {shader}, {side}², {what} | {times} | {memory[0]:.1f} | {memory[1]:.1f} |", flush=True)
+
+
+def poses(count: int, side: int = 64, rounds: int = 15) -> None:
+    """Print the times of losses of many poses, and of their gradients, with jax."""
+    import jax
+
+    ball = trimesh.creation.icosphere(2)
+    surface, vertices = rts.Mesh(ball.faces), np.asarray(ball.vertices, np.float32)
+    camera = rts.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40)
+
+    def loss(pose: jax.Array) -> jax.Array:
+        part = rts.Part(surface, {"vertices": vertices}, "silhouette", transform=rts.rigid(pose))
+        return (rts.render(part, camera, (side, side)) ** 2).mean()
+
+    every = jax.numpy.asarray(0.1 * np.random.default_rng(0).normal(size=(count, 6)), "float32")
+    one, together = jax.jit(jax.value_and_grad(loss)), jax.jit(jax.vmap(jax.value_and_grad(loss)))
+    times: dict[str, list[tuple[float, float]]] = {"loop over jit": [], "jit(vmap)": []}
+    for number in range(rounds + 2):
+        for name, run in zip(times, (lambda: [one(pose) for pose in every], lambda: together(every)), strict=True):
+            start = time.perf_counter(), time.process_time()
+            jax.block_until_ready(run())
+            if number > 1:
+                times[name].append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    print("\n| poses | ms | CPU ms |\n| --- | --- | --- |")
+    for name, found in times.items():
+        wall, cpu = 1e3 * np.median(found, axis=0)
+        print(f"| {name} | {wall:.0f} | {cpu:.0f} |", flush=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", type=int, default=PARTS)
+    parser.add_argument("--parts", nargs="*", type=int, default=PARTS)
     parser.add_argument("--shader", default="silhouette")
     parser.add_argument("--links", type=int, default=0)
+    parser.add_argument("--scenes", type=int, default=0)
+    parser.add_argument("--poses", type=int, default=0)
     args = parser.parse_args(arguments)
     print(f"| parts | each, ms | merged, ms | ratio | each, MB | merged, MB |\n{'| --- ' * 6}|")
     for count in args.parts:
@@ -128,6 +216,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.links:
         print("\n| chain | CPU s | steps | error of angles |\n| --- | --- | --- | --- |")
         chain(args.links)
+    if args.scenes:
+        batches(args.scenes)
+    if args.poses:
+        poses(args.poses)
 
 
 if __name__ == "__main__":

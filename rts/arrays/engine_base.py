@@ -48,7 +48,8 @@ class Engine(Plugin):
         """Call `fn` on NumPy views or copies of `args`; the results carry no derivative and live where `args` do.
 
         Args:
-            fn: host arrays → as many host arrays as there are specs.
+            fn: host arrays → as many host arrays as there are specs. It may have a method `many`: the operands of each
+                of several items → the results of each. Under `vmap` that is called, once for the whole batch.
             specs: an `ArraySpec` for each result; where it says `packed`, the engine may append rows of zeros.
             *args: arrays.
         """

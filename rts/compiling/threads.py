@@ -278,3 +278,26 @@ def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
     if errors:
         raise errors[min(errors)]
     return results
+
+
+class OnAllCores:
+    """A function of arrays on the host whose calls for the items of a batch share all cores; see `Engine.call_host`.
+
+    Args:
+        function: a function that several threads may call at once.
+        together: the operands of each item → the results of each, found in another way; or None where there is none.
+    """
+
+    def __init__(
+        self, function: Callable, together: Callable[[Sequence[Sequence[Any]]], list[Any] | None] | None = None
+    ):
+        self._function, self._together = function, together
+
+    def __call__(self, *operands: Any) -> Any:
+        """The function's results."""
+        return self._function(*operands)
+
+    def many(self, items: Sequence[Sequence[Any]]) -> list[Any]:
+        """The function's results for the operands of each item."""
+        results = None if self._together is None else self._together(items)
+        return each(lambda operands: self._function(*operands), items) if results is None else results

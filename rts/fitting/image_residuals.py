@@ -37,10 +37,12 @@ from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.views.render_views import render_views
+from rts.views.scenes import are_scenes
 
 Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]
-SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
+Scenes = Sequence[Sequence[Part] | Prepared]
+SceneFunction = Callable[[Tree], "Parts | Scenes | tuple[Parts | Scenes, Cameras]"]
 
 
 class ImageResiduals(Residuals):
@@ -52,7 +54,8 @@ class ImageResiduals(Residuals):
     A target of B views is compared with B renders, as `rts.render_views` makes them.
 
     Args:
-        scene: parameters → part, parts or the result of `prepare`; or a tuple of these and a camera, or cameras.
+        scene: parameters → part, parts or the result of `prepare`; or a tuple of these and a camera, or cameras. Of
+            several views it may give a list of scenes, one for each, as `rts.render_views` takes it.
         camera: the camera, if `scene` gives none; of several views a list, or the result of `Camera.stack`.
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
@@ -284,6 +287,12 @@ class ImageResiduals(Residuals):
         """
         parts, camera = self._scene_as_given(parameters)
         several = bool(self._views) or self._view is not None
+        if are_scenes(parts):
+            count = len(parts)
+            if not several or (self._views and count != len(self._views)):
+                targets = len(self._views) if several else "one view"
+                raise InputError(f"scene gave {count} scenes for targets of {targets}; expected one for each view")
+            parts = parts if self._view is None else parts[self._view]
         if not several and (not isinstance(camera, Camera) or camera.is_stacked):
             raise InputError("there are several cameras for a target of one view; expected targets (B, H, W, ·)")
         cameras: list[Any] = check_cameras(camera) if several else [camera]
@@ -302,6 +311,9 @@ class ImageResiduals(Residuals):
         if isinstance(scene, tuple) and len(scene) == 2 and _are_cameras(parts := scene[1]):
             return scene[0], parts
         parts = scene if isinstance(scene, (list, tuple)) else [scene]
+        if are_scenes(parts):
+            every = [part for own in parts for part in (own if isinstance(own, (list, tuple)) else [own])]
+            parts = [] if any(not isinstance(own, Prepared) and not own for own in parts) else every
         if not parts or not all(isinstance(part, (Part, Prepared)) for part in parts):
             kinds = ", ".join(map(kind_of, parts)) or "nothing"
             raise InputError(

@@ -9,16 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays.engines import engine_of, floating_bits, is_traced, namespace, stopped
+from rts.arrays.engines import Context, engine_of, floating_bits, is_traced, namespace, stopped, value_of
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
+from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
 from rts.outlines.found import Found, columns
+from rts.outlines.gaps import Fronts
+from rts.outlines.of_batch import found_in_batch
 from rts.outlines.points import Points, at_centres, found_in_views
 from rts.sampling.entries import host_value, is_batched, proxy_inputs
 from rts.sampling.scene import Grid, Scene, has_sheets
 from rts.sampling.tables import in_one_table, taken_rows
+from rts.sampling.triangle_sampler import TriangleSampler
 
 
 def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | None = None) -> Sampled:
@@ -57,15 +62,17 @@ def with_outlines(sampled: Sampled, scene: Scene, grid: Grid, capacity: int | No
         arrays = [np.asarray(x, spec.dtype) for x, spec in zip(here, specs, strict=True)]
         # Engines that compile eager operations anew for each shape pad them.
         found = Found(*engine_of(sampled.row).call_host(lambda _: arrays, specs, sampled.row))
-    xp, samples, first, rows = namespace(found.rows), [], 0, found.rows
+    xp, samples, moved, first = namespace(found.rows), [], [], 0
     for part, (of_cells, extra) in enumerate(zip(sampled.samples, more, strict=True)):
-        count = of_cells.ids.shape[-2]
-        rows = xp.where((found.parts == part) & (found.rows >= 0), found.rows + (first + count), rows)
+        moved.append(first + of_cells.ids.shape[-2])
         whole = in_one_table([of_cells, extra])
         if engine_of(whole.ids).padded(whole.ids):
             whole = _without_gaps(whole, of_cells, xp.where(found.parts == part, found.rows, -1))
         samples.append(whole)
         first += whole.ids.shape[-2]
+    rows, owners = found.rows, xp.reshape(xp.clip(found.parts, 0), (-1,))
+    moved = xp.take(engine_of(rows).constant(np.asarray(moved, np.int32), rows), owners, axis=0)
+    rows = xp.where(rows >= 0, rows + xp.reshape(moved, rows.shape), rows)
     outlines = found.outlines(rows)
     overflow, cells = sampled.overflow + found.left, _renumbered(replace(sampled, cells=cells), samples)
     return replace(sampled, samples=tuple(samples), cells=cells, outlines=outlines, overflow=overflow)
@@ -92,19 +99,35 @@ def _found_on_host(
     rows = (columns(layers)[0] + 1) * (most or 0)
     room = [_rooms(*pair, rows, capacity) for pair in zip(scene.parts, sampled.samples, strict=True)]
 
-    def host(*arrays: np.ndarray) -> list[np.ndarray]:
+    def entered(arrays: Sequence[np.ndarray]) -> tuple[Scene, Grid, Fronts, list[Tree]]:
+        """Scene, cells, what is seen at their centres, and the inputs of proxies, on the host."""
         values = iter(arrays)
         known = map_leaves(lambda x: x if type(x) is np.ndarray else next(values), inputs)
         of_parts, whole, camera, cells = known
         own_parts = zip(scene.parts, of_parts, strict=True)
         parts = [replace(part, transform=moved, theta=theta) for part, (moved, theta, _) in own_parts]
-        entered = [x for *_, x in of_parts]
-        points = Points.of(scene._replace(parts=parts, camera=whole), Grid(camera, grid.size), entered)
-        centres, count = at_centres(cells, sampled.samples), most
+        here = scene._replace(parts=parts, camera=whole)
+        return here, Grid(camera, grid.size), at_centres(cells, sampled.samples), [x for *_, x in of_parts]
+
+    def host(*arrays: np.ndarray) -> list[np.ndarray]:
+        here, own_grid, centres, known = entered(arrays)
+        points, count = Points.of(here, own_grid, known), most
         (found,), more = found_in_views([points], [centres], count)
         while count and not all(map(_has_room, more, room)):
             count //= 2
             (found,), more = found_in_views([points], [centres], count)
+        return in_arrays(here.parts, found, more)
+
+    def together(items: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]] | None:
+        known = [entered(arrays) for arrays in items]
+        scenes = [own._replace(context=Context(engine_of(), None)) for own, *_ in known]
+        _, grids, centres, of_proxies = zip(*known, strict=True)
+        batch = found_in_batch(scenes, grids, centres, of_proxies, most)
+        if batch is None:
+            return None
+        return [in_arrays(own.parts, *one) for own, one in zip(scenes, batch, strict=True)]
+
+    def in_arrays(parts: Sequence[CheckedPart], found: Found, more: Sequence[Samples]) -> list[np.ndarray]:
         arrays_of = []
         for part, samples, tables in zip(parts, more, owners, strict=True):
             known_of, kinds = _tables(samples), {kind for kind, _ in tables}
@@ -121,9 +144,16 @@ def _found_on_host(
             dtype = np.dtype(str(x.dtype).rpartition(".")[2])  # torch's own have its name before.
             count = rooms.get(name, rows) if kind == "tables" else rows
             specs.append(ArraySpec((count, *x.shape[1:]), dtype, packed=True))
-    results = iter(engine_of(sampled.row, *operands).call_host(host, specs, *operands))
+    at_once = all(map(_samples_at_once, scene.parts, scene.samplers))
+    call = OnAllCores(host, together) if at_once else host
+    results = iter(engine_of(sampled.row, *operands).call_host(call, specs, *operands))
     found = Found(*islice(results, len(Found._fields)))
     return found, [_with_tables(of, {name: next(results) for name in _tables(of)}) for of in sampled.samples]
+
+
+def _samples_at_once(part: CheckedPart, sampler: Sampler) -> bool:
+    """True if several threads may sample points of a part at once."""
+    return has_sheets(part, sampler) and isinstance(sampler, TriangleSampler) and sampler.draws_at_once
 
 
 def real_of(scene: Scene) -> Any:
@@ -169,7 +199,11 @@ def _renumbered(sampled: Sampled, samples: Sequence[Samples]) -> Cells:
         return replace(sampled.cells, triangle=None)
     row, counts = sampled.row, [before.ids.shape[-2] for before in sampled.samples]
     more = [of.ids.shape[-2] - count for of, count in zip(samples, counts, strict=True)]
-    shift = engine_of(row).constant(np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), row)
-    xp = namespace(row)
+    shift, engine = np.repeat(np.cumsum([0, *more[:-1]]), counts).astype(np.int32), engine_of(row)
+    known = value_of(row)
+    if known is not None and not is_batched(row):
+        place = np.append(np.arange(len(shift), dtype=np.int32) + shift, np.int32(-1))
+        return replace(sampled.cells, row=engine.constant(place[known], row), triangle=None)
+    xp, shift = namespace(row), engine.constant(shift, row)
     moved = row + xp.reshape(xp.take(shift, xp.reshape(xp.clip(row, 0), (-1,)), axis=0), row.shape)
     return replace(sampled.cells, row=xp.where(row >= 0, moved, row), triangle=None)

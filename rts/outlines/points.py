@@ -152,10 +152,12 @@ class Points:
         part = np.where(breaks.near == 2, -1, np.where(breaks.near == 1, breaks.parts[:, 1], breaks.parts[:, 0]))
         rows = np.full((len(part), 2), -1, np.int32)
         for index, known in enumerate(self._parts):
-            at = np.flatnonzero(part == index)
             surface, points, triangles = self._scene.parts[index].surface, breaks.points, breaks.triangles
             drawn = isinstance(known[0], TriangleSampler)
-            if not len(at) or (drawn and not overrides(surface, "refine_outlines", TriangleSurface)):
+            if drawn and not overrides(surface, "refine_outlines", TriangleSurface):
+                continue
+            at = np.flatnonzero(part == index)
+            if not len(at):
                 continue
             ending = at, breaks.near[at]
             fragments = self.on_sheets(index, points[ending], triangles[ending]) if drawn else None
@@ -271,9 +273,8 @@ class Points:
 
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
-    part = np.minimum(cells.row, np.int32(0))
-    for first in np.cumsum([one.ids.shape[-2] for one in samples])[:-1]:
-        part += cells.row >= first
+    owners = np.repeat(np.arange(len(samples), dtype=np.int32), [one.ids.shape[-2] for one in samples])
+    part = np.append(owners, np.int32(-1))[cells.row]
     triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
     assert cells.depth is not None
     return Fronts(part, triangle, cells.depth.astype(np.float64))

@@ -11,6 +11,7 @@ from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import shape_of, unit
 from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array, Tree
+from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.shader import Shader
@@ -56,9 +57,14 @@ class Outputs:
 
     def of_scene(self, scene: Scene) -> Scene:
         """The scene with shaders that give the means, too, as channels before alpha."""
+        return self.of_scenes([scene])[0]
+
+    def of_scenes(self, scenes: Sequence[Scene]) -> list[Scene]:
+        """The scenes as of `of_scene`; those that share a list of parts do so still."""
         if not self.means:
-            return scene
-        return scene._replace(parts=[replace(part, shader=_Widened(part.shader, self)) for part in scene.parts])
+            return list(scenes)
+        parts = {id(scene.parts): [_widened(part, self) for part in scene.parts] for scene in scenes}
+        return [scene._replace(parts=parts[id(scene.parts)]) for scene in scenes]
 
     def of_settings(self, settings: RenderSettings) -> RenderSettings:
         """The settings under which samples tell what is asked for."""
@@ -134,6 +140,16 @@ class _Widened(Shader):
 
     def __repr__(self) -> str:
         return repr(self._shader)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Widened) and self._shader == other._shader and self._outputs is other._outputs
+
+    def __hash__(self) -> int:
+        return hash((_Widened, self._shader))
+
+
+def _widened(part: CheckedPart, outputs: Outputs) -> CheckedPart:
+    return replace(part, shader=_Widened(part.shader, outputs))
 
 
 def fronts_of(names: Sequence[str], sampled: Sampled, splats: Splats) -> list[Array]:

@@ -11,14 +11,14 @@ from typing import Any
 
 from rts.arrays.array_functions import described, kind_of, shape_of
 from rts.arrays.engine_base import Engine
-from rts.arrays.engines import Context, is_constant, namespace
+from rts.arrays.engines import Context, is_constant
 from rts.arrays.trees import Array, Tree
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.result_checks import check_shaded
 from rts.errors import InputError
-from rts.operations.linear import affine_map
+from rts.rendering.part_transforms import OneTransform, ViewTransforms
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.tangents import TANGENT, tangents
@@ -86,7 +86,7 @@ def add_footprint(
 def shade(
     part: CheckedPart,
     theta: Mapping[str, Tree],
-    transform: Array | None,
+    transform: Array | ViewTransforms | None,
     samples: Samples,
     local: GBuffer,
     camera: Camera | RowCameras,
@@ -97,7 +97,7 @@ def shade(
     Args:
         part: the part.
         theta: the result of `theta_of`.
-        transform: the part's transform, in arrays of the engine.
+        transform: the part's transform, in arrays of the engine; or that of each sample.
         samples: the samples.
         local: their G-buffer, in local space.
         camera: the camera of the whole image, or of each sample.
@@ -167,7 +167,7 @@ class _UnreadError(Exception):
 def _colors(
     part: CheckedPart,
     theta: Mapping[str, Tree],
-    transform: Array | None,
+    transform: Array | ViewTransforms | None,
     camera: Camera | RowCameras,
     names: Sequence[str],
     attributes: Mapping[str, Array],
@@ -207,7 +207,7 @@ def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
     return readable
 
 
-def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
+def _to_world(gbuffer: GBuffer, transform: Array | ViewTransforms | None) -> GBuffer:
     """The G-buffer with positions, normals and tangents moved by the part's transform."""
     if transform is None:
         return gbuffer
@@ -215,32 +215,10 @@ def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
     world.like = gbuffer.like
     for name in gbuffer:
         world.defer(name, lambda name=name: gbuffer[name])
-    world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))
+    moves = transform if isinstance(transform, ViewTransforms) else OneTransform(transform)
+    world.defer("position", lambda: moves.points(gbuffer["position"]))
     if "normal" in gbuffer:
-        world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
+        world.defer("normal", lambda: moves.normals(gbuffer["normal"]))
     if TANGENT in gbuffer:
-        world.defer(TANGENT, lambda: _move_tangents(transform, gbuffer[TANGENT]))
+        world.defer(TANGENT, lambda: moves.tangents(gbuffer[TANGENT]))
     return world
-
-
-def _move_normals(transform: Array, normals: Array) -> Array:
-    """Normals (N, 3), of any length, under an affine map: times the cofactor matrix; a mirror keeps them outward."""
-    xp = namespace(transform)
-    a, b, c = (transform[:3, i] for i in range(3))
-    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    outside = _sign(xp.sum(a * cofactors[0]))
-    return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))
-
-
-def _move_tangents(transform: Array, tangents: Array) -> Array:
-    """Tangents with signs (N, 4) under an affine map, of any length; a mirror changes the signs."""
-    xp = namespace(transform)
-    a, b, c = (transform[:3, i] for i in range(3))
-    moved = sum(tangents[:, i : i + 1] * x for i, x in enumerate((a, b, c)))
-    return xp.concat([moved, tangents[:, 3:] * _sign(xp.sum(a * xp.linalg.cross(b, c)))], axis=1)
-
-
-def _sign(volume: Array) -> Array:
-    """1 () for the volume of an affine map's columns, −1 for that of one that mirrors."""
-    xp = namespace(volume)
-    return xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))

@@ -11,6 +11,7 @@ import numpy as np
 
 from rts.arrays.engines import context_of, floating_bits, is_constant, stopped
 from rts.arrays.trees import Array, leaves, map_leaves
+from rts.compiling.threads import OnAllCores
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.contracts.surface import TriangleSurface
@@ -79,6 +80,7 @@ class HostCall:
         cameras: cameras in the part's local space, without derivatives.
         bounds: bounds on the number of samples.
         entry: the part's prepared entry, if known; the inputs of its proxy are then not read.
+        concurrent: True if several threads may sample the part at once, as they then do under `vmap`.
     """
 
     def __init__(
@@ -88,7 +90,9 @@ class HostCall:
         cameras: Sequence[Camera],
         bounds: SampleBounds,
         entry: Entry | None,
+        concurrent: bool = False,
     ):
+        self._concurrent = concurrent
         self._surface, self._cameras, self._bounds, self._entry = surface, cameras, bounds, entry
         self._transform = [] if part.transform is None else [part.transform]
         self._engine, like = context_of(part.theta, cameras)
@@ -149,7 +153,7 @@ class HostCall:
         specs = *sample_specs, *beside.values(), *tables.values(), *self._attributes.values()
         matrices = [m for camera in self._cameras for m in (camera.view, camera.projection)]
         operands = *matrices, *self._transform, *arrays, *leaves(self._inputs)
-        results = iter(self._engine.call_host(host, specs, *operands))
+        results = iter(self._engine.call_host(OnAllCores(host) if self._concurrent else host, specs, *operands))
         ids, params, row, depth, overflow = islice(results, len(sample_specs))
         more, filled, attributes = (dict(zip(x, results, strict=False)) for x in (beside, tables, self._attributes))
         found = Samples(

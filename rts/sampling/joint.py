@@ -67,17 +67,24 @@ class Joint:
     @classmethod
     def of(cls, scene: Scene, first: int, proxies: Sequence[Proxy], cameras: Sequence[Camera]) -> Joint:
         """Join the parts from `first` on, given their proxies and the camera in the local space of each."""
-        starts = np.cumsum([0, *(len(proxy.faces) for proxy in proxies)], dtype=np.int32)
         alike = all(np.array_equal(camera.view, cameras[0].view) for camera in cameras[1:])
         vertices = [proxy.vertices for proxy in proxies]
         if not alike:
             vertices = [_moved(x, camera.view) for x, camera in zip(vertices, cameras, strict=True)]
+        camera = cameras[0] if alike else Camera(np.eye(4), cameras[0].projection)
+        return cls.seen_from(camera, scene, first, proxies, vertices)
+
+    @classmethod
+    def seen_from(
+        cls, camera: Camera, scene: Scene, first: int, proxies: Sequence[Proxy], vertices: Sequence[np.ndarray]
+    ) -> Joint:
+        """Join the parts from `first` on, given their proxies and where their vertices are in the space of a camera."""
+        starts = np.cumsum([0, *(len(proxy.faces) for proxy in proxies)], dtype=np.int32)
         shifts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
         faces = np.concatenate([proxy.faces + shift for proxy, shift in zip(proxies, shifts, strict=False)])
         ids = np.concatenate([proxy.faces if proxy.ids is None else proxy.ids for proxy in proxies])
         params = [proxy.corner_params for proxy in proxies if proxy.corner_params is not None]
         proxy = Proxy(np.concatenate(vertices), faces, ids, np.concatenate(params) if params else None)
-        camera = cameras[0] if alike else Camera(np.eye(4), cameras[0].projection)
         sampler = scene.samplers[first]
         assert isinstance(sampler, TriangleSampler)
         return cls(scene, first, starts, proxies, proxy, camera, scene.parts[first].cull, sampler)
@@ -154,7 +161,7 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
     These are parts of meshes and other triangles that are no approximation, of one sampler that `joins_parts`. Engines
     that pad arrays, and traced values, have none.
     """
-    suited = [_is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
+    suited = [is_suited(part, sampler) for part, sampler in zip(scene.parts, scene.samplers, strict=True)]
     if sum(suited) < 2 or not all(map(has_sheets, scene.parts, scene.samplers)) or not is_known(scene, grid):
         return scene
     like = scene.context.like
@@ -162,9 +169,9 @@ def with_joints(scene: Scene, grid: Grid) -> Scene:
         return scene
     joints = []
     runs = itertools.groupby(range(len(scene.parts)), lambda i: (suited[i], scene.parts[i].cull, id(scene.samplers[i])))
-    for (is_suited, *_), run in runs:
+    for (suits, *_), run in runs:
         indices = list(run)
-        if is_suited and len(indices) > 1:
+        if suits and len(indices) > 1:
             joints += _joined(scene, grid, indices)
     return scene._replace(joints=tuple(joints))
 
@@ -192,7 +199,7 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
             yield Joint.of(scene, own[0], [proxies[i] for i in own], [cameras[i] for i in own])
 
 
-def _is_suited(part: CheckedPart, sampler: object) -> bool:
+def is_suited(part: CheckedPart, sampler: object) -> bool:
     """True if a part can be sampled along with others."""
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or not isinstance(surface, TriangleSurface):

@@ -14,8 +14,8 @@ from rts.outlines.gaps import Fronts
 from rts.outlines.of_scene import real_of
 from rts.outlines.points import Points, at_centres, found_in_views
 from rts.sampling.entries import host_value, inputs_of
+from rts.sampling.picture import outlines_side_by_side
 from rts.sampling.tables import in_one_table, taken_rows
-from rts.views.picture import outlines_side_by_side
 from rts.views.sampled_views import Sampling, Views, with_counts
 
 

@@ -1,4 +1,4 @@
-"""Several views of one scene rendered in one call, side by side in pictures where possible."""
+"""Several views rendered in one call, of one scene or of a scene each, side by side in pictures where possible."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from rts.rendering.outputs import Outputs
 from rts.rendering.samples import sampled_scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.shade import shaded_at_once
-from rts.sampling.prepared import Prepared
-from rts.sampling.scene import Scene
+from rts.sampling.picture import Picture, at_once
+from rts.sampling.scene import Grid, Scene
+from rts.sampling.side_by_side import View
 from rts.scene.camera import Camera
-from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
+from rts.views.joint_views import sampled_at_once
 from rts.views.outlines import with_outlines_of_views
-from rts.views.picture import Picture, at_once
 from rts.views.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
+from rts.views.scenes import SceneParts, check_scene_channels, distinct, scenes_of_views
 from rts.views.splats import views_to_splats
 
 _T = TypeVar("_T")
@@ -37,7 +38,7 @@ _T = TypeVar("_T")
 
 @uncompiled
 def render_views(
-    parts: Part | Sequence[Part] | Prepared,
+    parts: SceneParts | Sequence[SceneParts],
     cameras: Sequence[Camera] | Camera,
     size: tuple[int, int],
     *,
@@ -50,18 +51,23 @@ def render_views(
     engine: str | None = None,
     outputs: Sequence[str] | None = None,
 ) -> Array:
-    """Render several views of a scene. The images equal the results of a loop of `render` up to rounding.
+    """Render several views, of one scene or of a scene each. Images equal a loop of `render` up to rounding.
 
     Views lie side by side in pictures of at most 1024² cells. Python's overhead, results for the whole of θ such as
     smooth normals, and one splat then serve all views. So does one call of a shader that `takes_views`, as the built-in
-    shaders without mipmaps do. The splatter "edges" finds the outlines of each view by itself. With jax, and under
-    `torch.func`, views share a picture only if all fit into one, and if each shader takes views or gives one colour.
-    Otherwise views are rendered one after another; so they are with `layers="auto"`, but not with "edges" where all is
-    opaque, and if images are rendered in bands. NumPy views that are too large for a picture are rendered one on each
-    core. With torch and jax all views are in memory at once, with a gradient or without.
+    shaders without mipmaps do, if it reads the same entries of θ in all views.
+
+    Views that show small meshes whole are also sampled at once, outlines included; see the guide "Many parts" for which
+    meshes these are. Other views of one scene are sampled one by one. Other scenes are rendered one after another; so
+    are all with `layers="auto"`, but not with "edges" where all is opaque, and if images are rendered in bands.
+
+    With jax, and under `torch.func`, scenes are rendered one after another. Views of one scene share a picture only if
+    all fit into one, and if each shader takes views or gives one colour. NumPy views that are too large for a picture
+    are rendered one on each core. With torch and jax all views are in memory at once, with a gradient or without.
 
     Args:
-        parts: as in `render`.
+        parts: as in `render`, of one scene for all views; or a list of B scenes, each a list of parts or the result of
+            `prepare`.
         cameras: B cameras, or one stacked by `Camera.stack`.
         size: (height, width) of each view, in pixels.
         sampler: as in `render`.
@@ -86,24 +92,25 @@ def render_views(
         AspectWarning: a camera is for images of another ratio of width to height.
     """
     wanted, camera_list = None if outputs is None else Outputs(outputs), check_cameras(cameras)
-    scene = Scene.of(parts, camera_list[0], sampler, engine)
     size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
-    context = context_of_scene(scene.parts, camera_list, engine=engine)
-    scenes = [scene._replace(camera=camera, context=context).at(size) for camera in camera_list]
-    background = _check_backgrounds(background, len(camera_list), size, scene.channels)
+    scenes = scenes_of_views(parts, camera_list, sampler, engine)
+    context = context_of_scene([part for scene in distinct(scenes) for part in scene.parts], camera_list, engine=engine)
+    scenes = [scene._replace(context=context).at(size) for scene in scenes]
+    channels = check_scene_channels(scenes)
+    background = _check_backgrounds(background, len(camera_list), size, channels)
     if not is_constant(background):
-        context = scene.context_with(camera_list, background)
+        context = scenes[0].context_with([scene.parts for scene in distinct(scenes)], camera_list, background)
     if wanted is not None and wanted.fronts:
         each_view = [outputs_over(view_scene, size, None, settings, wanted) for view_scene in scenes]
         found = {name: namespace(x).stack([view[name] for view in each_view]) for name, x in each_view[0].items()}
     else:
-        shown = scenes if wanted is None else [wanted.of_scene(view_scene) for view_scene in scenes]
+        shown = scenes if wanted is None else wanted.of_scenes(scenes)
         images = _images(shown, size, context, settings)
         for b, view_scene in enumerate(scenes):
             warned_if_empty(images[b], view_scene, f"view {b}")
         if wanted is None:
             return over_background(images, background)
-        found = wanted.taken(images, (), scene.channels)
+        found = wanted.taken(images, (), channels)
     if "color" in found:
         found["color"] = over_background(found["color"], background)
     return found
@@ -119,8 +126,58 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 
 def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
+    """The images (B, H, W, C + 1) of several views, without a background."""
+    of_scene = {id(scene.parts): settings.of(scene) for scene in distinct(scenes)}
+    of_views = [of_scene[id(scene.parts)] for scene in scenes]
+    views = [_view(scene, size, own) for scene, own in zip(scenes, of_views, strict=True)]
+    kinds: dict[Any, list[int]] = {}
+    for b, view in enumerate(views):
+        kinds.setdefault(None if view is None else (of_views[b], view.kind), []).append(b)
+    if len(of_scene) == 1 and len(kinds) > 1:  # Views of one scene have another way to share a picture.
+        kinds = {None: list(range(len(scenes)))}
+    images: list[Any] = [None] * len(scenes)
+    for kind, indices in kinds.items():
+        own = [scenes[b] for b in indices]
+        if kind is not None and len(indices) > 1:
+            together = [view for b in indices if (view := views[b]) is not None]
+            drawn = _drawn_at_once(together, context, of_views[indices[0]])
+        elif len(distinct(own)) == 1 and len(own) > 1:
+            drawn = _images_of_scene(own, size, context, of_views[indices[0]])
+        else:
+            drawn = [image_of(scene, size, context, settings) for scene in own]
+        if len(indices) == len(scenes) and not isinstance(drawn, list):
+            return drawn
+        for b, image in zip(indices, drawn, strict=True):
+            images[b] = image
+    return namespace(*images).stack(images)
+
+
+def _view(scene: Scene, size: tuple[int, int], settings: RenderSettings) -> View | None:
+    """The view of a scene that can be drawn along with others; None for one that has to be drawn by itself."""
+    if settings.layers == "auto" or len(settings.bands(size)) > 1 or settings.capacity is not None:
+        return None
+    grid = Grid.sampled(scene, scene.camera, _cells(size, settings), settings.apron)
+    return View.of(scene, grid) if at_once(grid.size) > 1 else None
+
+
+def _drawn_at_once(views: Sequence[View], context: Context, settings: RenderSettings) -> Array:
+    """The images (B, H, W, C + 1) of views of one kind."""
+    cells = views[0].grid.size
+    chunks = _chunks(views, at_once(cells))
+    place = Picture.of(len(chunks[0]), cells)
+    pictures = [sampled_at_once(chunk, place._replace(views=len(chunk)), settings) for chunk in chunks]
+    return _as_pictures(pictures, [view.scene for view in views], context, settings)
+
+
+def _cells(size: tuple[int, int], settings: RenderSettings) -> tuple[int, int]:
+    """(height, width) of an image in cells."""
+    return settings.supersample * size[0], settings.supersample * size[1]
+
+
+def _images_of_scene(
+    scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings
+) -> Array:
     """The images (B, H, W, C + 1) of several views of one scene, without a background."""
-    settings = settings.of(scenes[0])
     differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # With layers="auto" sampling may warn, and warnings belong to this thread.
     several = settings.layers != "auto" and _concurrent(scenes[0])
@@ -191,8 +248,9 @@ def _as_pictures(
 ) -> Array:
     """The images (B, H, W, C + 1) of sampled views, splatted picture by picture."""
     images, cameras, splatter = [], [scene.camera for scene in scenes], settings.splatter
+    parts = [scene.parts for scene in scenes]
     assert splatter is not None
-    for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
+    for views, splats in zip(pictures, views_to_splats(pictures, parts, cameras, context), strict=True):
         cells = views.picture.split(cropped_image(splatter, splats), views.sampled.apron)
         xp, (count, height, width, channels), factor = namespace(cells), cells.shape, views.sampled.supersample
         if factor > 1:

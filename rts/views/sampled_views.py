@@ -26,12 +26,12 @@ from rts.sampling.cache import Entry
 from rts.sampling.host_call import HostCall, SampleBounds
 from rts.sampling.merging import merge
 from rts.sampling.packing import pack_fragments
+from rts.sampling.picture import Picture, outlines_side_by_side, renumbered
 from rts.sampling.sample_checks import check_fragments
 from rts.sampling.scene import Grid, Scene
 from rts.sampling.tables import in_one_table
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
-from rts.views.picture import Picture, outlines_side_by_side, renumbered
 
 
 class Views(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,29 +14,32 @@ from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.result_checks import check_splats
 from rts.operations.projection import projective_map_of_views
-from rts.rendering.shade import add_footprint, evaluate, shade, shaded_at_once, split_by_view, theta_of
+from rts.rendering.part_transforms import ViewTransforms
+from rts.rendering.shade import add_footprint, shade, shaded_at_once, theta_of
 from rts.rendering.splats import all_in_use, concatenated, of_inputs, on_rays, owned, splats_of
 from rts.sampling.scene import Grid
 from rts.sampling.tables import in_one_table
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
+from rts.views.evaluated import Evaluated
 from rts.views.sampled_views import Views
 
 
 def views_to_splats(
     pictures: Sequence[Views],
-    parts: Sequence[CheckedPart],
+    parts: Sequence[Sequence[CheckedPart]],
     cameras: Sequence[Camera],
     context: Context,
 ) -> list[Splats]:
     """The splats of pictures of several views. They have no border: each view keeps its apron.
 
-    A surface is evaluated once, at the samples of all views, so that results for the whole of θ serve all. Shaders that
-    take views are called once, too; others are called view by view.
+    A part that all views share is evaluated once, at the samples of all, so that results for the whole of θ serve all.
+    Shaders that take views are called once, if θ has the same entries for them in every view; others are called view by
+    view.
 
     Args:
         pictures: the samples of the views; pictures are of one size.
-        parts: checked parts.
+        parts: checked parts of each view. The first parts of all views share a table of samples, and so on.
         cameras: the camera of each view, in order, which shaders see.
         context: as in `to_splats`.
     """
@@ -44,21 +48,21 @@ def views_to_splats(
     (height, width), border = pictures[0].picture.view, sampled[0].apron
     grids = [Grid.around(camera, (height - 2 * border, width - 2 * border), border) for camera in cameras]
     shown = [
-        _positions_and_colors(index, part, pictures, sampled, cameras, grids, context)
-        for index, part in enumerate(parts)
+        _positions_and_colors(index, places, pictures, sampled, cameras, grids, context)
+        for index, places in enumerate(itertools.zip_longest(*parts))
     ]
     splats, start = [], 0
     for picture, whole in zip(pictures, sampled, strict=True):
         here = slice(start, start := start + picture.picture.views)
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = concatenated(*zip(*of_parts, strict=True))
-        splats.append(splats_of(whole, parts, positions, rgba, context))
+        splats.append(splats_of(whole, [own for several in parts for own in several], positions, rgba, context))
     return splats
 
 
 def _positions_and_colors(
     index: int,
-    part: CheckedPart,
+    parts: Sequence[CheckedPart | None],
     pictures: Sequence[Views],
     sampled: Sequence[Sampled],
     cameras: Sequence[Camera],
@@ -69,7 +73,8 @@ def _positions_and_colors(
 
     Args:
         index: the index of the part.
-        part: the part; it must be `shaded_at_once` if the number of samples in each view is unknown.
+        parts: the part of each view; None where a view has fewer. If the number of samples in each view is unknown, it
+            must be one part, which is `shaded_at_once`.
         pictures: the views.
         sampled: their samples, in arrays of the engine.
         cameras: the camera of the whole image of each view.
@@ -84,43 +89,45 @@ def _positions_and_colors(
         # Engines that pad rows have all views in one picture.
         used = all_in_use(whole, inputs, outlines.rows if len(sampled) == 1 else None, before)
     counts, size = _counts_of(pictures, index), grids[0].size
-    theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
-    gbuffer = evaluate(part, whole, inputs)
+    shown = Evaluated.of(parts, whole, counts, inputs)
     view, first = [], 0
     for picture in pictures:
         view.append(picture.view[index] + first if first else picture.view[index])
         first += picture.picture.views
     (view,) = concatenated([inputs.constants(numbers) for numbers in view])
-    local_cameras = [g.camera.replace(view=inputs.constants(g.camera.view)).within(transform) for g in grids]
-    rows = namespace(local_cameras[0].view).stack([camera.pixel_rows(size) for camera in local_cameras])
-    points = on_rays(whole, gbuffer["position"])
+    local_cameras = [
+        g.camera.replace(view=inputs.constants(g.camera.view)).within(transform)
+        for g, transform in zip(grids, shown.transforms, strict=True)
+    ]
+    rows = namespace(*(camera.view for camera in local_cameras)).stack(
+        context_of(*(c.view for c in local_cameras)).constants([camera.pixel_rows(size) for camera in local_cameras])
+    )
+    points = on_rays(whole, shown.gbuffer["position"])
     rows, points = context_of(rows, points).constants((rows, points))
     places = _places_of(pictures, Context(engine_of(points), points))
     positions = context.constants(projective_map_of_views(rows, points, view, places))
     cameras = context.constants(cameras)
-    if shaded_at_once(part):
+    part = shown.part
+    if part is not None and shaded_at_once(part):
         camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
-        rgba = shade(part, theta, transform, used, gbuffer, camera, engine)[1]
+        moved = shown.transforms[0] if shown.one else ViewTransforms.of(shown.transforms, view)
+        rgba = shade(part, theta_of(part, inputs), moved, used, shown.gbuffer, camera, engine)[1]
     else:
         assert counts is not None
-        shaded = []
-        for local_camera, (samples, local) in zip(
-            local_cameras, split_by_view(whole, gbuffer, counts.tolist(), engine), strict=True
-        ):
-            add_footprint(part, samples, local, local_camera, size, inputs)
-            shaded.append((samples, local))
 
-        def colored(pair: tuple) -> Array:
-            camera, (samples, local) = pair
-            if not local["position"].shape[0]:
+        def colored(view: tuple) -> Array:
+            own, transform, grid_camera, camera, (samples, local) = view
+            if own is None or not local["position"].shape[0]:
                 # Shaders may expect a row at least.
-                none = namespace(local["position"]).broadcast_to(
-                    local["position"][:, :1], (0, part.shader.channels + 1)
-                )
-                return context.constants(none)
-            return context.constants(shade(part, theta, transform, samples, local, camera, engine)[1])
+                like = shown.gbuffer["position"]
+                channels = next(p for p in parts if p is not None).shader.channels
+                return context.constants(namespace(like).broadcast_to(like[:1, :1], (1, channels + 1))[:0, ...])
+            add_footprint(own, samples, local, grid_camera, size, inputs)
+            theta = theta_of(own, inputs)
+            return context.constants(shade(own, theta, transform, samples, local, camera, engine)[1])
 
-        views = list(zip(cameras, shaded, strict=True))
+        split = shown.split(whole, counts, engine)
+        views = list(zip(parts, shown.transforms, local_cameras, cameras, split, strict=True))
         colors = [colored(views[0])]
         colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray else map(colored, views[1:])
         (rgba,) = concatenated(colors)
@@ -128,8 +135,10 @@ def _positions_and_colors(
     if engine_of(rgba) is not engine:
         positions, rgba = context_of(rgba).constants((positions, rgba))
     # Values in unused rows are not checked.
-    every = np.arange(gbuffer["position"].shape[0], dtype=np.int32)[None, None] if counts is not None else whole.row
-    check_splats(index, part, gbuffer, positions, rgba, every, 0)
+    count = shown.gbuffer["position"].shape[0]
+    every = np.arange(count, dtype=np.int32)[None, None] if counts is not None else whole.row
+    own = next(p for p in parts if p is not None)
+    check_splats(index, own, shown.gbuffer, positions, rgba, every, 0)
     return positions, rgba
 
 

@@ -93,16 +93,25 @@ class JaxEngine(Engine):
 
         packed = [i for i, spec in enumerate(specs) if spec.packed]
 
-        def noticed(*host_args: Any) -> Sequence[np.ndarray | np.generic]:
+        def noticed(call: Callable, *operands: Any) -> Any:
             try:
-                results = fn(*host_args)
+                return call(*operands)
             except RtsError as error:
                 self._error = error
                 raise
+
+        def counted(results: Sequence) -> list[np.ndarray | np.generic]:
             return [*results, np.int32(max((len(results[i]) for i in packed), default=0))]
 
+        def one(*operands: Any) -> list[np.ndarray | np.generic]:
+            return counted(noticed(fn, *operands))
+
+        def together(items: Any) -> list[Any]:
+            return [counted(results) for results in noticed(many, items)]
+
+        many: Any = getattr(fn, "many", None)
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
-        *results, used = host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
+        *results, used = host.call(one, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args, many=many and together)
         for i in packed:
             self._used.note(results[i], used)
         return tuple(results)

@@ -14,7 +14,7 @@ import functools
 import mmap
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,41 @@ try:
 except ImportError:  # jax before 0.6.1.
     buffer_callback = None
 
-HostFunction = Callable[..., Sequence[np.ndarray | np.generic]]
-"""Function from NumPy arrays, which are read-only and lent for the length of the call, to NumPy arrays."""
+
+HostFunction = Callable[..., Sequence[Any]]
+"""A function of NumPy arrays that gives NumPy arrays; or of those of several items."""
+
+
+class Function(NamedTuple):
+    """A function of the host.
+
+    Attributes:
+        one: from NumPy arrays, which are read-only and lent for the length of the call, to NumPy arrays.
+        many: the same for several items at once, from the operands of each to the results of each; None for none.
+    """
+
+    one: HostFunction
+    many: HostFunction | None = None
+
+    def of_batch(self, mapped: Sequence[bool]) -> Function:
+        """The function of a batch: operands that are `mapped` have an axis of items first, and so have all results.
+
+        A result is the list of its items, which may differ in length.
+        """
+        many = self.many
+        assert many is not None
+
+        def items(operands: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
+            count = next(len(x) for x, m in zip(operands, mapped, strict=True) if m)
+            return [[x[b, ...] if m else x for x, m in zip(operands, mapped, strict=True)] for b in range(count)]
+
+        def of_batches(batches: Sequence[Sequence[np.ndarray]]) -> list[list[Any]]:
+            of_each = [items(operands) for operands in batches]
+            results = iter(many([item for of_batch in of_each for item in of_batch]))
+            return [list(map(list, zip(*(next(results) for _ in of_batch), strict=True))) for of_batch in of_each]
+
+        return Function(lambda *operands: of_batches([operands])[0], of_batches)
+
 
 Filler = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 """Function of operands, which are read-only, and of results, which it fills; both are lent for the call."""
@@ -82,13 +115,16 @@ def _emitted(ctx: Any, *operands: Any, function: Filler, shapes: Shapes) -> Sequ
     return emit(ctx, results, None, operands, ctx.avals_in, ctx.avals_out, has_side_effect=False)[0]
 
 
-def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Array]:
+def call(function: HostFunction, shapes: Shapes, *operands: Any, many: HostFunction | None = None) -> list[jax.Array]:
     """The results of a host function in any traced program, which keeps the function alive.
 
     Results that the program does not use are not copied. A result that is shorter along an axis than its shape says is
-    padded with zeros; a longer one raises a ValueError. Under `vmap` the function is called for each item.
+    padded with zeros; a longer one raises a ValueError. Under `vmap` the function is called for each item, or `many`
+    once for all, if it is given.
     """
-    return _call.bind(*operands, function=function, shapes=tuple(shapes), used=tuple(range(len(shapes))))
+    return _call.bind(
+        *operands, function=Function(function, many), shapes=tuple(shapes), used=tuple(range(len(shapes)))
+    )
 
 
 _call = Primitive("rts_host_call")
@@ -101,12 +137,21 @@ def _run(*operands: Any, **params: Any) -> list[jax.Array]:
 
 
 @_call.def_abstract_eval
-def _results(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[ShapedArray]:
+def _results(*operands: Any, function: Function, shapes: Shapes, used: Sequence[int]) -> list[ShapedArray]:
     return [ShapedArray(shapes[i].shape, shapes[i].dtype) for i in used]
 
 
 def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
     mapped = [jnp.moveaxis(x, d, 0) for x, d in zip(operands, dims, strict=True) if d is not None]
+    if params["function"].many is not None:
+        moved = iter(mapped)
+        whole = [x if d is None else next(moved) for x, d in zip(operands, dims, strict=True)]
+        params["function"] = params["function"].of_batch([d is not None for d in dims])
+        params["shapes"] = tuple(
+            jax.ShapeDtypeStruct((mapped[0].shape[0], *s.shape), s.dtype) for s in params["shapes"]
+        )
+        results = _call.bind(*whole, **params)
+        return results, [0] * len(results)
 
     def item(mapped_items: list) -> list[jax.Array]:
         it = iter(mapped_items)
@@ -129,20 +174,23 @@ def _without_unused(wanted: Sequence[bool], *rest: Any) -> tuple[list[bool], Any
     return [True] * len(equation.invars), equation.replace(outvars=outvars, params={**equation.params, "used": used})
 
 
-def _in_place(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
+def _in_place(*operands: Any, function: Function, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
     def fill(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        arrays = function(*operands)
+        arrays = function.one(*operands)
         for i, result in zip(used, results, strict=True):
             _write(result, arrays[i])
 
     return filled(fill, [shapes[i] for i in used], *operands)
 
 
-def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
+def _copying(*operands: Any, function: Function, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
     wanted = [shapes[i] for i in used]
 
     def whole(*operands: Any) -> list[np.ndarray]:
-        arrays, results = function(*map(np.asarray, operands)), [np.empty(shape.shape, shape.dtype) for shape in wanted]
+        arrays, results = (
+            function.one(*map(np.asarray, operands)),
+            [np.empty(shape.shape, shape.dtype) for shape in wanted],
+        )
         for i, result in zip(used, results, strict=True):
             _write(result, arrays[i])
         return results
@@ -150,8 +198,15 @@ def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Seque
     return list(jax.pure_callback(whole, wanted, *operands))
 
 
-def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:
-    """Copy `value` to `out`, with zeros where it is shorter; a ValueError if it is longer, or has other axes."""
+def _write(out: np.ndarray, value: Any) -> None:
+    """Copy `value` to `out`, with zeros where it is shorter; a ValueError if it is longer, or has other axes.
+
+    A list has a value for each entry of `out`.
+    """
+    if isinstance(value, list):
+        for place, item in zip(range(len(out)), value, strict=True):
+            _write(out[place, ...], item)
+        return
     value = np.asarray(value)
     if value.shape != out.shape:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):

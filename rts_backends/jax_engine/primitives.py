@@ -14,10 +14,15 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
+from rts.plugin_api.threads import parallel
 from rts_backends.jax_engine import host
 
 # jax reuses what a cacheable rule gave for an equation alike; such a rule does not see where operands come from.
 _SEEING_OPERANDS = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
+
+
+NUMBER = 10
+"""Rough time in which an operation computes a number of its result, nanoseconds."""
 
 
 class HostPrimitive:
@@ -96,14 +101,18 @@ class HostPrimitive:
         return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
 
     def _on_host(self, operands: Sequence[np.ndarray], results: Sequence[np.ndarray], params: dict) -> None:
-        """Fill the results in place, item by item if operands have the axis B; then all results have it, too."""
+        """Fill the results in place; if operands have the axis B, items share all cores, and all results have it."""
         by_item = self._by_item(operands, params)
         if not any(by_item):
             self._host(operands, results, **params)
             return
-        for b in range(len(results[0])):
-            item = [x[b] if by else x for x, by in zip(operands, by_item, strict=True)]
-            self._host(item, [x[b, ...] for x in results], **params)
+
+        def items(start: int, stop: int) -> None:
+            for b in range(start, stop):
+                item = [x[b] if by else x for x, by in zip(operands, by_item, strict=True)]
+                self._host(item, [x[b, ...] for x in results], **params)
+
+        parallel(items, len(results[0]), work=NUMBER * sum(x.size for x in results), off_caller_core=False)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
         """The host call in a program for the CPU."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,14 +59,45 @@ class _HostCall(torch.autograd.Function):
         def select(b):
             return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
 
+        if hasattr(fn, "many"):
+            whole = [a if d is None else a.movedim(d, 0) for a, d in zip(args, in_dims[2:], strict=True)]
+            batch = partial(_of_batch, fn.many, [d is not None for d in in_dims[2:]])
+            return _HostCall.apply(batch, specs, *whole), (0,) * len(specs)
         items = [_HostCall.apply(fn, specs, *select(b)) for b in range(info.batch_size)]
         outputs = []
         for spec, values in zip(specs, zip(*items, strict=True), strict=True):
             if spec.packed:
-                rows = max(v.shape[0] for v in values)
-                values = [torch.cat([v, v.new_zeros((rows - v.shape[0], *v.shape[1:]))]) for v in values]
+                values = _alike(values)
             outputs.append(torch.stack(tuple(values)))
         return tuple(outputs), (0,) * len(outputs)
+
+
+def _of_batch(many: Callable, mapped: Sequence[bool], *args: Any) -> list[np.ndarray]:
+    """The results of a host function of `many` items, stacked; shorter ones are padded with zeros.
+
+    `mapped` marks the arguments that have an axis of items first.
+    """
+    count = next(len(a) for a, m in zip(args, mapped, strict=True) if m)
+    items = [[a[b, ...] if m else a for a, m in zip(args, mapped, strict=True)] for b in range(count)]
+    stacked = []
+    for values in zip(*many(items), strict=True):
+        most = np.array([np.shape(value) for value in values], int).max(axis=0)
+        out = np.zeros((count, *most), np.asarray(values[0]).dtype)
+        for b, value in enumerate(values):
+            out[(b, *map(slice, np.shape(value)))] = value
+        stacked.append(out)
+    return stacked
+
+
+def _alike(values: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Tensors of several items, padded with zeros to the longest along every axis."""
+    for axis in range(values[0].ndim):
+        most = max(v.shape[axis] for v in values)
+        values = [
+            torch.cat([v, v.new_zeros([most - n if i == axis else n for i, n in enumerate(v.shape)])], axis)
+            for v in values
+        ]
+    return list(values)
 
 
 def call_host(fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:

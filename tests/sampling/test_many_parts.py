@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import CAMERA, TORCH, arrays, box, gradient, icosphere, relative_error, rigid, soup, to_numpy
+from mixed_scenes import mixed_of
 
 import rts
 from rts.sampling import joint
@@ -156,3 +157,42 @@ def test_a_number_of_rows_to_allot_is_that_of_each_part():
     transforms, parts = crowd(4)
     own = arrays(TORCH[0], parts(transforms))
     assert not any(kinds_of(own, capacity=20_000))
+
+
+@pytest.mark.parametrize("number", range(0, 24, 3))
+def test_scenes_of_the_generator_are_bit_for_bit_as_one_part_at_a_time(singly, number):
+    mixed = mixed_of(number)  # Opaque and translucent parts, some of them culled.
+
+    def image():
+        options = {"layers": mixed.layers, "supersample": mixed.supersample, "engine": "torch"}
+        return to_numpy(rts.render(mixed.parts, mixed.cameras[0], mixed.size, **options))
+
+    np.testing.assert_array_equal(image(), singly(image))
+
+
+class ByCull(rts.Sampler):
+    """Culled parts by "reference", others by "raster": two samplers in one scene."""
+
+    def __init__(self):
+        self.raster, self.reference = (rts.plugin("samplers", name)() for name in ("raster", "reference"))
+
+    def sampler_for(self, part, camera):
+        """Choose by `cull`."""
+        return self.reference if part.cull == "back" else self.raster
+
+    def sample(self, part, camera, size, layers, request):
+        """Never called."""
+        raise NotImplementedError
+
+
+def test_two_samplers_of_one_scene_share_no_pass(singly):
+    (_, parts), (_, culled) = crowd(4, moved=False, cull="none"), crowd(3, moved=False, seed=9, cull="back")
+    own, sampler = [*parts(None), *culled(None)], ByCull()
+    assert kinds_of(own, sampler=sampler) == [True] * 4 + [False] * 3
+    np.testing.assert_array_equal(image_of(own, sampler=sampler), singly(lambda: image_of(own, sampler=sampler)))
+
+
+def test_curved_surfaces_beside_meshes_are_bit_for_bit_as_one_at_a_time(singly):
+    _, parts = crowd(4, moved=False)
+    own = [*parts(None), rts.plugin("surfaces", "bezier").example().replace(shader="lambert")]
+    np.testing.assert_array_equal(image_of(own), singly(image_of, own))

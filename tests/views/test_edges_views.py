@@ -8,9 +8,9 @@ from helpers import arrays, box, icosphere, to_numpy
 import rts
 from rts import Camera
 from rts.arrays.engines import engine_of, namespace
+from rts.sampling import picture as side_by_side
+from rts.sampling.picture import Picture
 from rts.splatting.edges import Edges
-from rts.views import picture as side_by_side
-from rts.views.picture import Picture
 
 torch = pytest.importorskip("torch")
 
@@ -176,7 +176,8 @@ def test_torch_func_sees_the_views_of_a_loop(name):
 def test_vmap_over_poses_is_a_loop_of_views(name):
     poses = torch.tensor(np.stack([POSE, -POSE]))
     together = torch.func.vmap(lambda p: views(name, p))(poses)
-    torch.testing.assert_close(together, torch.stack([views(name, p) for p in poses]), rtol=0, atol=1e-11)
+    # Other cameras draw the triangles, and barycentrics are float32.
+    torch.testing.assert_close(together, torch.stack([views(name, p) for p in poses]), rtol=0, atol=1e-7)
 
 
 @thorough

@@ -9,10 +9,11 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere
 import rts
 from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
+from rts.sampling import picture as side_by_side
+from rts.sampling import side_by_side as side_by_side_scenes
+from rts.sampling.picture import Picture
 from rts.scene.row_cameras import RowCameras
 from rts.shading.shaders import Lambert
-from rts.views import picture as side_by_side
-from rts.views.picture import Picture
 
 pytestmark = pytest.mark.rendering
 
@@ -391,6 +392,7 @@ def test_promises_of_a_call_that_is_overridden_hold_no_more():
 def test_the_surface_is_evaluated_once_for_all_views_and_threads_share_the_sampling(monkeypatch):
     torch = pytest.importorskip("torch")
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    monkeypatch.setattr(side_by_side_scenes, "MOST", 0)  # Small meshes are drawn at once.
     part = scene()[0]
     part = part.replace(theta={"vertices": torch.tensor(part.theta["vertices"])})
     surface, sampler = type(part.surface), rts.plugin("samplers", "raster")

@@ -6,6 +6,7 @@ from outlines alone. They are computed once, for the value, and used again by th
 
 from __future__ import annotations
 
+from dataclasses import MISSING, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,13 @@ BORDER = 1e-3
 
 NOWHERE = np.empty((0, 2, 2))
 """In place of points, for tangents."""
+
+
+OF_SEGMENTS = frozenset({"square", "ties", "square_sides", "beyond", "corner", "pull"})
+"""The fields of outlines that have a row for each segment."""
+
+OF_ROWS = tuple(field.name for field in fields(Outlines) if field.default is MISSING and field.name != "joined")
+"""The fields of the outlines of one layer that have a row for each break, or for each segment."""
 
 
 class _Weights(NamedTuple):
@@ -81,7 +89,7 @@ def forward(operands: Arrays, out: np.ndarray) -> _Weights:
     from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
-    outlines = Outlines(*arrays)
+    outlines = _effective(Outlines(*arrays))
     parallel(loops.inside, len(row), positions, rgba, row, outlines.joined, out, work=10 * out.size)
     weights = _Weights.of(outlines)
     steady, motion = _jumps(rgba, weights), np.empty((len(weights.shown), 2))
@@ -95,7 +103,7 @@ def push(operands: Arrays, tangents: Some, out: np.ndarray, kept: _Weights | Non
     from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
-    outlines = Outlines(*arrays)
+    outlines = _effective(Outlines(*arrays))
     weights = kept or _Weights.of(outlines)
     t_positions, t_rgba = (read_only(np.empty((0, 3), out.dtype) if t is None else t) for t in tangents)
     parallel(loops.push_inside, len(row), rgba, row, outlines.joined, t_positions, t_rgba, out, work=10 * out.size)
@@ -132,7 +140,7 @@ def pull(operands: Arrays, g: np.ndarray, results: Some, kept: _Weights | None) 
     from rts.splatting.edges import weights_loops as loops
 
     positions, rgba, row, *arrays = operands
-    outlines, g = Outlines(*arrays), read_only(g)
+    outlines, g = _effective(Outlines(*arrays)), read_only(g)
     weights = kept or _Weights.of(outlines)
     g_positions, g_rgba = (np.empty((0, 3), g.dtype) if x is None else x for x in results)
     loops.pull_inside(rgba, row, outlines.joined, g, g_positions, g_rgba)
@@ -180,6 +188,23 @@ def normal_equations(
         w, curvatures = loss.weights(r)
         return np.asarray(value), (jacobian * curvatures) @ jacobian.T / r.size, jacobian @ (w * r) / r.size
     return np.asarray(value), jacobian @ jacobian.T / r.size, jacobian @ r / r.size
+
+
+def _effective(outlines: Outlines) -> Outlines:
+    """Outlines without their last rows that have no effect, for which compiled programs have room."""
+    ties, ends = outlines.ties, outlines.ends
+    segments = _count(ties[:, 0] != ties[:, 1])
+    used = ties[:segments], outlines.beyond[:segments]
+    breaks = max(_count(ends.any(axis=1)), *(1 + x.max(initial=-1) for x in used))
+    if breaks == len(ends) and segments == len(ties):
+        return outlines
+    cut = {name: getattr(outlines, name)[: segments if name in OF_SEGMENTS else breaks] for name in OF_ROWS}
+    return replace(outlines, **cut)
+
+
+def _count(marks: np.ndarray) -> int:
+    """The number of rows up to the last that is marked (N,)."""
+    return len(marks) - int(marks[::-1].argmax()) if marks.any() else 0
 
 
 def _segments(outlines: Outlines, weights: _Weights, row: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -1,0 +1,95 @@
+"""How transforms of parts move positions, normals and tangents: one transform for all samples, or one a view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.arrays.engines import Context, engine_of, exemplar, namespace
+from rts.arrays.trees import Array
+from rts.operations.by_view import index_of_views
+from rts.operations.linear import affine_map, affine_map_of_views
+from rts.operations.take import take
+
+
+class OneTransform(NamedTuple):
+    """A transform for all samples.
+
+    Attributes:
+        matrix: (4, 4), world from local.
+    """
+
+    matrix: Array
+
+    def points(self, points: Array) -> Array:
+        """Points (N, 3), moved."""
+        return affine_map(self.matrix[:3, :], points)
+
+    def normals(self, normals: Array) -> Array:
+        """Normals (N, 3), of any length, moved: times the cofactor matrix; a mirror keeps them outward."""
+        columns, _ = _cofactors(*_columns(self.matrix))
+        return sum(normals[:, i : i + 1] * columns[i] for i in range(3))
+
+    def tangents(self, tangents: Array) -> Array:
+        """Tangents with signs (N, 4), of any length, moved; a mirror changes the signs."""
+        columns = _columns(self.matrix)
+        moved = sum(tangents[:, i : i + 1] * columns[i] for i in range(3))
+        return namespace(moved).concat([moved, tangents[:, 3:] * _cofactors(*columns)[1]], axis=1)
+
+
+class ViewTransforms(NamedTuple):
+    """A transform for each of N samples, of parts in several views; methods as of `OneTransform`.
+
+    Attributes:
+        matrices: (B, 4, 4), world from local, of each view.
+        view: (N,) int32, the view of each sample; see `rts.operations.by_view`.
+    """
+
+    matrices: Array
+    view: Array
+
+    @classmethod
+    def of(cls, transforms: Sequence[Array | None], view: Array) -> ViewTransforms:
+        """The transforms of samples, from that of each view; None for the identity."""
+        known = [transform for transform in transforms if transform is not None]
+        context = Context(engine_of(*known), exemplar(*known))
+        matrices = context.constants([np.eye(4) if transform is None else transform for transform in transforms])
+        return cls(namespace(*matrices).stack(matrices), view)
+
+    def points(self, points: Array) -> Array:
+        """Points (N, 3), moved."""
+        return affine_map_of_views(self.matrices[:, :3, :], points, self.view)
+
+    def normals(self, normals: Array) -> Array:
+        """Normals (N, 3), moved."""
+        return self._turned(_cofactors(*_columns(self.matrices))[0], normals)
+
+    def tangents(self, tangents: Array) -> Array:
+        """Tangents with signs (N, 4), moved."""
+        columns = _columns(self.matrices)
+        moved, sign = self._turned(columns, tangents[:, :3]), _cofactors(*columns)[1]
+        return namespace(moved).concat([moved, tangents[:, 3:] * take(sign, index_of_views(self.view))], axis=1)
+
+    def _turned(self, columns: Sequence[Array], vectors: Array) -> Array:
+        """Vectors (N, 3) times the matrices with three columns (B, 3)."""
+        none = namespace(self.matrices).zeros_like(columns[0])
+        return affine_map_of_views(namespace(none).stack([*columns, none], axis=-1), vectors, self.view)
+
+
+def _columns(matrix: Array) -> list[Array]:
+    """The columns (..., 3) of the linear part of affine maps (..., 4, 4)."""
+    return [matrix[..., :3, i] for i in range(3)]
+
+
+def _cofactors(a: Array, b: Array, c: Array) -> tuple[list[Array], Array]:
+    """The columns (..., 3) of the cofactor matrix of one with columns (..., 3), times the sign of its determinant.
+
+    Also this sign (..., 1): 1, or −1 for a mirror.
+    """
+    xp = namespace(a)
+    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
+    volume = xp.sum(a * cofactors[0], axis=-1, keepdims=True)
+    sign = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
+    return [column * sign for column in cofactors], sign

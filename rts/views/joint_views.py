@@ -1,0 +1,81 @@
+"""Views that are drawn at once: their samples, all found in one pass over a picture, in the order of views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
+from rts.contracts.checks import check_memory
+from rts.contracts.records import Cells, Outlines, Sampled, Samples
+from rts.outlines.of_scene import with_outlines
+from rts.rendering.settings import RenderSettings
+from rts.sampling.picture import Picture
+from rts.sampling.side_by_side import View, joined
+from rts.sampling.tables import in_one_table
+from rts.views.sampled_views import Views, with_counts
+
+
+def sampled_at_once(views: Sequence[View], picture: Picture, settings: RenderSettings) -> Views:
+    """The samples of views of one kind, and their outlines if the splatter reads these."""
+    scene, grid = joined(views, picture)
+    gradient = scene.context.engine.differentiates
+    check_memory(*picture.view, settings.most_layers, settings.capacity, gradient=gradient)
+    sampled = scene.joints[0].sampled(picture.size, settings.most_layers, settings.finds_outlines)
+    if settings.finds_outlines:
+        sampled = with_outlines(sampled, scene, grid)
+    sampled = replace(sampled, supersample=settings.supersample, apron=settings.apron)
+    return _by_place(sampled, picture, [len(view.proxies) for view in views])
+
+
+def _by_place(sampled: Sampled, picture: Picture, numbers: Sequence[int]) -> Views:
+    """Samples of parts, view after view, as tables: of the first parts of all views, of the second, and so on.
+
+    Args:
+        sampled: the samples, with a table for each part of each view.
+        picture: the layout of the views.
+        numbers: the number of parts of each view.
+    """
+    places = np.concatenate([np.arange(n) for n in numbers])
+    sizes = np.array([own.ids.shape[0] for own in sampled.samples])
+    counts = np.zeros((max(numbers), len(numbers)), np.int64)
+    counts[places, np.repeat(np.arange(len(numbers)), numbers)] = sizes
+    tables = [[own for own, at in zip(sampled.samples, places, strict=True) if at == n] for n in range(max(numbers))]
+    samples = tuple(map(_in_one_table, tables))
+    cells, outlines = replace(sampled.cells, triangle=None), sampled.outlines
+    if max(numbers) > 1:
+        order = np.argsort(places, kind="stable")
+        starts = np.empty(len(sizes), np.int64)
+        starts[order] = np.cumsum(sizes[order]) - sizes[order]
+        moved = np.arange(sizes.sum()) + np.repeat(starts - (np.cumsum(sizes) - sizes), sizes)
+        cells = replace(cells, row=_moved(cells.row, moved))
+        outlines = None if outlines is None else _renumbered(outlines, moved)
+    sampled = replace(sampled, samples=samples, cells=cells, outlines=outlines)
+    return with_counts(sampled, picture, tuple(counts))
+
+
+def _in_one_table(samples: Sequence[Samples]) -> Samples:
+    """The samples of several parts as one table, with attributes if all of them have the same."""
+    names = {None if own.gbuffer is None else (*own.gbuffer, own.gbuffer_names) for own in samples}
+    if len(names) > 1:
+        samples = [replace(own, gbuffer=None) for own in samples]
+    whole = in_one_table(samples)
+    row = np.arange(whole.ids.shape[0], dtype=np.int32)[None, None]
+    return replace(whole, cells=Cells(engine_of(whole.ids).constant(row, whole.ids)))
+
+
+def _renumbered(outlines: Outlines, moved: np.ndarray) -> Outlines:
+    """Outlines of samples whose rows have `moved`."""
+    names = ("rows", "inner", "pair", "stack")
+    tables = {name: getattr(outlines, name) for name in names}
+    return replace(outlines, **{name: None if x is None else _moved(x, moved) for name, x in tables.items()})
+
+
+def _moved(rows: Array, moved: np.ndarray) -> Array:
+    """Indices of rows that have `moved`; −1 stays."""
+    xp, table = namespace(rows), engine_of(rows).constant(moved.astype(np.int32), rows)
+    found = xp.reshape(xp.take(table, xp.reshape(xp.clip(rows, 0), (-1,)), axis=0), rows.shape)
+    return xp.where(rows >= 0, found, rows)
