@@ -7,6 +7,7 @@ without one go through trimesh.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,16 +82,16 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         check_exists(path)
         return list(plugin.load(path))
     with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # Checks refuse overflow by name.
-        pieces = [_linear(piece) for piece in read_pieces(path)]
+        pieces = [linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):
             pieces = [_merged(path, pieces)]
-        parts = [_part(path, piece, weld) for piece in pieces]
+        parts = [part_of(path, piece, weld) for piece in pieces]
     for note in notes:
         warn(note, FileWarning)
     return parts
 
 
-def _linear(piece: Piece) -> Piece:
+def linear(piece: Piece) -> Piece:
     """The piece with linear colours; textures are sRGB in every format."""
     attributes, color = dict(piece.attributes), piece.color
     if not piece.linear:
@@ -102,11 +103,14 @@ def _linear(piece: Piece) -> Piece:
     return piece._replace(attributes=attributes, color=color, texture=texture)
 
 
-def _part(path: Path, piece: Piece, weld: bool) -> Part:
+def part_of(
+    path: Path, piece: Piece, weld: bool, surface: Callable[[np.ndarray, dict[str, Any]], Any] | None = None
+) -> Part:
+    """The part of a piece; a mesh, or the `surface` (faces, indices of attributes) → surface."""
     vertices, faces = piece.vertices.astype(np.float32), piece.faces
     if weld:
-        rows, faces = _used(vertices, faces)
-        vertices, place = _welded(rows)
+        rows, faces = used_rows(vertices, faces)
+        vertices, place = welded_rows(rows)
         faces = place[faces]
     theta, indices = {"vertices": vertices}, {}
     for name, (rows, table) in piece.attributes.items():
@@ -133,20 +137,20 @@ def _part(path: Path, piece: Piece, weld: bool) -> Part:
         name in theta and theta[name].shape[-1] == 4 for name in ("color", "texture" if textured else "colors")
     )
     return Part(
-        registry.plugin("rts.surfaces", "mesh")(faces, indices),
+        (surface or registry.plugin("rts.surfaces", "mesh"))(faces, indices),
         theta,
         (Pbr if piece.entries is not None else Textured if textured else Lambert)(opaque=not translucent),
         piece.transform,
     )
 
 
-def _used(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def used_rows(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that a table refers to, and the table with indices into these rows."""
     used, inverse = np.unique(table, return_inverse=True)
     return rows[used], inverse.reshape(table.shape)
 
 
-def _welded(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def welded_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct rows in order of first occurrence, and for each given row its index among them."""
     _, first, inverse = np.unique(rows + 0.0, axis=0, return_index=True, return_inverse=True)  # −0 + 0 is 0.
     order = np.argsort(first)
@@ -172,7 +176,7 @@ def _settled(
         return rows, None
     by_vertex = np.zeros((count, rows.shape[1]), rows.dtype)
     by_vertex[faces] = rows[table]
-    return (by_vertex, None) if np.array_equal(by_vertex[faces], rows[table]) else _used(rows, table)
+    return (by_vertex, None) if np.array_equal(by_vertex[faces], rows[table]) else used_rows(rows, table)
 
 
 def _merged(path: Path, pieces: list[Piece]) -> Piece:
