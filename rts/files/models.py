@@ -48,6 +48,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say
     that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
 
+    Parts of a glTF are at rest: joints, morph targets and clips are left out, and `rts.load_model` reads them.
+
     Welding may make vertices fewer than the file's. For data of your own, one row for each vertex of the
     file, load with `weld=False`.
 
