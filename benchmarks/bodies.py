@@ -95,7 +95,7 @@ def main() -> None:
     print(table(["start", "method", "mm before", "mm after", "steps", "ms a step", "CPU ms a step"], rows))
 
 
-RATES = {"turns": 0.02, "shift": 0.005}
+RATES = {"turns": 0.03, "shift": 0.01}
 METHODS = {
     "at full size": {"steps": STEPS, "learning_rate": RATES},
     "coarse to fine": {

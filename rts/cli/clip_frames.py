@@ -8,6 +8,7 @@ import numpy as np
 import typer
 
 import rts
+from rts.files.model_pieces import fault_of
 from rts.scene.default_camera import Bounds, bounds_of
 from rts.scene.parts import Part
 
@@ -41,7 +42,9 @@ def frames_of(model: Path, clip: str, time: float | None, moving: bool) -> tuple
     duration = loaded.clip(which).duration
 
     def parts_at(seconds: float) -> list[Part]:
-        return loaded.posed(loaded.pose(which, seconds))
+        parts = loaded.posed(loaded.pose(which, seconds))
+        # Clips hide parts by scaling them to nothing.
+        return [part for part in parts if part.transform is None or not fault_of(part.transform)]
 
     seen = [part for seconds in np.linspace(0, duration, SEEN) for part in parts_at(float(seconds))]
     times = np.arange(max(round(duration * FPS), 1)) / FPS if moving else [time or 0.0]

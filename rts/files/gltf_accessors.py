@@ -35,7 +35,7 @@ TABLES = {
     "scale": ("VEC3", "f4", ""),
     "weights": ("SCALAR", "f4 i1/ u1/ i2/ u2/", ""),
 }
-"""The same of other tables, for `read_table`."""
+"""Types of rows and of numbers of other tables, for `read_table`."""
 BOUNDS_TOLERANCE = 1e-3
 """Tolerance of `min` and `max`, as a share of the range that they bound; some writers round them."""
 

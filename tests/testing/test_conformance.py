@@ -77,6 +77,7 @@ class TestSkinned(SurfaceConformance):
         return rts.Skinned.example()
 
 
+@pytest.mark.thorough
 class TestSkinnedNormals(SurfaceConformance):
     """Normals with a table of their own, shared between vertices, which morph targets change."""
 
