@@ -60,18 +60,18 @@ def _data(comparisons: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The data of the page. Settings are listed once, and rows refer to them by index."""
     rows = [row for comparison in comparisons for row in comparison["rows"] if drawn(row)]
     settings: dict[str, int] = {}
-    listed = []
+    descriptions = []
     for row in rows:
         if arguments(row) not in settings:
             settings[arguments(row)] = len(settings)
-            listed.append(_settings(row))
+            descriptions.append(_settings(row))
     return {
         "looks": {
             **asdict(Looks.of(rows)),
             "peer_symbol": PEER_SYMBOL,
             "colors": [*SPLATTER_COLORS.values(), *PEER_COLORS.values(), *OTHER_COLORS],
         },
-        "settings": listed,
+        "settings": descriptions,
         "scenes": [_scene(comparison, settings) for comparison in comparisons],
     }
 

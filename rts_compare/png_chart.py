@@ -71,11 +71,11 @@ def draw(comparison: Mapping[str, Any], path: Path) -> None:
     rows = [row for row in comparison["rows"] if drawn(row)]
     looks = Looks.of(rows)
     modes = {mode: [row for row in rows if row["mode"] == mode] for mode in comparison["modes"]}
-    listed = LINE_HEIGHT * max(2, 1 + max((len(_front(found)) for found in modes.values()), default=0))
+    front_height = LINE_HEIGHT * max(2, 1 + max((len(_front(found)) for found in modes.values()), default=0))
     columns, lines = max(1, min(COLUMNS, len(modes))), max(1, -(-len(modes) // COLUMNS))
-    size = PANEL_WIDTH * columns + LEGEND_WIDTH, (PANEL_HEIGHT + listed) * lines + 0.8
+    size = PANEL_WIDTH * columns + LEGEND_WIDTH, (PANEL_HEIGHT + front_height) * lines + 0.8
     figure = Figure(figsize=size, dpi=110, layout="constrained")
-    panels = figure.subplots(2 * lines, columns, squeeze=False, height_ratios=[PANEL_HEIGHT, listed] * lines)
+    panels = figure.subplots(2 * lines, columns, squeeze=False, height_ratios=[PANEL_HEIGHT, front_height] * lines)
     charts, lists = panels[::2].ravel(), panels[1::2].ravel()
     for axes in (*charts[len(modes) :], *lists):
         axes.set_axis_off()

@@ -105,11 +105,11 @@ class Search:
     def _told_of_failure(self, error: float) -> str:
         """Warn that no setting is within the tolerance; return a line that says so."""
         wanted = _percent(self.tolerance)
-        told = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
-        told = f"{told}: the least error that was found is {_percent(error)}"
+        sentence = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
+        sentence = f"{sentence}: the least error that was found is {_percent(error)}"
         advice = "give a larger budget_s" if self.late else "give a larger tolerance, or look at more pixels"
-        warn(f"{told}; {advice}", ToleranceWarning)
-        return told
+        warn(f"{sentence}; {advice}", ToleranceWarning)
+        return sentence
 
     # -------------------------------------------------------------------------------------------------- accuracy
 
@@ -286,8 +286,8 @@ class Search:
             "sampler": list(self.samplers),
         }
         others = {name: self._others(chosen, name, values) for name, values in options.items()}
-        told = dict.fromkeys(s for pair in others.values() for s in pair if s is not None)
-        times = self._timed([chosen, *told]) if not self._over() else {}
+        shown = dict.fromkeys(s for pair in others.values() for s in pair if s is not None)
+        times = self._timed([chosen, *shown]) if not self._over() else {}
         faster = [s for s in times if times[s] < ALIKE * times[chosen] and self._error(s) <= self.tolerance]
         lines = [self._reason(chosen, name, *pair, times) for name, pair in others.items() if any(pair)]
         return lines, min(faster, key=lambda s: times[s], default=None)

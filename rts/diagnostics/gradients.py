@@ -16,13 +16,13 @@ from rts.arrays.engine_base import Engine
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import check_size, is_count, is_real
-from rts.diagnostics.explanation.reasons import Reason, legend, marked
-from rts.diagnostics.explanation.second_derivatives import HessianCheck, curvatures, require_second_derivatives
-from rts.diagnostics.explanation.selection import explained
-from rts.diagnostics.explanation.shared_budget import Clock, looked_at
-from rts.diagnostics.explanation.slopes import NEGLIGIBLE, Slope
-from rts.diagnostics.explanation.subject import Scene, Subject
 from rts.diagnostics.gradient_images import check_callable, checked_parameters, traceable
+from rts.diagnostics.gradient_reasons.reasons import Reason, legend, marked
+from rts.diagnostics.gradient_reasons.second_derivatives import HessianCheck, curvatures, require_second_derivatives
+from rts.diagnostics.gradient_reasons.selection import explained
+from rts.diagnostics.gradient_reasons.shared_budget import Clock, looked_at
+from rts.diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Slope
+from rts.diagnostics.gradient_reasons.subject import Scene, Subject
 from rts.diagnostics.progress import phases
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.rendering.image import render

@@ -41,7 +41,7 @@ class Shown:
         return f"Shown({len(self.png)} bytes of PNG, which a notebook displays)"
 
 
-def show(thing: Array | Part | Sequence[Part] | Prepared | Fit) -> Shown:
+def show(thing: Array | Part | Sequence[Part] | Prepared | Fit, over: Array | None = None) -> Shown:
     """Make a picture for a notebook: as the last line of a cell, it is displayed.
 
     Args:
@@ -49,11 +49,16 @@ def show(thing: Array | Part | Sequence[Part] | Prepared | Fit) -> Shown:
             writes it; without alpha, numbers beyond [0, 1], such as depths and normals, are scaled to that range. Or a
             part, parts or the result of `prepare`: one frame of 320 × 320 pixels, by a camera that sees all. Or the
             result of `fit`: its losses, a line for each stage.
+        over: (H, W, 3) or (H, W, 4), the picture that an image (H, W, 4) is fitted to: the image is laid over it, half
+            transparent, so that one sees where outlines differ.
 
     Raises:
-        InputError: the thing is none of these, or is traced.
+        InputError: the thing is none of these, or is traced, or there is something to lay it over, and it is no image
+            of the same size.
         PluginError: losses without matplotlib.
     """
+    if over is not None:
+        return Shown(png_of(_laid_over(thing, over)))
     if isinstance(thing, Fit):
         return Shown(losses_png(thing.history, thing.stages))
     if isinstance(thing, Prepared):
@@ -66,6 +71,18 @@ def show(thing: Array | Part | Sequence[Part] | Prepared | Fit) -> Shown:
     if not hasattr(thing, "shape"):
         raise InputError(f"{type(thing).__name__} cannot be shown; expected an image, parts, or the result of rts.fit")
     return Shown(png_of(_in_range(thing)))
+
+
+def _laid_over(image: Any, picture: Any) -> Array:
+    """A premultiplied image (H, W, 4), half transparent, over a picture of the same size."""
+    image, picture = (value_of(x) if hasattr(x, "shape") else None for x in (image, picture))
+    shapes = [None if x is None else x.shape for x in (image, picture)]
+    if image is None or picture is None or image.shape[2:] != (4,) or picture.shape[2:] not in ((3,), (4,)):
+        raise InputError(f"an image {shapes[0]} over a picture {shapes[1]}; expected (H, W, 4) over (H, W, 3 or 4)")
+    if image.shape[:2] != picture.shape[:2]:
+        raise InputError(f"an image {shapes[0]} over a picture {shapes[1]}; expected one size")
+    channels = picture.shape[2]
+    return image[..., :channels] / 2 + picture * (1 - image[..., 3:] / 2)
 
 
 def _on_the_host(part: Part) -> Part:

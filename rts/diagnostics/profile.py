@@ -30,8 +30,9 @@ SAMPLING, OUTLINES, SHADING, SPLATTING, BACKWARD = "sample", "outlines", "evalua
 HINTS = {
     SAMPLING: "if triangles stay the same, rts.prepare sorts them once; many parts of one surface are drawn at once if "
     "they are neighbours in the list and their samplers are alike",
-    OUTLINES: "outlines cost by their length in pixels and by the number of triangles: render fewer pixels while far "
-    "from the solution (rts.pyramid), or simplify the mesh; splatter='single' takes none, for coarse gradients",
+    OUTLINES: "they cost by their length in pixels, and by the number of triangles or of rays that are cast anew at a "
+    "field: render fewer pixels while far from the solution (rts.pyramid), or simplify a mesh; splatter='single' takes "
+    "none, for coarse gradients",
     SHADING: "shaders run on each covered pixel: a mask needs only 'silhouette', and promises of `opaque` and `reads` "
     "spare layers and attributes; θ in NumPy is a constant, and is evaluated without derivative",
     SPLATTING: "fewer pixels, samples a pixel or layers; opaque=True where no light passes through",
@@ -79,7 +80,8 @@ class Profile(NamedTuple):
             lines.append(f"{name:20}{first:>12.1f}{later:>12.2f}{share:>8}{rows:>10}{megabytes:>8.1f}")
         lines.append(f"{'':20}{sum(stage.first for stage in self.stages):>12.1f}{total:>12.2f}")
         longest = max(self.stages, key=lambda stage: stage.later).name
-        return "\n".join([*lines, f"{self.parts} parts. Most takes: {longest}. {self.hint}."])
+        parts = "1 part" if self.parts == 1 else f"{self.parts} parts"
+        return "\n".join([*lines, f"{parts}. Most time: {longest}; {self.hint}."])
 
 
 def profile(

@@ -268,13 +268,13 @@ def _halved(found: _Intervals, gaps: _Lines, oracle: Oracle) -> _Intervals:
         if not len(found.gap):
             break
         middle = (found.low + found.high) / 2
-        told = oracle.layers(gaps.points(found.gap, middle))
+        in_middle = oracle.layers(gaps.points(found.gap, middle))
         halves = [
-            _Intervals(found.gap, found.low, middle, found.before, told),
-            _Intervals(found.gap, middle, found.high, told, found.behind),
+            _Intervals(found.gap, found.low, middle, found.before, in_middle),
+            _Intervals(found.gap, middle, found.high, in_middle, found.behind),
         ]
         # Within the same parts the half in which a depth changes more has the break.
-        alike = ((found.before.part == told.part) & (told.part == found.behind.part)).all(0)
+        alike = ((found.before.part == in_middle.part) & (in_middle.part == found.behind.part)).all(0)
         changes = [np.abs(half.before.depth - half.behind.depth).max(0) for half in halves]
         drop = [_level(half.before, half.behind, oracle).all(0) for half in halves]
         drop = [drop[0] | (alike & (changes[0] < changes[1])), drop[1] | (alike & (changes[1] <= changes[0]))]
@@ -380,11 +380,11 @@ def _sampled_slopes(found: _Intervals, layer: np.ndarray, gaps: _Lines, oracle: 
         front, number = seen.of_layer(layer), _numbers(seen.part)[layer, np.arange(len(layer))]
         at, step = gaps.points(found.gap, place), gaps.step[found.gap]
         inward, across = way * BESIDE * step, BESIDE * step[:, ::-1]
-        told = [_depth_of(front, number, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
-        same = [np.isfinite(t) for t in told]
-        along = (told[0] - front.depth) / (way * BESIDE)
-        both = (told[1] - told[2]) / (2 * BESIDE)
-        one = np.where(same[1], told[1] - told[0], told[0] - told[2]) / BESIDE
+        depths = [_depth_of(front, number, oracle.layers(at + inward + k * across)) for k in (0, 1, -1)]
+        same = [np.isfinite(t) for t in depths]
+        along = (depths[0] - front.depth) / (way * BESIDE)
+        both = (depths[1] - depths[2]) / (2 * BESIDE)
+        one = np.where(same[1], depths[1] - depths[0], depths[0] - depths[2]) / BESIDE
         beside = np.where(np.isfinite(both), both, one)
         slopes[:, side] = along[:, None] * step + beside[:, None] * step[:, ::-1]
     return slopes

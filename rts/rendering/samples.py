@@ -108,7 +108,9 @@ def _taken(scene: Scene, grid: Grid, request: Request, count: int) -> Sampled:
             number = joint.stop
             continue
         part, sampler, entry = scene.parts[number], scene.samplers[number], scene.entries[number]
-        own = sampler.sample(part, grid.camera.within(part.transform), grid.size, count, replace(request, entry=entry))
-        tables.append(check_samples(own, grid.size, sampler))
+        sampled = sampler.sample(
+            part, grid.camera.within(part.transform), grid.size, count, replace(request, entry=entry)
+        )
+        tables.append(check_samples(sampled, grid.size, sampler))
         number += 1
     return merge(tables, count)

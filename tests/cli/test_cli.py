@@ -251,7 +251,7 @@ def test_render_writes_outputs_beside_the_picture_or_as_arrays(model, tmp_path):
     said = succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, "--outputs", names, "--profile")
     succeed("render", model, "-o", tmp_path / "a.npz", "--size", 32, "--outputs", f"{names},position")
     known = np.load(tmp_path / "a.npz")
-    assert set(known) == {*names.split(","), "position"} and "Most takes" in said
+    assert set(known) == {*names.split(","), "position"} and "Most time" in said
     pictures = {name: np.asarray(Image.open(tmp_path / f"a.{name}.png")) for name in ("depth", "normal", "part")}
     most = float(said.partition("depth, 65535 is ")[2].split()[0])
     np.testing.assert_allclose(pictures["depth"] * most / 65535, known["depth"][..., 0], atol=1e-3)

@@ -24,7 +24,7 @@ def test_a_profile_names_the_stages_and_counts_rows(splatter):
     assert rows["splat"] == 256 and rows["gradient"] == 2 * 42 * 3
     assert all(stage.first >= 0 and stage.later >= 0 for stage in found.stages)
     text = str(found)
-    assert all(name in text for name in names) and "2 parts. Most takes: " in text
+    assert all(name in text for name in names) and "2 parts. Most time: " in text
 
 
 def test_without_derivatives_there_is_no_gradient():

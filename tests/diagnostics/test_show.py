@@ -69,3 +69,17 @@ def test_a_fit_is_shown_by_its_losses(monkeypatch):
 def test_what_is_no_picture_is_refused(thing, expected):
     with pytest.raises(rts.InputError, match=expected):
         rts.show(thing)
+
+
+def test_an_image_is_laid_half_transparent_over_the_picture_that_it_is_fitted_to():
+    image = np.zeros((2, 2, 4), np.float32)
+    image[0] = [0.4, 0.0, 0.2, 1.0]
+    picture = np.full((2, 2, 3), 0.6, np.float32)
+    mixed = picture.copy()
+    mixed[0] = [0.5, 0.3, 0.4]
+    assert rts.show(image, over=picture).png == rts.show(mixed).png
+    for wrong in (picture[:1], picture[..., :1], [PART], 3.0):
+        with pytest.raises(rts.InputError, match="over a picture"):
+            rts.show(image, over=wrong)
+    with pytest.raises(rts.InputError, match="over a picture"):
+        rts.show(PART, over=picture)

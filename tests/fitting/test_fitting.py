@@ -2,13 +2,10 @@ import math
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, box, derivative, finite_difference, gradient, rotation, to_numpy
-from scipy.spatial.transform import Rotation
+from helpers import DIFFERENTIABLE, arrays, box, to_numpy
 
 import rts
 from rts.errors import InputError, PluginError
-from rts.fitting.least_squares import _Model
-from rts.fitting.normal_equations import Linearization
 
 pytestmark = pytest.mark.fitting
 
@@ -24,11 +21,6 @@ def line(target):
     return lambda p: matrix @ p - goal, arrays(target, np.zeros(3))
 
 
-def rosenbrock(p):
-    """Its two residuals, by the arithmetic that every engine has."""
-    return p[:1] * 0 + 1 - p[:1], 10 * (p[1:] - p[:1] ** 2)
-
-
 def joined(target, pieces):
     return pytest.importorskip("jax").numpy.concatenate(pieces) if target == "jax" else _torch().cat(pieces)
 
@@ -38,44 +30,6 @@ def _torch():
 
 
 # ------------------------------------------------------------------------------------------------ solutions
-
-
-@targets
-def test_lm_solves_linear_least_squares_in_a_few_steps(target):
-    residuals, start = line(target)
-    fit = rts.fit(residuals, start, method="lm", progress=False)
-    np.testing.assert_allclose(to_numpy(fit.parameters), SOLUTION, atol=1e-6)
-    assert fit.history[4] < 1e-9 * fit.history[0]
-
-
-@targets
-def test_lm_solves_an_overdetermined_system_to_its_normal_equations(target):
-    goal = np.random.default_rng(1).normal(size=9)
-    matrix, there = arrays(target, MATRIX), arrays(target, goal)
-    fit = rts.fit(lambda p: matrix @ p - there, arrays(target, np.ones(3)), method="lm", tolerance=1e-9)
-    np.testing.assert_allclose(to_numpy(fit.parameters), np.linalg.lstsq(MATRIX, goal)[0], atol=1e-4)
-
-
-@targets
-def test_lm_goes_through_the_valley_of_rosenbrock(target):
-    start = arrays(target, np.array([-1.2, 1.0]))
-    fit = rts.fit(lambda p: joined(target, rosenbrock(p)), start, method="lm", steps=100, tolerance=0)
-    np.testing.assert_allclose(to_numpy(fit.parameters), [1, 1], atol=1e-4)
-    assert fit.steps < 60
-    assert any(after > before for before, after in zip(fit.history, fit.history[1:], strict=False)), "no trial rejected"
-
-
-@targets
-def test_lm_ignores_parameters_that_change_nothing_and_differences_of_scale(target):
-    scales = arrays(target, np.array([1e-2, 1e3, 0.0]))
-    start = arrays(target, {"far": np.array([0.0]), "near": np.array([0.0, 0.0, 7.0])})
-    goal = arrays(target, np.array([1.0, 1.0, 0.0]))
-    fit = rts.fit(
-        lambda p: joined(target, [p["near"] * scales - goal, 1e-4 * p["far"] - 1]), start, method="lm", tolerance=0
-    )
-    np.testing.assert_allclose(to_numpy(fit.parameters["near"]), [1e2, 1e-3, 7], rtol=1e-4)
-    np.testing.assert_allclose(to_numpy(fit.parameters["far"]), [1e4], rtol=1e-4)
-    assert fit.reason.endswith("not determined: near[2]")
 
 
 @targets
@@ -118,13 +72,6 @@ def test_a_loss_of_ones_own(target):
     goal = arrays(target, np.array([[0.0], [0.1], [10.0]]))
     fit = rts.fit(lambda p: p - goal, start, loss=lambda r: abs(r).sum(), steps=300, learning_rate=0.05)
     np.testing.assert_allclose(to_numpy(fit.parameters), [0.1], atol=0.05)  # The median.
-
-
-def test_lm_keeps_float64_and_mixed_dtypes():
-    torch = _torch()
-    start = {"a": torch.zeros(2, dtype=torch.float64), "b": torch.zeros(1)}
-    fit = rts.fit(lambda p: torch.cat([p["a"] - 1, p["b"] - 2]), start, method="lm")
-    assert fit.parameters["a"].dtype == torch.float64 and fit.parameters["b"].dtype == torch.float32
 
 
 @pytest.mark.parametrize("method", ["adam", "lm"])
@@ -193,46 +140,6 @@ def test_an_error_of_the_callback_is_its_own():
             rts.fit(lambda p: p**3 - 1, _torch().ones(1) * 3, method=method, callback=report)
 
 
-def test_no_jacobian_is_made_that_nobody_uses():
-    torch = _torch()
-    traced = []
-
-    def residuals(p):
-        traced.append(torch._C._functorch.is_functorch_wrapped_tensor(p))
-        return torch.stack([p[0] - 1, 10 * (p[1] - p[0] ** 2)])
-
-    start = torch.tensor([0.9, 0.9])
-    rts.fit(residuals, start, method="lm", steps=1)
-    assert traced == [True]
-    traced.clear()
-    rts.fit(residuals, start, method="lm", steps=2)
-    assert traced == [True, False]
-
-
-def test_residuals_are_computed_once_where_a_trial_is_accepted():
-    torch = _torch()
-    calls = []
-
-    def residuals(p):
-        derived = torch._C._functorch.is_functorch_wrapped_tensor(p)
-        calls.append("linearised" if derived else "valued")
-        return torch.stack([1 - p[0], 10 * (p[1] - p[0] ** 2)])
-
-    fit = rts.fit(residuals, torch.tensor([-1.2, 1.0]), method="lm", steps=12, tolerance=0)
-    best, expected = fit.history[0], ["linearised"]
-    assert fit.steps == 12
-    accepted, refused = True, 0
-    for value in fit.history[1:-1]:
-        after, accepted = accepted, value < best
-        refused += not accepted
-        expected.append("linearised" if after else "valued")
-        if accepted and not after:
-            expected.append("linearised")  # Its derivative was not known.
-        best = min(best, value)
-    assert refused > 0
-    assert calls == [*expected, "valued"]  # After the last there is no step to make.
-
-
 @targets
 def test_patience(target):
     start = arrays(target, np.array([1.0]))
@@ -251,24 +158,6 @@ def test_patience_with_a_negative_loss(target):
     assert fit.steps == 6
 
 
-@targets
-def test_lm_stops_where_steps_gain_little_or_nothing_can(target):
-    residuals, start = line(target)
-    assert "gained less than 0.5" in rts.fit(lambda p: residuals(p) ** 2 + 1, start, method="lm", tolerance=0.5).reason
-    assert rts.fit(lambda p: p * 0 + 1, start, method="lm").reason.startswith("the gradient is exactly zero")
-    # Away from the start the loss only rises, whatever the derivative says.
-    walled = rts.fit(lambda p: p + 1000 * (p != 0) + 1, start, method="lm")
-    assert walled.reason.startswith("no step lowers the loss, though the gradient promises it: the loss has jumps")
-    assert walled.loss == 1
-    np.testing.assert_array_equal(to_numpy(walled.parameters), np.zeros(3))
-
-
-def test_no_step_goes_where_the_matrix_is_not_definite():
-    model = _Model(Linearization(1.0, np.array([[1.0, 1.5], [1.5, 1.0]]), np.array([1.0, 0.0]), 1e-7), [2])
-    step, predicted = model.step(1e-3)
-    assert step[0] == pytest.approx(step[1]) and step[0] < 0 and predicted > 0
-
-
 # ----------------------------------------------------------------------------------------------- going astray
 
 
@@ -279,15 +168,6 @@ def test_descent_that_diverges_keeps_the_best(target):
     assert "the loss is" in fit.reason and "too far" in fit.reason
     assert all(map(math.isfinite, fit.history)) and fit.loss == min(fit.history) == fit.history[0]
     np.testing.assert_array_equal(to_numpy(fit.parameters), [2])
-
-
-@targets
-def test_lm_shuns_trials_that_are_not_finite(target):
-    # The first trials overshoot to below zero, where a power is NaN.
-    start = arrays(target, np.array([4.0]))
-    fit = rts.fit(lambda p: p**0.1 - 0.5, start, method="lm", steps=100, tolerance=0)
-    assert any(map(math.isnan, fit.history))
-    np.testing.assert_allclose(to_numpy(fit.parameters), [0.5**10], rtol=1e-3)
 
 
 @targets
@@ -459,78 +339,6 @@ def test_the_progress_bar(capsys):
     assert "loss" in (shown := capsys.readouterr().err) and "ms/iteration" in shown and "3/3" in shown
     rts.fit(lambda p: p, _torch().ones(2), steps=3)
     assert capsys.readouterr().err == ""
-
-
-# ----------------------------------------------------------------------------------------------- rigid poses
-
-
-def test_rigid_equals_scipy_on_both_sides_of_the_threshold():
-    rng = np.random.default_rng(0)
-    axes = rng.normal(size=(60, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    angles = [0.0, 1e-9, 1e-4, 0.05, 0.0999999, 0.1, 0.1000001, 0.2, 1.0, 3.0, math.pi, 2 * math.pi, 7.0]
-    for axis, angle in zip(axes, [*angles, *rng.uniform(0, 0.3, 47)], strict=True):
-        vector = axis * angle
-        matrix = rts.rigid(np.array([*vector, 1.0, 2.0, 3.0]))
-        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
-        np.testing.assert_allclose(matrix[:, 3], [1, 2, 3, 1], atol=1e-15)
-
-
-@targets
-def test_rigid_in_float32(target):
-    for angle in (0.0, 0.0999, 0.1001, 2.0):
-        vector = np.array([0.6, 0.0, 0.8]) * angle
-        matrix = to_numpy(rts.rigid(arrays(target, np.array([*vector, 0, 0, 0]))))
-        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
-
-
-@targets
-def test_rigid_is_the_identity_at_zero_with_its_derivatives(target):
-    zero = arrays(target, np.zeros(6))
-    np.testing.assert_array_equal(to_numpy(rts.rigid(zero)), np.eye(4))
-    point = arrays(target, np.array([0.3, -0.7, 0.5, 1.0]))
-    weights = arrays(target, np.array([1.0, 2.0, -1.0, 0.0]))
-
-    def f(pose):
-        return (rts.rigid(pose) @ point) @ weights
-
-    # d(R p)/dω at zero is the cross product.
-    expected = [*np.cross(to_numpy(point)[:3], to_numpy(weights)[:3]), *to_numpy(weights)[:3]]
-    np.testing.assert_allclose(gradient(target, f, zero), expected, atol=1e-6)
-    p, w = to_numpy(point)[:3].astype(float), to_numpy(weights)[:3].astype(float)
-    # R p = p + ω × p + ω × (ω × p) / 2 + …: the Hessian is (w pᵀ + p wᵀ) / 2 − (w · p) I.
-    hessian = np.zeros((6, 6))
-    hessian[:3, :3] = (np.outer(w, p) + np.outer(p, w)) / 2 - (w @ p) * np.eye(3)
-    func = pytest.importorskip("jax") if target == "jax" else _torch().func
-    np.testing.assert_allclose(to_numpy(func.hessian(f)(zero)), hessian, atol=1e-5)
-
-
-def test_the_derivative_of_rigid_at_an_angle():
-    torch = _torch()
-    weights = np.random.default_rng(2).normal(size=(4, 4))
-    for angle in (0.03, 0.1, 0.5):
-        pose = np.array([0.6 * angle, 0, 0.8 * angle, 0.1, 0.2, 0.3])
-        tensor = torch.tensor(pose)
-
-        def f(p):
-            return (rts.rigid(p, (0.5, 0, 1)) * torch.as_tensor(weights)).sum()
-
-        numeric = finite_difference(lambda p: np.sum(rts.rigid(p, (0.5, 0, 1)) * weights), pose)
-        np.testing.assert_allclose(gradient("torch-cpu", f, tensor), numeric, atol=1e-8)
-        tangent = np.arange(6.0)
-        _, slope = derivative("torch-cpu", f, tensor, torch.tensor(tangent))
-        assert float(slope) == pytest.approx(numeric @ tangent, abs=1e-7)
-
-
-def test_rigid_turns_about_the_centre_and_takes_lists():
-    center = np.array([1.0, -2.0, 0.5])
-    matrix = rts.rigid([0, 0, 0.7, 0.1, 0.2, 0.3], center)
-    np.testing.assert_allclose(matrix @ [*center, 1], [1.1, -1.8, 0.8, 1], atol=1e-12)
-    np.testing.assert_allclose(matrix[:3, :3], rotation((0, 0, 1), np.degrees(0.7)), atol=1e-12)
-    np.testing.assert_array_equal(matrix, rts.rigid(np.array([0, 0, 0.7, 0.1, 0.2, 0.3]), center))
-    for wrong in ([0, 0, 0], np.zeros((6, 1)), 3.0, None):
-        with pytest.raises(InputError, match=r"expected .*\(6,\)"):
-            rts.rigid(wrong)
 
 
 # ---------------------------------------------------------------------------------------------- silhouettes

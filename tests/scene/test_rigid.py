@@ -1,12 +1,14 @@
-"""The compiled rigid matrix against the array code, near and far from where series end."""
+"""`rts.rigid`: closed forms, and compiled code against array code, near and far from where series end."""
 
 import math
 
 import numpy as np
 import pytest
-from helpers import ALL, arrays
+from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, rotation, to_numpy
+from scipy.spatial.transform import Rotation
 
 import rts
+from rts.errors import InputError
 from rts.scene.rigid import RIGID
 
 pytestmark = pytest.mark.engines
@@ -23,6 +25,74 @@ POSES = {
     "many turns": [9.0, -4.0, 7.0, 0.0, 0.0, 5.0],
 }
 CENTER = [0.3, -0.2, 0.7]
+
+
+def test_rigid_equals_scipy_on_both_sides_of_the_threshold():
+    rng = np.random.default_rng(0)
+    axes = rng.normal(size=(60, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = [0.0, 1e-9, 1e-4, 0.05, 0.0999999, 0.1, 0.1000001, 0.2, 1.0, 3.0, math.pi, 2 * math.pi, 7.0]
+    for axis, angle in zip(axes, [*angles, *rng.uniform(0, 0.3, 47)], strict=True):
+        vector = axis * angle
+        matrix = rts.rigid(np.array([*vector, 1.0, 2.0, 3.0]))
+        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(matrix[:, 3], [1, 2, 3, 1], atol=1e-15)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_rigid_in_float32(target):
+    for angle in (0.0, 0.0999, 0.1001, 2.0):
+        vector = np.array([0.6, 0.0, 0.8]) * angle
+        matrix = to_numpy(rts.rigid(arrays(target, np.array([*vector, 0, 0, 0]))))
+        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_rigid_is_the_identity_at_zero_with_its_derivatives(target):
+    zero = arrays(target, np.zeros(6))
+    np.testing.assert_array_equal(to_numpy(rts.rigid(zero)), np.eye(4))
+    point = arrays(target, np.array([0.3, -0.7, 0.5, 1.0]))
+    weights = arrays(target, np.array([1.0, 2.0, -1.0, 0.0]))
+
+    def f(pose):
+        return (rts.rigid(pose) @ point) @ weights
+
+    # d(R p)/dω at zero is the cross product.
+    expected = [*np.cross(to_numpy(point)[:3], to_numpy(weights)[:3]), *to_numpy(weights)[:3]]
+    np.testing.assert_allclose(gradient(target, f, zero), expected, atol=1e-6)
+    p, w = to_numpy(point)[:3].astype(float), to_numpy(weights)[:3].astype(float)
+    # R p = p + ω × p + ω × (ω × p) / 2 + …: the Hessian is (w pᵀ + p wᵀ) / 2 − (w · p) I.
+    hessian = np.zeros((6, 6))
+    hessian[:3, :3] = (np.outer(w, p) + np.outer(p, w)) / 2 - (w @ p) * np.eye(3)
+    func = pytest.importorskip("jax") if target == "jax" else torch.func
+    np.testing.assert_allclose(to_numpy(func.hessian(f)(zero)), hessian, atol=1e-5)
+
+
+def test_the_derivative_of_rigid_at_an_angle():
+    weights = np.random.default_rng(2).normal(size=(4, 4))
+    for angle in (0.03, 0.1, 0.5):
+        pose = np.array([0.6 * angle, 0, 0.8 * angle, 0.1, 0.2, 0.3])
+        tensor = torch.tensor(pose)
+
+        def f(p):
+            return (rts.rigid(p, (0.5, 0, 1)) * torch.as_tensor(weights)).sum()
+
+        numeric = finite_difference(lambda p: np.sum(rts.rigid(p, (0.5, 0, 1)) * weights), pose)
+        np.testing.assert_allclose(gradient("torch-cpu", f, tensor), numeric, atol=1e-8)
+        tangent = np.arange(6.0)
+        _, slope = derivative("torch-cpu", f, tensor, torch.tensor(tangent))
+        assert float(slope) == pytest.approx(numeric @ tangent, abs=1e-7)
+
+
+def test_rigid_turns_about_the_centre_and_takes_lists():
+    center = np.array([1.0, -2.0, 0.5])
+    matrix = rts.rigid([0, 0, 0.7, 0.1, 0.2, 0.3], center)
+    np.testing.assert_allclose(matrix @ [*center, 1], [1.1, -1.8, 0.8, 1], atol=1e-12)
+    np.testing.assert_allclose(matrix[:3, :3], rotation((0, 0, 1), np.degrees(0.7)), atol=1e-12)
+    np.testing.assert_array_equal(matrix, rts.rigid(np.array([0, 0, 0.7, 0.1, 0.2, 0.3]), center))
+    for wrong in ([0, 0, 0], np.zeros((6, 1)), 3.0, None):
+        with pytest.raises(InputError, match=r"expected .*\(6,\)"):
+            rts.rigid(wrong)
 
 
 @pytest.mark.parametrize("pose", POSES.values(), ids=POSES)
@@ -53,9 +123,9 @@ def test_float32_stays_float32():
 def test_batches_of_derivatives():
     poses = torch.tensor(list(POSES.values()), dtype=torch.float64)
     center = torch.tensor(CENTER, dtype=torch.float64)
-    for derivative in (torch.func.jacfwd, torch.func.jacrev, torch.func.hessian):
+    for transform in (torch.func.jacfwd, torch.func.jacrev, torch.func.hessian):
         found, expected = (
-            torch.func.vmap(derivative(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, RIGID.specification)
+            torch.func.vmap(transform(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, RIGID.specification)
         )
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 

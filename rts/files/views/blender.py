@@ -51,8 +51,11 @@ def _lens(place: str, frame: Mapping[str, Any], size: tuple[int, int]) -> tuple[
     """The lens of a frame, and the size (height, width) of the pictures that it is stated for."""
     _check_angle(place, frame)
     stated = {key: frame[key] for key in ("w", "h") if frame.get(key) is not None}
-    given = {**stated, **{key: frame[key] for key in ("fl_x", "fl_y", "cx", "cy", *COEFFICIENTS) if key in frame}}
-    for key, value in given.items():
+    parameters = {
+        **stated,
+        **{key: frame[key] for key in ("fl_x", "fl_y", "cx", "cy", *COEFFICIENTS) if key in frame},
+    }
+    for key, value in parameters.items():
         if not is_real(value) or not math.isfinite(value) or (key in ("w", "h", "fl_x", "fl_y") and value <= 0):
             kind = "positive number" if key in ("w", "h", "fl_x", "fl_y") else "number"
             raise InputError(f"{place} has {key} = {quoted(value)}; expected a {kind}")
@@ -64,14 +67,14 @@ def _lens(place: str, frame: Mapping[str, Any], size: tuple[int, int]) -> tuple[
         raise InputError(f"{place} lacks camera_angle_x and fl_x; expected the horizontal field of view in radians")
     fy = _focal(place, frame, "y", height) or fx
     fisheye = _is_fisheye(place, frame)
-    bent = {key: float(given.get(key, 0)) for key in COEFFICIENTS}
+    bent = {key: float(parameters.get(key, 0)) for key in COEFFICIENTS}
     unclear = [key for key in ("k4", "k5", "k6") if bent[key]]
     if unclear and not fisheye and frame.get("camera_model") != "FULL_OPENCV":
         raise InputError(
             f"{place} has {' and '.join(unclear)}, which tools take for different things; state camera_model, "
             f"{FISHEYE} or FULL_OPENCV"
         )
-    center = float(given.get("cx", width / 2)), float(given.get("cy", height / 2))
+    center = float(parameters.get("cx", width / 2)), float(parameters.get("cy", height / 2))
     return checked_lens(place, Lens(fx, fy, *center, **bent, fisheye=fisheye)), (height, width)
 
 

@@ -45,10 +45,9 @@ def _lens(place: str, view: Mapping[str, Any]) -> Lens:
     if not isinstance(fisheye, bool):
         raise InputError(f"{place} has fisheye = {quoted(fisheye)}; expected true or false")
     names = FISHEYE if fisheye else COEFFICIENTS
-    given = view.get("distortion") or []
-    values = (
-        numbers(place, "distortion", given, *([(0,), (4,)] if fisheye else LENGTHS)) if given != [] else np.zeros(0)
-    )
+    coefficients = view.get("distortion") or []
+    lengths = [(0,), (4,)] if fisheye else LENGTHS
+    values = numbers(place, "distortion", coefficients, *lengths) if coefficients != [] else np.zeros(0)
     bent = dict(zip(names, map(float, values), strict=False))
     return checked_lens(
         place, Lens(float(K[0, 0]), float(K[1, 1]), K[0, 2] + HALF, K[1, 2] + HALF, **bent, fisheye=fisheye)

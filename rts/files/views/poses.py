@@ -77,12 +77,12 @@ def entries(path: Path, tree: Mapping[str, Any], key: str, *needed: str) -> list
     Raises:
         InputError: there is no such list, it is empty, or an entry lacks something that it needs.
     """
-    listed = tree.get(key)
-    if not isinstance(listed, list) or not listed:
-        raise InputError(f"{path} has {f'{key} that are no list' if listed else f'no {key}'}; expected at least one")
+    frames = tree.get(key)
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path} has {f'{key} that are no list' if frames else f'no {key}'}; expected at least one")
     shared = {name: value for name, value in tree.items() if name != key}
     whole = []
-    for i, entry in enumerate(listed):
+    for i, entry in enumerate(frames):
         place = f"{path}, {key.removesuffix('s')} {i}"
         entry = {**shared, **entry} if isinstance(entry, Mapping) else {}
         if not set(needed) <= set(entry):

@@ -141,9 +141,9 @@ def _colmap(folder: Path, entries: list[_Entry]) -> dict[str, str]:
         x, y, z, w = Rotation.from_matrix(entry.rotation).as_quat()
         pose = " ".join(repr(float(value)) for value in (w, x, y, z, *entry.translation))
         images += [f"{number} {pose} {cameras.setdefault(camera, len(cameras) + 1)} {entry.view.name}", ""]
-    listed = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *(f"{number} {camera}" for camera, number in cameras.items())]
+    lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *(f"{number} {camera}" for camera, number in cameras.items())]
     return {
-        "cameras.txt": "\n".join([*listed, ""]),
+        "cameras.txt": "\n".join([*lines, ""]),
         "images.txt": "\n".join([*images, ""]),
         "points3D.txt": "# No points\n",
     }

@@ -11,8 +11,8 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import is_real
-from rts.diagnostics.explanation.slopes import Number, differenced, largest_and_random, measured, unit
-from rts.diagnostics.explanation.subject import Subject
+from rts.diagnostics.gradient_reasons.slopes import Number, differenced, largest_and_random, measured, unit
+from rts.diagnostics.gradient_reasons.subject import Subject
 from rts.diagnostics.progress import Phase
 from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves

@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
-from rts.diagnostics.explanation.subject import Change
+from rts.diagnostics.gradient_reasons.subject import Change
 from rts.registry import instance
 from rts.scene.camera import Camera
 from rts.scene.parts import Part

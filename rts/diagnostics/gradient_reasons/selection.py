@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rts.diagnostics.explanation.disagreeing import why_off
-from rts.diagnostics.explanation.reasons import Finding, Reason, merged
-from rts.diagnostics.explanation.slopes import Number, Slope
-from rts.diagnostics.explanation.subject import Subject, Touched
-from rts.diagnostics.explanation.vanishing import (
+from rts.diagnostics.gradient_reasons.disagreeing import why_off
+from rts.diagnostics.gradient_reasons.reasons import Finding, Reason, merged
+from rts.diagnostics.gradient_reasons.slopes import Number, Slope
+from rts.diagnostics.gradient_reasons.subject import Subject, Touched
+from rts.diagnostics.gradient_reasons.vanishing import (
     is_quiet,
     undetermined,
     why_constant,

@@ -9,8 +9,8 @@ import numpy as np
 
 from rts.arrays.argument_checks import one_line
 from rts.arrays.trees import Tree, leaves
-from rts.diagnostics.explanation.slopes import NEGLIGIBLE, Number, unit
-from rts.diagnostics.explanation.subject import Subject
+from rts.diagnostics.gradient_reasons.slopes import NEGLIGIBLE, Number, unit
+from rts.diagnostics.gradient_reasons.subject import Subject
 from rts.diagnostics.progress import Phase
 from rts.errors import InputError, RtsError
 

@@ -11,10 +11,10 @@ import numpy as np
 from rts.advice.empty_images import out_of_view
 from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.checked_parts import check_scene
-from rts.diagnostics.explanation import variants
-from rts.diagnostics.explanation.reasons import Finding
-from rts.diagnostics.explanation.slopes import Number
-from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched, listed_parts
+from rts.diagnostics.gradient_reasons import variants
+from rts.diagnostics.gradient_reasons.reasons import Finding
+from rts.diagnostics.gradient_reasons.slopes import Number
+from rts.diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched, listed_parts
 from rts.fitting.dependence import directions_in_words
 
 QUIET = 1e-4

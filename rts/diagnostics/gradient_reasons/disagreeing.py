@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.diagnostics.explanation import variants
-from rts.diagnostics.explanation.reasons import Finding
-from rts.diagnostics.explanation.slopes import Number
-from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
-from rts.diagnostics.explanation.vanishing import why_constant
+from rts.diagnostics.gradient_reasons import variants
+from rts.diagnostics.gradient_reasons.reasons import Finding
+from rts.diagnostics.gradient_reasons.slopes import Number
+from rts.diagnostics.gradient_reasons.subject import DEEP, Change, Subject, Touched
+from rts.diagnostics.gradient_reasons.vanishing import why_constant
 from rts.diagnostics.smoothing import low_pass
 
 HALVED = 0.5

@@ -70,7 +70,7 @@ class Reason(NamedTuple):
     """A reason why derivatives disagree with the truth, or vanish.
 
     Attributes:
-        kind: a key of `rts.diagnostics.explanation.reasons.KINDS`.
+        kind: a key of `rts.diagnostics.gradient_reasons.reasons.KINDS`.
         parameters: the names of the numbers.
         text: the cause, its share and the remedy, in a plain sentence or two.
         pixels: (H, W) bool, the pixels that show it.

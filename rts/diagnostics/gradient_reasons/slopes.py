@@ -10,7 +10,7 @@ import numpy as np
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.diagnostics.explanation.subject import DEEP, Subject
+from rts.diagnostics.gradient_reasons.subject import DEEP, Subject
 from rts.diagnostics.smoothing import low_pass
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
