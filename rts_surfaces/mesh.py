@@ -18,17 +18,18 @@ from rts.plugin_api.records import Proxy, Rate, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 
-VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
+VERTEX_ATTRIBUTES = ("normals", "colors", "uv", "tangents")
 
 
 class Mesh(TriangleSurface):
     """A triangle mesh.
 
-    θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors" and
-    "uv" are known and have one row a vertex (A = V). `indices` declares attributes of other names, and tables for
-    attributes with other rows, such as a uv map with split seams. In the G-buffer "normals" becomes "normal" and
-    "colors" becomes "color". Where θ has no normals, smooth ones are computed from the positions, differentiably, if
-    the shader reads them.
+    θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors", "uv"
+    and "tangents" are known and have one row a vertex (A = V). `indices` declares attributes of other names, and tables
+    for attributes with other rows, such as a uv map with split seams. In the G-buffer "normals" becomes "normal",
+    "colors" becomes "color", and "tangents" becomes "tangent". Where θ has no normals, smooth ones are computed from
+    the positions, differentiably, if the shader reads them; so are tangents for normal maps. "tangents" (A, 4) are the
+    directions in which u grows, each with the sign of the direction of v (`rts.GBuffer`).
 
     Args:
         faces: (T, 3) integers into θ["vertices"]; copied.

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from rts import InputError, namespace
 from rts.plugin_api.arrays import Tree, shape_of
 
-G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
+G_BUFFER_NAMES = {"normals": "normal", "colors": "color", "tangents": "tangent"}
 """Entry of θ → its name in the G-buffer, where the two differ."""
-WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
+WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "tangents": (4,), "uv": (2,), "colors": (1, 3, 4)}
 """Entry of θ → how many numbers a vertex or control point may have in it."""
 
 RESERVED = ("vertices", "points", "position", "normal")

@@ -162,7 +162,11 @@ class Skinned(TriangleSurface):
         joints = ("joint_transforms", "joint_weights") if self.joints is not None else ()
         morphs = MORPHS if self._morphs(theta) else ()
         normals = ("morph_normals",) if self._morphs_normals(theta) else ()
-        return *self.mesh.reads(theta), *joints, *morphs, *normals
+        return *self._attributes(theta), *joints, *morphs, *normals
+
+    def _attributes(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """The entries of the mesh; tangents would have to turn with joints, and are computed from uv instead."""
+        return self.mesh.reads({name: x for name, x in theta.items() if name != "tangents"})
 
     # ------------------------------------------------------------------------------------------------ pose
 
@@ -213,7 +217,7 @@ class Skinned(TriangleSurface):
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Interpolated posed positions and attributes; see the class for their names."""
-        entries = {name: theta[name] for name in self.mesh.reads(theta) if name != "normals"}
+        entries = {name: theta[name] for name in self._attributes(theta) if name != "normals"}
         gbuffer = self.mesh.evaluate({**entries, "vertices": self.posed(theta)}, samples)
         if "normals" in theta:
             gbuffer.defer("normal", lambda: self.mesh.attribute("normals", self._posed_normals(theta), samples))

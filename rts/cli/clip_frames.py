@@ -27,7 +27,9 @@ def check_animation(output: Path, clip: str | None, time: float | None, names: t
         raise typer.BadParameter("--time is for a clip; give --clip, too")
 
 
-def frames_of(model: Path, clip: str, time: float | None, moving: bool) -> tuple[list[list[Part]], Bounds]:
+def frames_of(
+    model: Path, clip: str, time: float | None, moving: bool, cull: str = "none"
+) -> tuple[list[list[Part]], Bounds]:
     """The parts of a model at one time of a clip, or, if `moving`, at each frame; and the bounds of the whole clip.
 
     Args:
@@ -35,8 +37,9 @@ def frames_of(model: Path, clip: str, time: float | None, moving: bool) -> tuple
         clip: the name of a clip, or its number.
         time: seconds; None for the start.
         moving: True for all frames.
+        cull: as of `rts.load`.
     """
-    loaded = rts.load_model(model)
+    loaded = rts.load_model(model, cull=cull)
     named = any(c.name == clip for c in loaded.clips)
     which = int(clip) if clip.isdecimal() and not named else clip
     duration = loaded.clip(which).duration

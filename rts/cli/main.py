@@ -149,7 +149,9 @@ def render(
     splatter: Annotated[str, typer.Option(help="Name of a splatter: edges, multi, single or none.")] = "auto",
     supersample: Annotated[str, typer.Option(help="Samples along each side of a pixel, such as 2.")] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
-    cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
+    cull: Annotated[
+        str, typer.Option(help="none; back, to leave out triangles seen from behind; or file: where a glTF says so.")
+    ] = "none",
     environment: Annotated[
         Path | None,
         typer.Option(
@@ -197,11 +199,11 @@ def render(
     light = None if environment is None else environment_of(environment, up)
     engine_object = registry.plugin("rts.engines", engine)()
     if clip is None:
-        frames = [rts.load(model, surface=surface)]
+        frames = [rts.load(model, surface=surface, cull=cull)]
         bounds = bounds_of(frames[0])
     else:
         refuse_beside("--clip", context, ("pose", "surface"))
-        frames, bounds = frames_of(model, clip, time_, output.suffix.lower() in ANIMATIONS)
+        frames, bounds = frames_of(model, clip, time_, output.suffix.lower() in ANIMATIONS, cull)
     if pose is None:
         seen = orbit(bounds, shape, *view, fov=fov, up=up)
     else:
@@ -218,7 +220,6 @@ def render(
         theta = theta if light is None else {**theta, "light": {"environment": light}}
         return part.replace(
             theta=map_leaves(engine_object.constant, theta),
-            cull=cull,
             shader=part.shader if shader == "auto" else shader,
         )
 

@@ -99,6 +99,13 @@ def gathered(path: Path) -> Iterator[list[str]]:
     lines[:] = dict.fromkeys(lines)
 
 
+def warn_once(path: Path, lines: list[str]) -> None:
+    """Pass what was `gathered` on to the user, as one warning."""
+    if lines:
+        rest = (line.removeprefix(str(path)).lstrip(":, ") for line in lines[1:])
+        errors.warn("; ".join([lines[0], *rest]), FileWarning)
+
+
 class _Lines(logging.Handler):
     """Handler that adds lines for records logged as warnings or worse, with the errors that led to them."""
 

@@ -17,7 +17,8 @@ _INTEGERS = "i1 u1 i2 u2 i1/ u1/ i2/ u2/"
 ATTRIBUTES = {
     "POSITION": ("VEC3", "f4", _INTEGERS),
     "NORMAL": ("VEC3", "f4", "i1/ i2/"),
-    "TEXCOORD_0": ("VEC2", "f4 u1/ u2/", _INTEGERS),
+    "TANGENT": ("VEC4", "f4", "i1/ i2/"),
+    **{f"TEXCOORD_{i}": ("VEC2", "f4 u1/ u2/", _INTEGERS) for i in range(4)},
     "COLOR_0": ("VEC3 VEC4", "f4 u1 u2 u1/ u2/", ""),
     "indices": ("SCALAR", "u1 u2 u4", ""),
 }

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.files.damaged_files import warn
+from rts.files.gltf_textures import Lookup, Maps
 from rts.files.gltf_tree import Gltf
 from rts.files.srgb import decode_srgb
 
@@ -23,12 +24,15 @@ class Material(NamedTuple):
     """The part of a material that shaders use.
 
     Attributes:
-        color: (4,) the factor of the base colour, linear, in steps of 1/255; or None.
+        color: (4,) the factor of the base colour, linear; or None.
         texture: (h, w, 3 or 4) of the base colour, as `rts.files.images.pixels` gives it; or None.
         alpha_mode: "OPAQUE", "MASK" or "BLEND".
         cutoff: the least alpha that is shown, of "MASK".
         entries: entries of θ for the shader `pbr`, linear: "metallic", "roughness", "normal_map", "occlusion" and
             "emissive", numbers or maps; None where the material tells nothing but its base colour.
+        lookup: the way in which all maps are looked up.
+        unlit: True if it has no light.
+        double_sided: False if it is not seen from behind.
     """
 
     color: np.ndarray | None = None
@@ -36,6 +40,9 @@ class Material(NamedTuple):
     alpha_mode: str = "OPAQUE"
     cutoff: float = 0.5
     entries: dict[str, np.ndarray] | None = None
+    lookup: Lookup = Lookup()
+    unlit: bool = False
+    double_sided: bool = False
 
     def shown(
         self, rows: np.ndarray | None, mapped: bool
@@ -54,7 +61,7 @@ class Material(NamedTuple):
             at = 1 if mapped and self.texture is not None else 0
             shown, alpha = values[at], 1.0 if self.color is None else float(self.color[3])
             if shown is not None and shown.shape[-1] == 4:
-                opaque = shown[..., 3:] * alpha >= self.cutoff
+                opaque = (shown[..., 3:] * alpha).astype(np.float32) >= np.float32(self.cutoff)
                 plain[at] = np.concatenate([shown[..., :3], opaque], axis=-1, dtype=shown.dtype)
             elif self.color is not None:
                 plain[2] = np.append(self.color[:3], float(alpha >= self.cutoff))
@@ -62,8 +69,8 @@ class Material(NamedTuple):
 
 
 def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
-    """A material; refused if a colour or texture is invalid. Warns of what is not read of a texture."""
-    name = f"material {index}"
+    """A material; refused if a colour or texture is invalid. Notes what is not followed."""
+    name, maps = f"material {index}", Maps(gltf)
     look = dict(material.get("pbrMetallicRoughness", {}))
     older = material.get("extensions", {}).get(SPECULAR, {})
     for ours, theirs in (("baseColorFactor", "diffuseFactor"), ("baseColorTexture", "diffuseTexture")):
@@ -73,37 +80,39 @@ def read_material(gltf: Gltf, index: int, material: dict[str, Any]) -> Material:
     if factor.shape != (4,):
         raise gltf.fail(f"the baseColorFactor of {name} is {factor.tolist()}; expected four numbers")
     color = unit_colors(gltf, f"baseColorFactor of {name}", factor[None])[0] if "baseColorFactor" in look else None
-    texture = _picture(gltf, look, "baseColorTexture", f"the texture of {name}")
-    entries = None if UNLIT in material.get("extensions", {}) or older else _entries(gltf, material, look, name)
-    mode, cutoff = material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5))
-    return Material(color, texture, mode, cutoff, entries)
+    texture = maps.read(look, "baseColorTexture", f"the texture of {name}")
+    if older:
+        gltf.note(f"{SPECULAR}, of which the diffuse colour alone is read", name)
+    unlit = UNLIT in material.get("extensions", {})
+    entries = None if unlit or older else _entries(maps, material, look, name)
+    return Material(
+        color,
+        texture,
+        alpha_mode=material.get("alphaMode", "OPAQUE"),
+        cutoff=float(material.get("alphaCutoff", 0.5)),
+        entries=entries,
+        lookup=maps.lookup or Lookup(),
+        unlit=unlit,
+        double_sided=bool(material.get("doubleSided", False)),
+    )
 
 
-def _picture(gltf: Gltf, entry: dict[str, Any], key: str, name: str) -> np.ndarray | None:
-    """The pixels of a texture that an entry refers to, as the file has them; None if it has none, or is not read."""
-    if key not in entry:
-        return None
-    reference = entry[key]
-    if "KHR_texture_transform" in reference.get("extensions", {}) or reference.get("texCoord", 0) != 0:
-        warn(f"{gltf.path}: {name} has a transform or coordinates of its own, which are not read")
-    return gltf.picture(reference["index"], name)
-
-
-def _entries(gltf: Gltf, material: dict[str, Any], look: dict[str, Any], name: str) -> dict[str, np.ndarray] | None:
+def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: str) -> dict[str, np.ndarray] | None:
     """`Material.entries`; refused where a factor is no number, or out of its range."""
+    gltf = maps.gltf
     keys = {*look} & set(STATED) | {*material} & {"normalTexture", "occlusionTexture", "emissiveTexture"}
     if not keys:
         return None
-    surface = _picture(gltf, look, "metallicRoughnessTexture", f"the metallicRoughnessTexture of {name}")
+    surface = maps.read(look, "metallicRoughnessTexture", f"the metallicRoughnessTexture of {name}")
     entries = {}
     for entry, key, channel in (("metallic", "metallicFactor", 2), ("roughness", "roughnessFactor", 1)):
         factor = _number(gltf, look, key, 1.0, name, most=1.0)
         entries[entry] = np.asarray(factor if surface is None else factor * surface[..., channel : channel + 1])
-    bumps = _picture(gltf, material, "normalTexture", f"the normalTexture of {name}")
+    bumps = maps.read(material, "normalTexture", f"the normalTexture of {name}")
     if bumps is not None:
         scale = _number(gltf, material["normalTexture"], "scale", 1.0, name, least=-LARGEST)
         entries["normal_map"] = (2 * bumps[..., :3] - 1) * [scale, scale, 1.0]
-    open_ = _picture(gltf, material, "occlusionTexture", f"the occlusionTexture of {name}")
+    open_ = maps.read(material, "occlusionTexture", f"the occlusionTexture of {name}")
     if open_ is not None:
         strength = _number(gltf, material["occlusionTexture"], "strength", 1.0, name, most=1.0)
         entries["occlusion"] = 1 + strength * (open_[..., :1] - 1)
@@ -113,7 +122,7 @@ def _entries(gltf: Gltf, material: dict[str, Any], look: dict[str, Any], name: s
         raise gltf.fail(f"the emissiveFactor of {name} is {factor.tolist()}; expected three numbers from 0 to 1")
     factor = factor * _number(gltf, strong, "emissiveStrength", 1.0, name)
     if factor.any():
-        glow = _picture(gltf, material, "emissiveTexture", f"the emissiveTexture of {name}")
+        glow = maps.read(material, "emissiveTexture", f"the emissiveTexture of {name}")
         entries["emissive"] = factor if glow is None else factor * decode_srgb(glow[..., :3])
     return {entry: np.asarray(value, np.float32) for entry, value in entries.items()}
 
@@ -129,11 +138,11 @@ def _number(
 
 
 def unit_colors(gltf: Gltf, name: str, colors: np.ndarray) -> np.ndarray:
-    """Colours (N, C) clipped to [0, 1], in steps of 1/255; refused if NaN or beyond ±255, with a warning if clipped."""
+    """Colours (N, C) clipped to [0, 1], with a warning; refused if NaN or beyond ±255."""
     wrong = ~(np.abs(colors) <= 255).all(axis=1)
     if wrong.any():
         at = int(np.argmax(wrong))
         raise gltf.fail(f"row {at} of {name} is {colors[at].tolist()}; expected colours from 0 to 1")
     if ((colors < 0) | (colors > 1)).any():
         warn(f"{gltf.path}: {name} has colours that are not from 0 to 1, which are clipped")
-    return np.round(255 * np.clip(colors, 0, 1)).astype(np.float64) / 255
+    return np.clip(colors, 0, 1)

@@ -47,6 +47,7 @@ def read_scene(gltf: Gltf) -> tuple[list[tuple[Piece, dict[str, Any], int]], lis
     meshes = gltf.each("meshes", read_mesh)
     instances = gltf.part("its scene", read_instances, gltf)
     gltf.part("its tree", gltf.check_names)
+    gltf.warn_of_notes()
     pieces = [
         (piece._replace(transform=None if np.array_equal(place, np.eye(4)) else place), primitive, node)
         for mesh, place, node in instances
@@ -78,14 +79,29 @@ def _piece(
     attributes = {}
     if "NORMAL" in read:
         attributes["normals"] = read["NORMAL"].numbers(), faces
-    if "TEXCOORD_0" in read:
-        u, v = read["TEXCOORD_0"].numbers().T
-        attributes["uv"] = np.stack([u, 1 - v], axis=1), faces
+    lookup, entries = material.lookup, material.entries
+    if (uv := f"TEXCOORD_{lookup.texcoord}") in read:
+        attributes["uv"] = lookup.uv(read[uv].numbers()), faces
+    if "TANGENT" in read and entries is not None and "normal_map" in entries:
+        attributes["tangents"] = read["TANGENT"].numbers(), faces
     colors = None
     if "COLOR_0" in read:
         colors = unit_colors(gltf, f"COLOR_0 of {name}", read["COLOR_0"].numbers(fractions=True))
+        if material.texture is not None and "uv" in attributes and (colors[:, :3] < 1).any():
+            gltf.note("vertex colours beside a texture, which hides them", name)
     colors, texture, color = material.shown(colors, "uv" in attributes)
     if colors is not None:
         attributes["colors"] = colors, faces
     vertices = read["POSITION"].numbers().astype(np.float64)
-    return Piece(vertices, faces, attributes, texture, color, linear=True, entries=material.entries)
+    return Piece(
+        vertices,
+        faces,
+        attributes,
+        texture,
+        color,
+        linear=True,
+        entries=entries,
+        options={"wrap": lookup.wrap, "filter": lookup.filter},
+        unlit=material.unlit,
+        one_sided=not material.double_sided,
+    )

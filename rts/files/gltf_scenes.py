@@ -15,7 +15,13 @@ _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
 def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray, int]]:
-    """The meshes of the scene that is shown: index, transform (4, 4) scene-from-local, and node, one for each node.
+    """The meshes of the scene that is shown: index, transform (4, 4) scene-from-local, and node, one for each node."""
+    nodes = gltf.tree.get("nodes", [])
+    return [(nodes[index]["mesh"], place, index) for index, place in read_places(gltf) if "mesh" in nodes[index]]
+
+
+def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
+    """The nodes of the scene that is shown: index, and transform (4, 4) scene-from-local.
 
     Refuses nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots; warns of
     instances, which are not read.
@@ -47,15 +53,14 @@ def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray, int]]:
             raise fail(
                 f"scene {index} has node {wrong[0]}, which is there twice, is the child of another, or is missing"
             )
-    instances = []
+    places = []
     ahead = [(root, np.eye(4)) for root in scenes[tree.get("scene", 0)].get("nodes", [])] if scenes else []
     while ahead:
         index, outer = ahead.pop()
         place = outer @ moves[index]
         ahead += [(child, place) for child in nodes[index].get("children", [])]
-        if "mesh" in nodes[index]:
-            instances.append((nodes[index]["mesh"], place, index))
-    return instances
+        places.append((index, place))
+    return places
 
 
 def parents_of(nodes: list[dict[str, Any]], fail: Fail) -> dict[int, int]:

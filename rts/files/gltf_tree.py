@@ -19,7 +19,13 @@ from rts.files.images import decoded
 
 APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
 """Names of extensions that do not concern shapes begin like this."""
-READ = ("KHR_mesh_quantization",)
+READ = frozenset(
+    f"KHR_{name}"
+    for name in "mesh_quantization materials_unlit materials_emissive_strength materials_pbrSpecularGlossiness "
+    "lights_punctual".split()
+)
+UNSEEN = re.compile(r"[A-Z]+_(texture|xmp|animation)")
+"""Names of extensions begin like this that are read, or that make no difference to what is loaded."""
 TOLD = "EXT_mesh_gpu_instancing"
 """An extension of which reading scenes warns."""
 PROPERTIES = {
@@ -54,6 +60,7 @@ class Gltf:
         fail: text → error.
         tree: its JSON.
         views: the bytes of each bufferView.
+        notes: what is not followed → the names of where it is.
 
     Raises:
         InputError: it is shorter than it promises, a part is missing or unsound, or it needs what is not read.
@@ -61,6 +68,7 @@ class Gltf:
 
     def __init__(self, path: Path, data: bytes, file: Callable[[str], bytes]):
         self.path, self._file, self._pictures = path, file, {}
+        self.notes: dict[str, list[str]] = {}
         kind = "GLTF" if path.suffix.lower() == ".gltf" else "GLB"
         self.fail: Fail = lambda what: unreadable(path, kind, what)
         text, self._binary = self._parts(data) if kind == "GLB" else (data, None)
@@ -88,6 +96,17 @@ class Gltf:
     def uses(self, extension: str) -> bool:
         """True if the file says that it uses or requires the extension."""
         return extension in (*self.tree.get("extensionsUsed", []), *self.tree.get("extensionsRequired", []))
+
+    def note(self, what: str, name: str) -> None:
+        """Note that something is not followed; `warn_of_notes` tells of it."""
+        self.notes.setdefault(what, []).append(name)
+
+    def warn_of_notes(self) -> None:
+        """Warn of what is not followed, each with the first places where it is."""
+        for what, names in self.notes.items():
+            names = list(dict.fromkeys(names))
+            more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+            warn(f"{self.path} has {what}: {', '.join(names[:3])}{more}")
 
     def picture(self, texture: int, name: str) -> np.ndarray | None:
         """The pixels of a texture, as `rts.files.images.pixels` gives them; None with a warning if of an unknown kind.
@@ -152,10 +171,13 @@ class Gltf:
         if unknown or not isinstance(required, list):
             raise self.fail(f"it requires the extension {(unknown or [required])[0]!r}, which is not read")
         holders = [*tree.get("bufferViews", []), *(p for mesh in tree.get("meshes", []) for p in mesh["primitives"])]
+        holders += tree.get("materials", [])
         used = [*tree.get("extensionsUsed", []), *(name for holder in holders for name in holder.get("extensions", {}))]
-        for name in dict.fromkeys(used):
-            if name not in (*READ, TOLD) and not APPEARANCE.match(name):
-                warn(f"{self.path} uses the extension {name[:60]}, which is not read; it is loaded as it is without")
+        unread = [name[:60] for name in dict.fromkeys(used) if name not in (*READ, TOLD) and not UNSEEN.match(name)]
+        if unread:
+            what = f"{unread[0]}, which is" if len(unread) == 1 else f"{', '.join(unread[:9])}, which are"
+            plural = "s" if len(unread) > 1 else ""
+            warn(f"{self.path} uses the extension{plural} {what} not read; it is loaded as it is without")
 
     def _buffer(self, index: int, buffer: dict[str, Any]) -> bytes:
         extensions, content = buffer.get("extensions", {}), b""

@@ -18,9 +18,9 @@ from rts.arrays.argument_checks import quoted
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.contracts.checks import MEMORY, is_real
-from rts.errors import EngineError, FileWarning, InputError, PluginError, warn
+from rts.errors import EngineError, InputError, PluginError
 from rts.files.bright_images import read_exr, read_hdr, write_exr, write_hdr
-from rts.files.damaged_files import Fail, gathered
+from rts.files.damaged_files import Fail, gathered, warn_once
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 from rts.shading.tone_mapping import check_exposure, tonemap
@@ -95,8 +95,7 @@ def load_image(path: Any) -> np.ndarray:
         return _bright(path)
     with gathered(path) as notes:
         encoded = read_image(path)
-    for note in notes:
-        warn(note, FileWarning)
+    warn_once(path, notes)
     straight = decode_srgb(encoded)
     alpha = straight[..., 3:] if straight.shape[2] == 4 else np.ones_like(straight[..., :1])
     return np.concatenate([straight[..., :3] * alpha, alpha], axis=2)

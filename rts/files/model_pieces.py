@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arrays.argument_checks import quoted
 from rts.errors import InputError
 
-WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "colors": (3, 4)}
+WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "tangents": (4,), "colors": (3, 4)}
 """Numbers in a row of each table."""
 LARGEST = float(np.finfo(np.float32).max)
+CULLS = ("none", "back", "file")
 SINGULAR = 1e-9
 """Least volume of a transform's parallelepiped, as a share of the product of its edges."""
 
@@ -22,13 +26,16 @@ class Piece(NamedTuple):
     Attributes:
         vertices: (V, 3) float, local space.
         faces: (T, 3) int into `vertices`.
-        attributes: "uv", "normals", "colors" → rows (A, C) and (T, 3) int into them, each where the file has
-            it. Colours are in [0, 1], as encoded in the file.
+        attributes: "uv", "normals", "tangents", "colors" → rows (A, C) and (T, 3) int into them, each where the file
+            has it. Colours are in [0, 1], as encoded in the file.
         texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, alpha straight; or None.
         color: (3,) or (4,) factor of the material, as encoded in the file; or None.
         linear: True if `color` and the attribute "colors" are linear rather than sRGB.
         transform: (4, 4) scene-from-local, or None.
         entries: further entries of θ, for the shader `pbr`; None for other shaders.
+        options: of the shader, "wrap" and "filter"; empty for its defaults.
+        unlit: True if it has no light.
+        one_sided: True if the file says that it is not seen from behind.
     """
 
     vertices: np.ndarray
@@ -39,6 +46,9 @@ class Piece(NamedTuple):
     linear: bool = False
     transform: np.ndarray | None = None
     entries: dict[str, np.ndarray] | None = None
+    options: Mapping[str, Any] = MappingProxyType({})
+    unlit: bool = False
+    one_sided: bool = False
 
 
 def check_piece(path: Path, piece: Piece) -> None:
@@ -86,3 +96,14 @@ def fault_of(matrix: np.ndarray) -> str:
     if not abs(np.linalg.det(linear)) > SINGULAR * np.prod(lengths):
         return "is singular: it makes things flat"
     return ""
+
+
+def check_cull(cull: str) -> None:
+    """Refuse what is none of `CULLS`."""
+    if not isinstance(cull, str) or cull not in CULLS:
+        raise InputError(f"cull is {quoted(cull)}; expected {', '.join(CULLS)}")
+
+
+def cull_of(piece: Piece, cull: str) -> str:
+    """`Part.cull` of a piece, for an argument of `load`."""
+    return "back" if cull == "back" or (cull == "file" and piece.one_sided) else "none"

@@ -16,9 +16,9 @@ import numpy as np
 from rts import registry
 from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
-from rts.files.damaged_files import contents, gathered
+from rts.files.damaged_files import contents, gathered, warn_once
 from rts.files.gltf_reader import read_gltf
-from rts.files.model_pieces import Piece, check_piece
+from rts.files.model_pieces import Piece, check_cull, check_piece, cull_of
 from rts.files.obj_reader import read_obj
 from rts.files.off_reader import read_off
 from rts.files.paths import as_path, beside
@@ -28,10 +28,10 @@ from rts.files.stl_reader import read_stl
 from rts.files.trimesh_reader import read_with_trimesh
 from rts.scene.parts import Part
 from rts.shading.pbr import Pbr
-from rts.shading.shaders import Lambert, Textured
+from rts.shading.shaders import Lambert, Textured, Unlit
 
 
-def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh") -> list[Part]:
+def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh", cull: str = "none") -> list[Part]:
     """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, and others that trimesh reads.
 
     There is one part for each mesh of the scene or, in an OBJ, for each material; in an STL as text, for each solid;
@@ -39,9 +39,10 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     "normals", "colors", "texture" and "color". Vertices are in the order of the file; those that no face refers to
     are left out, and those that coincide exactly are welded: where uv or normals differ between the faces around a
     vertex they have an index table of their own, so that moving vertices opens no seams. Normals of the file do not
-    follow moving vertices: drop them from θ, and smooth ones are computed that do. The shader is `pbr` where the
-    material of a glTF tells more than its base colour: θ then has "metallic", "roughness", "normal_map", "occlusion"
-    and "emissive", as far as the file has them. Else it is `textured` where there are uv and a texture, or `lambert`.
+    follow moving vertices: drop them from θ, and smooth ones are computed that do; likewise "tangents". The shader is
+    `pbr` where the material of a glTF or MTL tells more than its base colour: θ then has "metallic", "roughness",
+    "normal_map", "occlusion" and "emissive", as far as the file has them. Else it is `textured` where there are uv and
+    a texture, `unlit` where a glTF says that there is no light, or `lambert`.
 
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
     about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
@@ -58,6 +59,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         merge: join everything into one part, in the coordinates of the scene. Refused where textures differ.
         weld: leave out vertices without faces, and weld those that coincide; False keeps the vertices of the file,
             their number and order. (All parts of an OBJ share one table of vertices; each then holds all of it.)
+        cull: "back" to leave out all triangles seen from behind; "file" to do so where a material of a glTF is not
+            double-sided; "none", the default, infers nothing. Nodes that mirror keep their outside.
         surface: the name of a registered surface that reads the file, in a format of its own; "bezier" reads patches
             (text as Newell's teapot is in, or .npz), "subdivision" the cage in an OBJ. The text above is about "mesh".
 
@@ -69,12 +72,14 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
 
     Warns:
         FileWarning: something was left out or guessed, such as a library of materials that is not there, a statement or
-            property that is not known, or positions that are not within the bounds that a glTF gives them.
+            property that is not known, or positions that are not within the bounds that a glTF gives them. There is
+            one warning for all of this.
     """
     path = as_path(path)
     for name, flag in (("merge", merge), ("weld", weld)):
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"{name} is {quoted(flag)}; expected True or False")
+    check_cull(cull)
     if not isinstance(surface, str):
         raise InputError(f"surface is {quoted(surface)}; expected a name, such as 'mesh' or 'bezier'")
     if surface != "mesh":
@@ -82,14 +87,13 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         if merge or not weld:
             raise InputError(f"merge and weld are for meshes; the surface {surface!r} reads its files without them")
         check_exists(path)
-        return list(plugin.load(path))
+        return [part.replace(cull="back") if cull == "back" else part for part in plugin.load(path)]
     with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # Checks refuse overflow by name.
         pieces = [linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):
             pieces = [_merged(path, pieces)]
-        parts = [part_of(path, piece, weld) for piece in pieces]
-    for note in notes:
-        warn(note, FileWarning)
+        parts = [part_of(path, piece, weld).replace(cull=cull_of(piece, cull)) for piece in pieces]
+    warn_once(path, notes)
     return parts
 
 
@@ -138,10 +142,11 @@ def part_of(
     translucent = any(
         name in theta and theta[name].shape[-1] == 4 for name in ("color", "texture" if textured else "colors")
     )
+    shader = Pbr if piece.entries is not None else Textured if textured else Unlit if piece.unlit else Lambert
     return Part(
         (surface or registry.plugin("rts.surfaces", "mesh"))(faces, indices),
         theta,
-        (Pbr if piece.entries is not None else Textured if textured else Lambert)(opaque=not translucent),
+        shader(opaque=not translucent, **piece.options),
         piece.transform,
     )
 
@@ -190,7 +195,8 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
     first = pieces[0].texture
     for piece in pieces[1:]:
         other = piece.texture
-        if not (other is None if first is None else other is not None and np.array_equal(other, first)):
+        alike = first is None or piece.options == pieces[0].options
+        if not alike or not (other is None if first is None else other is not None and np.array_equal(other, first)):
             raise InputError(
                 f"{path} has {len(pieces)} parts with different textures, which cannot be merged; load it without merge"
             )
@@ -212,7 +218,17 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
     same = all(piece.entries is pieces[0].entries for piece in pieces)
     if not same:
         warn(f"{path}: its parts have different materials; merged, they keep base colours alone", FileWarning)
-    return Piece(vertices, faces, whole, first, linear=True, entries=pieces[0].entries if same else None)
+    return pieces[0]._replace(
+        vertices=vertices,
+        faces=faces,
+        attributes=whole,
+        color=None,
+        linear=True,
+        transform=None,
+        entries=pieces[0].entries if same else None,
+        unlit=all(piece.unlit for piece in pieces),
+        one_sided=all(piece.one_sided for piece in pieces),
+    )
 
 
 def _in_scene(piece: Piece) -> Piece:
@@ -230,6 +246,10 @@ def _in_scene(piece: Piece) -> Piece:
         if "normals" in attributes:
             rows, table = attributes["normals"]
             attributes["normals"] = (rows @ np.linalg.inv(m[:3, :3]), table)
+        if "tangents" in attributes:
+            rows, table = attributes["tangents"]
+            moved = rows[:, :3] @ m[:3, :3].T
+            attributes["tangents"] = (np.column_stack([moved, -rows[:, 3] if mirrored else rows[:, 3]]), table)
         if mirrored:  # Mirrored triangles would be inside out.
             faces = faces[:, ::-1]
             attributes = {name: (rows, table[:, ::-1]) for name, (rows, table) in attributes.items()}

@@ -11,13 +11,13 @@ import numpy as np
 
 from rts import registry
 from rts.arrays.argument_checks import quoted
-from rts.errors import FileWarning, InputError, warn
-from rts.files.damaged_files import contents, gathered
+from rts.errors import InputError
+from rts.files.damaged_files import contents, gathered, warn_once
 from rts.files.gltf_bodies import Deformation, read_deformation, read_nodes, read_skins
 from rts.files.gltf_clips import read_clips
 from rts.files.gltf_reader import read_scene
 from rts.files.gltf_tree import Gltf, count_of
-from rts.files.model_pieces import Piece, check_piece
+from rts.files.model_pieces import Piece, check_cull, check_piece, cull_of
 from rts.files.models import check_exists, linear, part_of, used_rows, welded_rows
 from rts.files.paths import as_path, beside
 from rts.scene.model import Binding, Model
@@ -26,7 +26,7 @@ from rts.scene.parts import Part
 EXTENSIONS = (".glb", ".gltf")
 
 
-def load_model(path: Any, *, weld: bool = True) -> Model:
+def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
     """A model that moves: the parts of a GLB or glTF, and what `rts.load` leaves out of it.
 
     `model.pose(clip, time)` is a pose, and `model.posed(pose)` are the parts in it. Parts that joints bend, or that
@@ -36,6 +36,7 @@ def load_model(path: Any, *, weld: bool = True) -> Model:
     Args:
         path: the file. It may refer to files in its own folder only.
         weld: as of `rts.load`.
+        cull: as of `rts.load`.
 
     Raises:
         InputError: as of `rts.load`; the file is of another kind; or a skin, morph target or clip is damaged: joints
@@ -47,6 +48,7 @@ def load_model(path: Any, *, weld: bool = True) -> Model:
     path = as_path(path)
     if not isinstance(weld, (bool, np.bool_)):
         raise InputError(f"weld is {quoted(weld)}; expected True or False")
+    check_cull(cull)
     check_exists(path)
     if path.suffix.lower() not in EXTENSIONS:
         raise InputError(f"{path} is no model that moves; expected .glb or .gltf: rts.load reads parts of other files")
@@ -66,15 +68,14 @@ def load_model(path: Any, *, weld: bool = True) -> Model:
             name, count = f"the mesh of node {node}", None if skin is None else len(skins[skin].joints)
             deformation = gltf.part(name, read_deformation, gltf, name, primitive, accessors, count)
             is_bent = deformation is not None and deformation.joints is not None
-            parts.append(_part(path, linear(piece), deformation, weld))
+            parts.append(_part(path, linear(piece), deformation, weld).replace(cull=cull_of(piece, cull)))
             bindings.append(Binding(node, skin if is_bent else None))
         if not parts:
             raise InputError(f"{path} holds no faces; expected a mesh with triangles")
         model = Model(
             tuple(parts), tuple(bindings), tuple(nodes), tuple(skins), tuple(read_clips(gltf, accessors, nodes))
         )
-    for note in notes:
-        warn(note, FileWarning)
+    warn_once(path, notes)
     return replace(model, parts=tuple(model.posed(model.pose())))
 
 

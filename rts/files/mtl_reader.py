@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.errors import InputError
 from rts.files.damaged_files import contents, lines_of
+from rts.files.images import read_texture
 from rts.files.paths import inside
+from rts.files.srgb import decode_srgb
 
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
@@ -18,6 +22,10 @@ _MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
 _MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
 """A comment by which MeshLab signs; its Tr is 1 for opaque materials."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
+NUMBERS = {"pm": "metallic", "pr": "roughness", "ke": "emissive"}
+"""Statements of numbers that the shader `pbr` reads → entries of θ."""
+MAPS = {"map_pm": "metallic", "map_pr": "roughness", "map_ke": "emissive", "norm": "normal_map"}
+"""Statements of maps that it reads."""
 
 
 class Material(NamedTuple):
@@ -28,10 +36,35 @@ class Material(NamedTuple):
             is white with alpha, or None where opaque. Without d, alpha is 1 − Tr, unless Tr is at least 1 or MeshLab
             wrote the file: then Tr is taken for d.
         texture: file of map_Kd, or None. It replaces Kd.
+        numbers: "metallic" () of Pm and "roughness" () of Pr, both in [0, 1], and "emissive" (3,) of Ke, sRGB and not
+            black, as far as the material has them.
+        maps: files of "metallic", "roughness", "emissive" and "normal_map". They replace numbers.
+        unread: statements of other maps.
     """
 
     color: np.ndarray | None = None
     texture: Path | None = None
+    numbers: Mapping[str, np.ndarray] = MappingProxyType({})
+    maps: Mapping[str, Path] = MappingProxyType({})
+    unread: tuple[str, ...] = ()
+
+    def entries(self, referrer: Path) -> dict[str, np.ndarray] | None:
+        """Entries of θ for the shader `pbr`, linear; None if the material has none. `referrer` is for errors.
+
+        Raises:
+            InputError: a map is missing or cannot be read.
+        """
+        entries = {name: decode_srgb(x) if name == "emissive" else x for name, x in self.numbers.items()}
+        for name, file in self.maps.items():
+            pixels = read_texture(file, referrer)[..., :3]
+            match name:
+                case "emissive":
+                    entries[name] = decode_srgb(pixels)
+                case "normal_map":
+                    entries[name] = 2 * pixels - 1
+                case _:
+                    entries[name] = np.ascontiguousarray(pixels[..., :1])
+        return entries or None
 
 
 def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
@@ -47,7 +80,7 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     for number, line in enumerate(lines, start=1):
         key, _, rest = line.replace("\t", " ").strip().partition(" ")
         key, rest = key.lower(), rest.strip()
-        values = _numbers(library, number, rest) if key in ("kd", "d", "tr") else []
+        values = _numbers(library, number, rest) if key in ("kd", "d", "tr", *NUMBERS) else []
         if key == "newmtl":
             current = materials.setdefault(rest, {})
         elif key == "kd" and len(values) in (1, 3):
@@ -60,6 +93,13 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
             file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
             if key == "map_kd":
                 current["texture"] = file
+            elif key in MAPS:
+                current.setdefault("maps", {})[MAPS[key]] = file
+            else:
+                current.setdefault("unread", {})[key] = file
+        elif key in NUMBERS and len(values) in ((1, 3) if key == "ke" else (1,)):
+            numbers = np.maximum(np.resize(values, 3), 0) if key == "ke" else np.clip(values[0], 0, 1)
+            current.setdefault("numbers", {})[NUMBERS[key]] = np.asarray(numbers, np.float32)
     return {name: _material(values) for name, values in materials.items()}
 
 
@@ -80,4 +120,9 @@ def _material(values: dict[str, Any]) -> Material:
         color = None if alpha >= 1 else np.ones(3)
     if alpha < 1:
         color = np.append(np.ones(3) if color is None else color, max(alpha, 0.0))
-    return Material(color, values.get("texture"))
+    texture, numbers = values.get("texture"), dict(values.get("numbers", {}))
+    if not numbers.get("emissive", np.zeros(3)).any():
+        numbers.pop("emissive", None)
+    # The map of the ambient colour is mostly that of the diffuse one.
+    unread = tuple(key for key, file in values.get("unread", {}).items() if file != texture)
+    return Material(color, texture, numbers, values.get("maps", {}), unread)

@@ -242,11 +242,13 @@ def read_obj(path: Path) -> list[Piece]:
     lines = _Lines(path).read()
     materials = _materials(lines)
     used = {material for _, _, material in lines.faces}
-    textures = {
-        name: read_texture(file, path)
-        for name, index in lines.materials.items()
-        if index in used and (file := materials.get(name, Material()).texture) is not None
-    }
+    looks = {name: materials.get(name, Material()) for name, index in lines.materials.items() if index in used}
+    textures = {name: read_texture(look.texture, path) for name, look in looks.items() if look.texture is not None}
+    entries = {name: look.entries(path) for name, look in looks.items()}
+    unread = [f"{key} of {name!r}" for name, look in looks.items() for key in look.unread]
+    if unread:
+        more = f" and {len(unread) - 3} more" if len(unread) > 3 else ""
+        warn(f"{path} has maps that are not read: {', '.join(unread[:3])}{more}")
     v, vt, vn = _rows(lines)
     # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]
@@ -268,8 +270,7 @@ def read_obj(path: Path) -> list[Piece]:
         colors = _colors(v)
         if colors is not None:
             attributes["colors"] = (colors, faces)
-        material = materials.get(name, Material())
-        pieces.append(Piece(vertices, faces, attributes, textures.get(name), material.color))
+        pieces.append(Piece(vertices, faces, attributes, textures.get(name), looks[name].color, entries=entries[name]))
     return pieces
 
 

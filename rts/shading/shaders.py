@@ -29,7 +29,7 @@ from rts.plugin_base import promised
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
 from rts.shading.light import light_of
-from rts.shading.textures import WRAPS, sample_texture
+from rts.shading.textures import FILTERS, WRAPS, Wrap, sample_texture
 from rts.shading.theta_entries import check_base, entry_of
 from rts.shading.uv_footprints import FOOTPRINT
 
@@ -92,21 +92,26 @@ class Unlit(Shader):
     """The base colour times θ["color"], without light.
 
     Attributes:
-        wrap: continuation of the texture outside [0, 1]: "repeat", "mirror" or "clamp".
+        wrap: continuation of the texture outside [0, 1]: "repeat", "mirror" or "clamp", or a pair, along u and along v.
         opaque: whether to ignore the alpha of texture and colours.
         mip: whether to average the texture over roughly the footprint of a sample, trilinearly in a pyramid (mipmaps),
             so that texels smaller than samples do not alias. The footprint has no derivative.
+        filter: "linear" between the centres of texels, or "nearest", for textures of plain squares.
     """
 
-    wrap: str = "repeat"
+    wrap: Wrap = "repeat"
     opaque: bool = True
     mip: bool = False
+    filter: str = "linear"
     takes_views = True
     reads = ("color", "uv", "texture")
 
     def __post_init__(self):
-        if not isinstance(self.wrap, str) or self.wrap not in WRAPS:
-            raise InputError(f"wrap is {quoted(self.wrap)}; expected one of {', '.join(WRAPS)}")
+        pair = self.wrap if isinstance(self.wrap, tuple) and len(self.wrap) == 2 else (self.wrap,)
+        if not all(isinstance(wrap, str) and wrap in WRAPS for wrap in pair):
+            raise InputError(f"wrap is {quoted(self.wrap)}; expected {', '.join(WRAPS)}, or two of them: u's and v's")
+        if not isinstance(self.filter, str) or self.filter not in FILTERS:
+            raise InputError(f"filter is {quoted(self.filter)}; expected one of {', '.join(FILTERS)}")
         reads = promised(self, "reads")
         if self.mip and reads is not None:
             object.__setattr__(self, "reads", (*reads, FOOTPRINT))
@@ -148,7 +153,8 @@ class Unlit(Shader):
 
     def looked_up(self, texture: Array, gbuffer: GBuffer) -> Array:
         """A texture (h, w, C) at the samples (N, C), with the options of this shader."""
-        return sample_texture(texture, gbuffer["uv"], self.wrap, gbuffer[FOOTPRINT] if self.mip else None)
+        footprint = gbuffer[FOOTPRINT] if self.mip else None
+        return sample_texture(texture, gbuffer["uv"], self.wrap, footprint, self.filter)
 
     def premultiplied(self, color: Array, alpha: Array) -> Array:
         """Premultiplied (N, 4) of colour (N, 3) and alpha (N, 1); an opaque shader takes 1 for alpha."""

@@ -13,18 +13,25 @@ from rts.errors import InputError
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Continuations of a texture outside [0, 1]."""
+FILTERS = ("linear", "nearest")
+"""Ways to read between the centres of texels."""
+Wrap = str | tuple[str, str]
+"""A continuation, or one along u and one along v."""
 
 
-def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: Array | None = None) -> Array:
+def sample_texture(
+    texture: Array, uv: Array, wrap: Wrap = "repeat", footprint: Array | None = None, filter: str = "linear"
+) -> Array:
     """Bilinear texture lookup, or trilinear where a footprint is given; differentiable in texture and uv.
 
     Args:
         texture: (h, w, C), C = 1, 3 or 4, row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w,
             v = 1 − (i + 0.5) / h.
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
-        wrap: "repeat" or "mirror" outside [0, 1]; any other text is "clamp".
+        wrap: "repeat" or "mirror" outside [0, 1]; any other text is "clamp". A pair is for u and for v.
         footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for a step to the next cell, constant. The texture is averaged
             over roughly this area, by `mip_levels` and `level_of`. None for no average.
+        filter: "nearest" takes the texel around a point, without derivative in uv; any other text is "linear".
 
     Returns:
         (N, C).
@@ -42,7 +49,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
         )
     height, width, channels = shape
     if footprint is None:
-        return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width)
+        return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width, filter=filter)
     levels, engine = mip_levels(texture), engine_of(texture, uv)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
     sizes = np.array([x.shape[:2] for x in levels])
@@ -53,7 +60,9 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
     share, lower = (level - finer)[:, None], xp.astype(finer, xp.int32)
 
     def at(number: Array) -> Array:
-        return _bilinear(table, uv, wrap, *(xp.take(x, number, axis=0) for x in (heights, widths, first)))
+        return _bilinear(
+            table, uv, wrap, *(xp.take(x, number, axis=0) for x in (heights, widths, first)), filter=filter
+        )
 
     below = at(lower)
     return below + share * (at(xp.clip(lower + 1, 0, len(levels) - 1)) - below)
@@ -108,7 +117,9 @@ def _halved(x: Array) -> Array:
     return (m / n - part) * x[0:-1:2, ...] + m / n * x[1::2, ...] + (part + 1 / n) * x[2::2, ...]
 
 
-def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first: Array | None = None) -> Array:
+def _bilinear(
+    flat: Array, uv: Array, wrap: Wrap, height: Any, width: Any, first: Array | None = None, filter: str = "linear"
+) -> Array:
     """Bilinear lookup (N, C) in a table of texels: of one texture, row by row, or of several, one after the other.
 
     Args:
@@ -118,15 +129,20 @@ def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first:
         height: height of the texture; for several textures (N,) floats of uv's dtype.
         width: width, in the same form.
         first: (N,) integers, the table row of the texture's first texel; None for a single texture.
+        filter: see `sample_texture`.
     """
     xp = namespace(flat, uv)
     columns = width if first is None else xp.astype(width, xp.int32)
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    if filter == "nearest":
+        x, y = xp.floor(x + 0.5), xp.floor(y + 0.5)  # The centre of the texel.
     x0, y0 = xp.floor(x), xp.floor(y)
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
 
+    along_u, along_v = (wrap, wrap) if isinstance(wrap, str) else wrap
+
     def texel(dx: int, dy: int) -> Array:
-        index = _wrapped(y0 + dy, height, wrap) * columns + _wrapped(x0 + dx, width, wrap)
+        index = _wrapped(y0 + dy, height, along_v) * columns + _wrapped(x0 + dx, width, along_u)
         return xp.take(flat, index if first is None else index + first, axis=0)
 
     top = texel(0, 0) + fx * (texel(1, 0) - texel(0, 0))

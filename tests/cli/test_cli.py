@@ -292,6 +292,10 @@ def test_render_options_reach_the_picture(model, tmp_path):
     amid = "--camera", "30,20,0.01"
     assert picture(*amid)[..., 3].mean() == 1
     assert picture(*amid, "--cull", "back")[..., 3].mean() == 0
+    assert picture(*amid, "--cull", "file")[..., 3].mean() == 1  # An OBJ does not say.
+    trimesh.load_mesh(model).export(tmp_path / "one_sided.glb")
+    succeed("render", tmp_path / "one_sided.glb", "-o", tmp_path / "a.png", "--size", 32, *amid, "--cull", "file")
+    assert rts.load_image(tmp_path / "a.png")[..., 3].mean() == 0
 
 
 @pytest.mark.thorough

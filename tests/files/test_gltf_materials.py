@@ -21,32 +21,45 @@ def picture(pixels):
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def model(folder, material, images=(), uv=True):
-    """A glTF of one triangle with a material; textures are numbered as their images."""
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    data = corners.tobytes() + corners[:, :2].tobytes()
-    views = [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24}]
-    bounds = {"min": [0, 0, 0], "max": [1, 1, 0]}
-    accessors = [
-        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **bounds},
-        {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
-    ]
-    attributes = {"POSITION": 0, "TEXCOORD_0": 1} if uv else {"POSITION": 0}
+def near(x, z=2.0):
+    """A camera that sees a small square around (x, 0.2, 0) from a point above it."""
+    return rts.Camera.look_at((x, 0.2, z), (x, 0.2, 0), fov_y=5)
+
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+
+
+def model(folder, material, images=(), uv=True, more=None, **tables):
+    """A glTF of one triangle with a material; textures are numbered as their images.
+
+    `more` are further entries of the tree, and `tables` further attributes, (3, C) float32.
+    """
+    coordinates = {"TEXCOORD_0": CORNERS[:, :2]} if uv else {}
+    tables = {"POSITION": CORNERS, **coordinates, **{name: np.float32(x) for name, x in tables.items()}}
+    views, accessors, data = [], [], b""
+    for i, rows in enumerate(tables.values()):
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": rows.nbytes})
+        accessors.append({"bufferView": i, "componentType": 5126, "count": 3, "type": f"VEC{rows.shape[1]}"})
+        data += rows.tobytes()
+    accessors[0] |= {"min": [0, 0, 0], "max": [1, 1, 0]}
     tree = {
         "asset": {"version": "2.0"},
         "buffers": [{"uri": "data:;base64," + base64.b64encode(data).decode(), "byteLength": len(data)}],
         "bufferViews": views,
         "accessors": accessors,
-        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
+        "meshes": [{"primitives": [{"attributes": {name: i for i, name in enumerate(tables)}, "material": 0}]}],
         "nodes": [{"mesh": 0}],
         "scenes": [{"nodes": [0]}],
         "materials": [material],
+        **(more or {}),
     }
     if images:
         tree |= {
             "images": [{"uri": picture(x)} for x in images],
             "textures": [{"source": i} for i in range(len(images))],
         }
+        for texture, sampler in zip(tree["textures"], range(len(tree.get("samplers", []))), strict=False):
+            texture["sampler"] = sampler
     path = folder / "m.gltf"
     path.write_text(json.dumps(tree))
     return path
@@ -137,3 +150,188 @@ def test_maps_need_uv(tmp_path):
 def test_wrong_factors_are_refused(tmp_path, material, message):
     with pytest.raises(rts.InputError, match=message):
         rts.load(model(tmp_path, material))
+
+
+# ------------------------------------------------------------------------------------------- where maps are looked up
+
+GREY = np.full((1, 1, 3), 51)
+SPECIFIED = {"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}
+"""The extension's own example: the lower left quarter of the image, turned clockwise by 90 degrees."""
+
+
+def looked_up(index, transform=None, **reference):
+    """The JSON of a reference to a texture."""
+    return {"index": index, "extensions": {"KHR_texture_transform": transform or {}}, **reference}
+
+
+def test_a_transform_that_all_maps_share_is_in_the_coordinates(tmp_path):
+    look = {"baseColorTexture": looked_up(0, SPECIFIED), "metallicRoughnessTexture": looked_up(1, SPECIFIED)}
+    [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": look}, [GREY, GREY]))
+    # Corners are on the left and on top of the file's image; coordinates of rts point up.
+    np.testing.assert_allclose(part.theta["uv"], [[0, 0], [0, 0.5], [0.5, 0]], atol=1e-7)
+
+
+@pytest.mark.parametrize("reference", [{"texCoord": 1}, {"texCoord": 0, "transform": {"texCoord": 1}}])
+def test_maps_may_all_use_another_set_of_coordinates(tmp_path, reference):
+    look = {"baseColorTexture": looked_up(0, **reference)}
+    further = np.array([[0.25, 0], [0.5, 0.5], [0, 1]])
+    [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": look}, [GREY], TEXCOORD_1=further))
+    np.testing.assert_allclose(part.theta["uv"], [[0.25, 1], [0.5, 0.5], [0, 0]], atol=1e-7)
+
+
+def test_what_is_not_followed_is_one_warning_that_names_it(tmp_path):
+    material = {
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": looked_up(1, SPECIFIED)},
+        "occlusionTexture": {"index": 2, "texCoord": 1},
+        "emissiveTexture": {"index": 3},
+        "emissiveFactor": [1, 1, 1],
+        "extensions": {"KHR_materials_clearcoat": {}, "KHR_materials_sheen": {}},
+    }
+    samplers = {"samplers": [{}, {}, {}, {"wrapS": 33071}]}
+    maps = [GREY, np.array([[[0, 51, 102], [0, 153, 204]]]), GREY, GREY]
+    path = model(tmp_path, material, maps, more=samplers, TEXCOORD_1=CORNERS[:, :2], COLOR_0=CORNERS)
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        [part] = rts.load(path)
+    assert [str(warning.message) for warning in caught] == [
+        f"{path} uses the extensions KHR_materials_clearcoat, KHR_materials_sheen, which are not read; it is loaded "
+        "as it is without; has maps with coordinates other than their material's, whose mean is taken: the "
+        "metallicRoughnessTexture of material 0, the occlusionTexture of material 0; has maps with a sampler other "
+        "than their material's, which they get: the emissiveTexture of material 0; has vertex colours beside a "
+        "texture, which hides them: mesh 0"
+    ]
+    np.testing.assert_allclose(part.theta["roughness"], [[[102 / 255]]], atol=1e-6)
+    np.testing.assert_allclose(part.theta["metallic"], [[[153 / 255]]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "wrap", "filter"),
+    [
+        ({}, "repeat", "linear"),
+        ({"wrapS": 33071, "wrapT": 33071, "magFilter": 9728}, "clamp", "nearest"),
+        ({"wrapT": 33648, "magFilter": 9729, "minFilter": 9984}, ("repeat", "mirror"), "linear"),
+    ],
+)
+def test_samplers_are_options_of_the_shader(tmp_path, sampler, wrap, filter):
+    look = {"baseColorTexture": {"index": 0}}
+    [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": look}, [GREY], more={"samplers": [sampler]}))
+    assert (part.shader.wrap, part.shader.filter) == (wrap, filter)
+
+
+@pytest.mark.parametrize(
+    ("reference", "sampler", "message"),
+    [
+        ({"transform": {"scale": [1, "x"]}}, {}, "KHR_texture_transform of the texture of material 0 is .*'x'"),
+        ({"transform": {"offset": [1]}}, {}, "KHR_texture_transform of the texture of material 0 is"),
+        ({}, {"wrapS": 7}, "wrapS of the sampler of the texture of material 0 is 7; expected one of"),
+    ],
+)
+def test_wrong_transforms_and_samplers_are_refused(tmp_path, reference, sampler, message):
+    look = {"baseColorTexture": looked_up(0, **reference)}
+    with pytest.raises(rts.InputError, match=message):
+        rts.load(model(tmp_path, {"pbrMetallicRoughness": look}, [GREY], more={"samplers": [sampler]}))
+
+
+# --------------------------------------------------------------------------------- colours, sides, tangents, no light
+
+
+@pytest.mark.parametrize("material", [{}, {"alphaMode": "MASK", "alphaCutoff": 0.7}, {"alphaMode": "BLEND"}])
+def test_vertex_colours_and_factors_are_exact(tmp_path, material):
+    colors = np.float32([[0.7, 0.123456, 1e-4, 0.7], [0, 1, 0.3, 0.7], [0.5, 0.25, 0.1, 0.7]])
+    factor = [0.1234567, 0.2, 0.3, 1]
+    path = model(tmp_path, {**material, "pbrMetallicRoughness": {"baseColorFactor": factor}}, COLOR_0=colors)
+    [part] = rts.load(path)
+    np.testing.assert_array_equal(
+        part.theta["colors"], colors if "alphaMode" in material and not part.shader.opaque else colors[:, :3]
+    )
+    np.testing.assert_array_equal(part.theta["color"], np.float32(factor[:3]))
+    assert part.shader.opaque == (material.get("alphaMode") != "BLEND")
+
+
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
+@pytest.mark.parametrize("merge", [False, True])
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(
+    ("cull", "double_sided", "seen"),
+    [("file", False, False), ("file", True, True), ("none", False, True), ("back", True, False)],
+)
+def test_sides_are_those_of_the_file_where_it_is_asked_for(tmp_path, cull, double_sided, seen, mirrored, merge):
+    scale = [-1, 1, 1] if mirrored else [1, 1, 1]
+    nodes = {"nodes": [{"mesh": 0, "scale": scale}]}
+    [part] = rts.load(model(tmp_path, {"doubleSided": double_sided}, more=nodes), cull=cull, merge=merge)
+    x = 0.2 * scale[0]
+    front, behind = (rts.render(part.replace(shader="silhouette"), near(x, z), (8, 8))[4, 4, 3] for z in (2, -2))
+    assert front == 1 and behind == float(seen)
+
+
+@pytest.mark.parametrize("merge", [False, True])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_tangents_of_the_file_turn_a_normal_map(tmp_path, mirrored, merge):
+    # A normal map of directions along u, and tangents that point up, into the corner between x and y.
+    tangents = [[0, 1, 0, -1]] * 3
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0}, "normalTexture": {"index": 0}}
+    nodes = {"nodes": [{"mesh": 0, "scale": [-1 if mirrored else 1, 1, 1]}]}
+    path = model(tmp_path, material, [[[[255, 255, 128]]]], more=nodes, TANGENT=tangents)
+    [part] = rts.load(path, merge=merge)
+    seen = []
+
+    def shader(theta, gbuffer, camera):
+        frame, normal = gbuffer["tangent"], gbuffer["normal"]
+        seen.append((frame[:, :3], frame[:, 3:] * np.cross(normal, frame[:, :3])))
+        return np.ones((len(frame), 4), np.float32)
+
+    x = -0.2 if mirrored else 0.2
+    rts.render(part.replace(shader=shader), near(x), (4, 4))
+    along_u, along_v = seen[0]
+    np.testing.assert_allclose(along_u[:16], [[0, 1, 0]] * 16, atol=1e-5)
+    np.testing.assert_allclose(along_v[:16], [[-1 if mirrored else 1, 0, 0]] * 16, atol=1e-5)
+    theta = {name: x for name, x in part.theta.items() if name != "tangents"}  # Then they are computed.
+    rts.render(part.replace(shader=shader, theta=theta), near(x), (4, 4))
+    np.testing.assert_allclose(seen[-1][0][:16], [[-1 if mirrored else 1, 0, 0]] * 16, atol=1e-5)
+
+
+def test_tangents_without_a_normal_map_are_left_out(tmp_path):
+    [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": {"metallicFactor": 0}}, TANGENT=[[1, 0, 0, 1]] * 3))
+    assert "tangents" not in part.theta
+
+
+def test_a_material_without_light_has_none_without_a_texture_either(tmp_path):
+    look = {"baseColorFactor": [0.2, 0.4, 0.6, 1]}
+    [part] = rts.load(model(tmp_path, {"pbrMetallicRoughness": look, "extensions": {"KHR_materials_unlit": {}}}))
+    image = rts.render(part, near(0.2), (8, 8))
+    np.testing.assert_allclose(image[4, 4], [0.2, 0.4, 0.6, 1], atol=1e-6)
+
+
+# ---------------------------------------------------------------------------------------------------- models of others
+
+
+def test_what_samplers_and_sides_make_of_a_test_card(data):
+    parts = rts.load(data / "gltf/TextureSettingsTest.glb", cull="file")
+    white = {"light": {"ambient": np.float32(1), "color": np.zeros(3)}}
+    parts = [part.replace(theta={**part.theta, **white}) for part in parts]
+    # Tiles of 0.9 lie in two columns, 2.146 apart; the right one shows what the left one should.
+    pixel, y = 2.14592 / 60, -1.085
+    camera = rts.Camera.orthographic((1.528, y, 5), (1.528, y, 0), height=226 * pixel)
+    image = rts.render(parts, camera, (226, 160))[..., :3]
+    tested, shown = image[:, 39:61], image[:, 99:121]
+    assert shown.std() > 0.2 and np.abs(tested - shown).mean() < 0.025
+
+
+@pytest.mark.thorough
+def test_tangents_that_are_computed_are_those_of_a_file(data):
+    [part] = rts.load(data / "gltf/WaterBottle/WaterBottle.gltf")
+    seen = []
+
+    def shader(theta, gbuffer, camera):
+        normal, frame = gbuffer["normal"], gbuffer["tangent"]
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        along = frame[:, :3] - np.sum(frame[:, :3] * normal, axis=1, keepdims=True) * normal
+        seen.append((along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9), np.sign(frame[:, 3])))
+        return np.ones((len(frame), 4), np.float32)
+
+    camera = rts.Camera.look_at((0.12, 0.05, 0.42), (0, 0, 0))
+    computed = {name: x for name, x in part.theta.items() if name != "tangents"}
+    for theta in (part.theta, computed):
+        rts.render(part.replace(theta=theta, shader=shader), camera, (64, 64), splatter="none")
+    (along, sign), (other, other_sign) = seen
+    cosines = np.sum(along * other, axis=1)
+    assert np.median(cosines) > 0.9999 and np.quantile(cosines, 0.05) > 0.99 and (sign == other_sign).mean() > 0.99

@@ -377,6 +377,8 @@ BAD = {
         ("texture", "(0, 2, 3)"),
     ),
     "wrap typo": (lambda: Textured(wrap="reapeat"), ("wrap", "'reapeat'", "mirror")),
+    "wrap typo in a pair": (lambda: Textured(wrap=("clamp", "reapeat")), ("wrap", "'reapeat'", "mirror")),
+    "filter typo": (lambda: Textured(filter="trilinear"), ("filter", "'trilinear'", "nearest")),
     "two directions, three colours": (
         lambda: rts.render(with_theta("lambert", light=two_lights()), CAMERA, SIZE),
         ("2 directions", "3 colors"),

@@ -64,6 +64,21 @@ def test_wrap_modes_outside_the_unit_square(target, wrap, column):
         np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-5)
 
 
+@pytest.mark.parametrize("target", ALL)
+def test_each_axis_has_its_wrap_and_nearest_takes_the_texel_around_a_point(target):
+    near = np.array([(j + 0.5 + x, i + 0.5 + x) for i in range(-3, 6) for j in range(-4, 8) for x in (-0.49, 0.49)])
+    uv = np.stack([near[:, 0] / 4, 1 - near[:, 1] / 3], axis=1)
+    column = {"repeat": [0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3], "clamp": [0, 0, 0, 0, 0, 1, 2, 3, 3, 3, 3, 3]}
+    row = {"mirror": [2, 1, 0, 0, 1, 2, 2, 1, 0], "repeat": [0, 1, 2, 0, 1, 2, 0, 1, 2]}
+    for wrap in (("repeat", "mirror"), ("clamp", "repeat")):
+        expected = TEXTURE[row[wrap[1]]][:, column[wrap[0]]].repeat(2, axis=1).reshape(-1, 3)
+        found = to_numpy(sample_texture(*arrays(target, (TEXTURE, uv)), wrap, filter="nearest"))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        centres = (uv[::2] + uv[1::2]) / 2
+        found = to_numpy(sample_texture(*arrays(target, (TEXTURE, centres)), wrap))
+        np.testing.assert_allclose(found, expected[::2], atol=1e-5)
+
+
 def test_repeat_blends_the_two_ends_and_clamp_does_not():
     uv = np.array([(0.0, texel(1, 0)[1])])
     ends = (TEXTURE[1, 0] + TEXTURE[1, 3]) / 2

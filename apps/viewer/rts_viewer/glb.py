@@ -29,7 +29,7 @@ class Triangles(NamedTuple):
         colors: (V, 3 or 4) linear, in [0, 1]; None for white.
         uv: (V, 2), v upwards; None without a texture.
         texture: (h, w, 1, 3 or 4) linear, row 0 on top; None without one.
-        wrap: continuation of the texture: "repeat", "mirror" or "clamp".
+        wrap: continuation of the texture: "repeat", "mirror" or "clamp", or a pair, along u and along v.
         factor: linear colour of 3 or 4 numbers that multiplies the others.
     """
 
@@ -39,7 +39,7 @@ class Triangles(NamedTuple):
     colors: np.ndarray | None = None
     uv: np.ndarray | None = None
     texture: np.ndarray | None = None
-    wrap: str = "repeat"
+    wrap: str | tuple[str, str] = "repeat"
     factor: Any = (1.0, 1.0, 1.0, 1.0)
 
 
@@ -66,8 +66,8 @@ def glb(mesh: Triangles) -> bytes:
     if mesh.texture is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = body.numbers(np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=-1))
         coat["baseColorTexture"] = {"index": 0}
-        wrap = WRAPS[mesh.wrap]
-        document["samplers"] = [{"wrapS": wrap, "wrapT": wrap}]
+        along_u, along_v = (mesh.wrap, mesh.wrap) if isinstance(mesh.wrap, str) else mesh.wrap
+        document["samplers"] = [{"wrapS": WRAPS[along_u], "wrapT": WRAPS[along_v]}]
         document["images"] = [{"bufferView": body.add(png(encoded(mesh.texture))), "mimeType": "image/png"}]
         document["textures"] = [{"sampler": 0, "source": 0}]
     indices = body.numbers(mesh.faces.reshape(-1, 1), elements=True)

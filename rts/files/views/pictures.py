@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.errors import FileWarning, InputError, warn
-from rts.files.damaged_files import gathered
+from rts.errors import InputError
+from rts.files.damaged_files import gathered, warn_once
 from rts.files.images import load_image, read_image
 from rts.files.paths import inside
 from rts.files.views.lenses import undistorted
@@ -152,8 +152,7 @@ def _encoded(path: Path) -> np.ndarray:
         raise InputError(f"there is no picture {path}; it was there when the views were loaded")
     with gathered(path) as notes:
         encoded = read_image(path)
-    for note in notes:
-        warn(note, FileWarning)
+    warn_once(path, notes)
     return encoded
 
 

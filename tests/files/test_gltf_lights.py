@@ -1,0 +1,129 @@
+"""Lights and cameras of glTF."""
+
+import json
+
+import numpy as np
+import pytest
+
+import rts
+from rts.files.gltf_cameras import read_cameras
+from rts.files.gltf_lights import read_lights
+from rts.files.gltf_tree import Gltf
+
+pytestmark = pytest.mark.files
+
+
+def opened(folder, **tree):
+    """A glTF of these entries, all of whose nodes are shown."""
+    nodes = tree["nodes"]
+    below = {child for node in nodes for child in node.get("children", [])}
+    roots = [i for i in range(len(nodes)) if i not in below]
+    data = json.dumps({"asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], **tree}).encode()
+    return Gltf(folder / "m.gltf", data, lambda name: b"")
+
+
+def lit(folder, lights, nodes):
+    """A glTF with lights; each node has the light of its number."""
+    nodes = [{**node, "extensions": {"KHR_lights_punctual": {"light": i}}} for i, node in enumerate(nodes)]
+    return opened(folder, extensions={"KHR_lights_punctual": {"lights": lights}}, nodes=nodes)
+
+
+QUARTER_ABOUT_X = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+QUARTER_ABOUT_Y = [0, np.sqrt(0.5), 0, np.sqrt(0.5)]
+
+
+def test_lights_are_in_the_form_that_shaders_read(tmp_path):
+    lights = [
+        {"type": "directional", "color": [1, 0.5, 0], "intensity": np.pi},
+        {"type": "point", "intensity": 2 * np.pi},
+        {"type": "directional"},
+        {"type": "spot", "spot": {}},
+        {"type": "point", "range": 5},
+    ]
+    nodes = [
+        {"rotation": QUARTER_ABOUT_Y, "scale": [3, 3, 3]},
+        {"translation": [1, 2, 3]},
+        {},
+        {},
+        {"children": []},
+    ]
+    gltf = lit(tmp_path, lights, nodes)
+    found = read_lights(gltf)
+    assert set(found) == {"direction", "color", "position", "intensity", "ambient"} and found["ambient"] == 0
+    order = np.argsort(found["direction"][:, 0])  # Nodes are found in any order.
+    np.testing.assert_allclose(found["direction"][order], [[0, 0, 1], [1, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(found["color"][order], [[1 / np.pi] * 3, [1, 0.5, 0]], atol=1e-6)
+    order = np.argsort(found["position"][:, 0])
+    np.testing.assert_allclose(found["position"][order], [[0, 0, 0], [1, 2, 3]], atol=1e-6)
+    np.testing.assert_allclose(found["intensity"][order], [[1 / np.pi] * 3, [2] * 3], atol=1e-6)
+    assert gltf.notes == {
+        "spot lights, which are left out": ["the light of node 3"],
+        "lights of limited range, which is not followed": ["the light of node 4"],
+    }
+
+
+def test_a_white_surface_in_one_lux_has_a_radiance_of_one_over_pi(tmp_path):
+    light = read_lights(lit(tmp_path, [{"type": "directional"}], [{}]))
+    square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], np.float32)
+    part = rts.Part(rts.Mesh([(0, 1, 2), (0, 2, 3)]), {"vertices": square, "light": light}, "lambert")
+    image = rts.render(part, rts.Camera.look_at((0, 0, 2), (0, 0, 0)), (4, 4))
+    np.testing.assert_allclose(image[2, 2, :3], [1 / np.pi] * 3, rtol=1e-5)
+
+
+def test_files_without_lights_have_none(tmp_path):
+    assert read_lights(opened(tmp_path, nodes=[{}])) == {} and read_cameras(opened(tmp_path, nodes=[{}])) == []
+
+
+@pytest.mark.parametrize(
+    ("light", "node", "message"),
+    [
+        ({"type": "sun"}, {}, "the light of node 0 is of type 'sun'; expected directional, point or spot"),
+        ({"type": "point", "color": [1, 2]}, {}, r"the light of node 0 has color \[1, 2\]"),
+        ({"type": "point", "intensity": -1}, {}, "the light of node 0 has color None and intensity -1"),
+        ({"type": "point"}, {"scale": [1, 1, 0]}, "the transform of the light of node 0 is singular"),
+        ({}, {}, "the light of node 0: 'type' is missing"),
+    ],
+)
+def test_wrong_lights_are_refused(tmp_path, light, node, message):
+    with pytest.raises(rts.InputError, match=message):
+        read_lights(lit(tmp_path, [light], [node]))
+
+
+def test_cameras_are_those_of_rts(tmp_path):
+    cameras = [
+        {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1, "zfar": 50, "aspectRatio": 1.5}},
+        {"type": "orthographic", "orthographic": {"xmag": 3, "ymag": 2, "znear": 0.1, "zfar": 10}},
+        {"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1}},
+    ]
+    nodes = [
+        {"camera": 0, "translation": [1, 2, 3]},
+        {"children": [2], "scale": [2, 4, 2], "translation": [0, 5, 0]},
+        {"camera": 1, "rotation": QUARTER_ABOUT_X},
+        {"camera": 2, "translation": [1, 2, 3]},
+    ]
+    found = read_cameras(opened(tmp_path, cameras=cameras, nodes=nodes))
+    fov = np.degrees(0.8)
+    expected = [
+        rts.Camera.look_at((1, 2, 3), (1, 2, 0), fov_y=fov, aspect=1.5, near=0.1, far=50),
+        rts.Camera.orthographic((0, 5, 0), (0, 6, 0), up=(0, 0, 1), height=4, aspect=1.5, near=0.1, far=10),
+        rts.Camera.look_at((1, 2, 3), (1, 2, 0), fov_y=fov, near=0.1, far=1e9),
+    ]
+    for camera, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(camera.view, other.view, atol=1e-12)
+        np.testing.assert_allclose(camera.projection, other.projection, atol=1e-6)
+        assert camera.aspect == other.aspect
+    assert [float(x) for x in found[2].depth_range()] == [pytest.approx(0.1), np.inf]
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ({"type": "perspective", "perspective": {"yfov": 4, "znear": 0.1}}, "the camera of node 0 makes no image"),
+        ({"type": "perspective", "perspective": {"yfov": 1, "znear": 0}}, "the camera of node 0 makes no image"),
+        ({"type": "orthographic", "orthographic": {"xmag": 0, "ymag": 1, "znear": 0, "zfar": 1}}, "makes no image"),
+        ({"type": "fisheye"}, "the camera of node 0: 'fisheye' is missing"),
+    ],
+)
+def test_wrong_cameras_are_refused(tmp_path, camera, message):
+    with pytest.raises(rts.InputError, match=message):
+        read_cameras(opened(tmp_path, cameras=[camera], nodes=[{"camera": 0}]))
