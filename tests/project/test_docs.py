@@ -35,6 +35,7 @@ ELSEWHERE = {
     "rts render man.glb --clip walk --time 0.4 -o man.png": "test_cli.py",
     "rts render man.glb --clip 0 -o man.gif": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
+    "rts cameras photos/ -o thing": "make apps",
 }
 """Commands that take long, or need files of their own, and who runs them."""
 

@@ -15,7 +15,9 @@ import rts
 def reconstruct(
     views: Annotated[
         Path,
-        typer.Argument(help="Folder or file of pictures with cameras: transforms.json, COLMAP, LLFF, cameras.json."),
+        typer.Argument(
+            help="Pictures with cameras: transforms.json, COLMAP, LLFF, cameras.json; or photographs alone."
+        ),
     ],
     out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("reconstruction"),
     start: Annotated[str, typer.Option(help="ball, hull (of alpha or masks), or a file of a mesh.")] = "ball",
@@ -79,6 +81,22 @@ def reconstruct(
     if watch is not None:
         _say(f"{watch.url} shows the result until “close” is pressed there, or Ctrl-C here")
         watch.wait()
+
+
+def cameras(
+    photos: Annotated[Path, typer.Argument(help="Folder of photographs of one thing that stands still.")],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")] = Path("cameras"),
+    size: Annotated[int, typer.Option(help="Longer side, in pixels, in which features are looked for.")] = 1600,
+) -> None:
+    """Find the cameras of photographs, by COLMAP.
+
+    Writes a folder that rts reconstruct and other tools read: images, and sparse/0.
+
+    Example: rts cameras photos/ -o thing && rts reconstruct thing/ -o out/thing
+    """
+    from rts_reconstruct.cameras import find_cameras
+
+    _say(f"{find_cameras(photos, out, size=size)}; {out} is a data set of COLMAP")
 
 
 def _say(text: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import rts
 from rts.diagnostics.measuring_api import output_folder, writing
 from rts_reconstruct import files, job, measures, pictures, posing, stages, texturing
+from rts_reconstruct.cameras import with_cameras
 from rts_reconstruct.light import decoded
 from rts_reconstruct.model import Model
 from rts_reconstruct.report import write_report
@@ -111,7 +112,8 @@ def reconstruct(
     Under torchrun processes share the pictures of a step, and the first one writes.
 
     Args:
-        views: file or folder, as `rts.load_views` takes it; or a list of views with sRGB-encoded images.
+        views: file or folder, as `rts.load_views` takes it; a folder of photographs alone, whose cameras are
+            looked for; or a list of views with sRGB-encoded images.
         out: the folder to write into.
         start: "ball"; "hull", the visual hull of alpha or masks; or the path of a mesh in the world of the cameras.
         surface: "mesh"; "isosurface", for stages that fit values on a lattice, whose surface may change its topology,
@@ -155,6 +157,7 @@ def reconstruct(
         raise rts.InputError(f"texture is {texture}; expected at least 16 texels a side, or 0 for vertex colours")
     folder = output_folder(out)
     first = job.join()
+    views = job.shared(lambda: with_cameras(views, folder / "photographs"))
     shots = pictures.read(views, size, held_out, background)
     mesh = starting_mesh(start, shots)
     grey = np.full((len(mesh.vertices), 3), GREY, np.float32)
