@@ -7,8 +7,8 @@ Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `
 `rts.results`.
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
-`rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are `rts.tune`, of the package `rts_compare`,
-`rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+`rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package
+`rts_compare`, `rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
 # pyright: reportUnsupportedDunderAll=false
@@ -37,6 +37,7 @@ from rts.diagnostics.profile import profile
 from rts.errors import InputError, RtsError
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
+from rts.files.moving_models import load_model as load_model
 from rts.files.views.loading import load_views
 from rts.files.views.saving import save_views
 from rts.fitting.fit import fit

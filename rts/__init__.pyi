@@ -9,8 +9,8 @@ Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `
 `rts.results`.
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
-`rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So are `rts.tune`, of the package `rts_compare`,
-`rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
+`rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package
+`rts_compare`, `rts.NarrowBand`, `rts.Ndc`, `rts.load_radiance_field` and `rts.volume_render`.
 """
 
 import os
@@ -45,6 +45,7 @@ from rts.diagnostics.profile import profile
 from rts.errors import InputError, RtsError
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
+from rts.files.moving_models import load_model as load_model
 from rts.files.views.loading import load_views
 from rts.files.views.saving import save_views
 from rts.fitting.fit import fit
@@ -156,6 +157,40 @@ class Mesh(_BuiltInTriangles):
 
         Those of NumPy vertices are kept until the vertices change.
         """
+        ...
+
+class Skinned(_BuiltInTriangles):
+    """A triangle mesh that joints bend, and that morph targets change.
+
+    θ has the entries of `rts.Mesh`, with "vertices" (V, 3) and "normals" at rest. A vertex v is posed as
+    Σᵢ wᵢ M(jᵢ) (v + Σₖ mₖ dₖ), by further entries of θ, all differentiable:
+
+    - "joint_transforms" (J, 4, 4): M, the affine map of each joint, from the mesh at rest to its pose.
+    - "joint_weights" (V, I): w, the share of each joint of a vertex. They ought to sum to 1, and are taken as they are.
+    - "morph_weights" (M,): m, the share of each morph target; "morph_vertices" (M, V, 3): d, its displacements.
+    - "morph_normals" (M, A, 3): displacements of "normals", if there are any.
+
+    Without `joints` no entry of joints is needed, and without "morph_vertices" none of morph targets. Normals of θ are
+    turned with the joints, by the inverse transpose. Where θ has none, smooth ones of the posed vertices are computed.
+
+    Args:
+        faces: (T, 3) integers into θ["vertices"]; copied.
+        joints: (V, I) integers into θ["joint_transforms"], the joints of each vertex; None for a mesh without joints.
+            Vertices of fewer joints than I repeat any joint with a weight of 0.
+        indices: as of `rts.Mesh`.
+
+    Raises:
+        InputError: tables of another shape, of no integers, or traced; or `indices` that `rts.Mesh` refuses.
+    """
+
+    mesh: Mesh
+    joints: np.ndarray | None
+
+    def __init__(
+        self, faces: ArrayLike, joints: ArrayLike | None = None, indices: Mapping[str, ArrayLike | None] | None = None
+    ) -> None: ...
+    def posed(self, theta: Mapping[str, Tree]) -> Array:
+        """The posed vertices (V, 3), differentiable in θ. NumPy arrays beside others are constants."""
         ...
 
 class Bezier(_BuiltInTriangles):

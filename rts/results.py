@@ -10,5 +10,23 @@ from rts.diagnostics.profile import Profile
 from rts.fitting.fit import Fit
 from rts.rendering.renderer import PreparedParts, Renderer
 from rts.sampling.auto import Choice
+from rts.scene.clips import Channel, Clip
+from rts.scene.model import Binding, Model, Node, Pose, Skin
 
-__all__ = ["Choice", "Fit", "GradientCheck", "GradientImage", "PreparedParts", "Profile", "Renderer", "Shown"]
+__all__ = [
+    "Binding",
+    "Channel",
+    "Choice",
+    "Clip",
+    "Fit",
+    "GradientCheck",
+    "GradientImage",
+    "Model",
+    "Node",
+    "Pose",
+    "PreparedParts",
+    "Profile",
+    "Renderer",
+    "Shown",
+    "Skin",
+]

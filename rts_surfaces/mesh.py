@@ -146,11 +146,14 @@ class Mesh(TriangleSurface):
         vertices = with_room(theta["vertices"])
         gbuffer = GBuffer(position=self._interpolate(vertices, samples, 0))
         for name in self._attributes(theta):
-            attribute = partial(self._interpolate, theta[name], samples, self._columns[name])
-            gbuffer.defer(G_BUFFER_NAMES.get(name, name), attribute)
+            gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self.attribute, name, theta[name], samples))
         if "normals" not in theta:
             gbuffer.defer("normal", lambda: self._interpolate(self.vertex_normals(vertices), samples, 0))
         return gbuffer
+
+    def attribute(self, name: str, rows: Array, samples: Samples) -> Array:
+        """An attribute (N, C) at samples, interpolated between `rows` (A, C) of θ[name]."""
+        return self._interpolate(rows, samples, self._columns[name])
 
     def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
         return interpolate(rows, samples.ids, column, samples.params)

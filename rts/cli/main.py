@@ -123,7 +123,12 @@ def render(
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
     *,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="The picture to write: .png, .hdr or .exr; or a .npz of arrays.")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="The picture to write: .png, .hdr or .exr; a .npz of arrays; with --clip a .gif or .mp4.",
+        ),
     ] = Path("out.png"),
     outputs: Annotated[
         str,
@@ -161,12 +166,20 @@ def render(
         Path | None,
         typer.Option(help="The pose.json of `rts fit-pose`: pose, camera and size are exactly those in it."),
     ] = None,
+    clip: Annotated[
+        str | None, typer.Option(help="A clip of a GLB or glTF, by its name or its number, from 0 on.")
+    ] = None,
+    time_: Annotated[
+        float | None,
+        typer.Option("--time", help="Seconds of the clip; 0 by default. A .gif shows all of it.", show_default=False),
+    ] = None,
     profile: Annotated[
         bool, typer.Option("--profile", help="Show where the time goes, stage by stage, and what would help.")
     ] = False,
 ) -> None:
-    """Render a model to a picture."""
+    """Render a model to a picture, or a clip of it to an animation."""
     import rts
+    from rts.cli.clip_frames import ANIMATIONS, FPS, check_animation, frames_of
     from rts.cli.output_files import check_names, names_of, write_outputs
     from rts.cli.pose_file import posed, read_pose
     from rts.diagnostics.measuring_api import size_of, supersample_of
@@ -176,23 +189,29 @@ def render(
     from rts.shading.tone_mapping import check_exposure
 
     shape, view, color = size_of(size), view_of(camera), color_of(background)
-    output_file(output, "picture", (*PICTURES, ".npz"))
     names = names_of(outputs)
+    check_animation(output, clip, time_, names)
+    output_file(output, "picture", (*PICTURES, ".npz", *(ANIMATIONS if clip is not None else ())))
     check_names(names, output)
     if exposure is not None and output.suffix.lower() != ".png":
         raise typer.BadParameter("--exposure is for a .png; .hdr and .exr hold colours of any brightness")
     check_exposure(exposure or 0.0)
     light = None if environment is None else environment_of(environment, up)
     engine_object = registry.plugin("rts.engines", engine)()
+    if clip is None:
+        frames = [rts.load(model, surface=surface, cull=cull)]
+        bounds = bounds_of(frames[0])
+    else:
+        refuse_beside("--clip", context, ("pose", "surface"))
+        frames, bounds = frames_of(model, clip, time_, output.suffix.lower() in ANIMATIONS, cull)
     if pose is None:
-        parts = rts.load(model, surface=surface, cull=cull)
-        seen = orbit(bounds_of(parts), shape, *view, fov=fov, up=up)
+        seen = orbit(bounds, shape, *view, fov=fov, up=up)
     else:
         refuse_beside("--pose", context, ("camera", "fov", "up"))
         matrix, seen, pose_size = read_pose(pose)
         shape = shape if is_given(context, "size") else pose_size
-        parts = posed(rts.load(model, surface=surface, cull=cull), matrix)
-    bounds = bounds_of(parts)
+        frames = [posed(frames[0], matrix)]
+        bounds = bounds_of(frames[0])
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
     extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
 
@@ -204,15 +223,20 @@ def render(
             shader=part.shader if shader == "auto" else shader,
         )
 
-    scene = [prepared(p) for p in parts]
+    scene, parts = [prepared(p) for p in frames[0]], frames[0]
     options: dict[str, Any] = {"sampler": sampler, "splatter": splatter, "layers": layers_of(layers)}
     options["supersample"] = supersample_of(supersample)
     start = time.perf_counter()
-    images = rts.render(scene, seen, shape, **options, background=color, outputs=names)
+    lines: list[str] = []
+    if output.suffix.lower() in ANIMATIONS:
+        moving = ([prepared(p) for p in frame] for frame in frames)
+        rts.save_animation(output, (rts.render(x, seen, shape, **options, background=color) for x in moving), FPS)
+    else:
+        images = rts.render(scene, seen, shape, **options, background=color, outputs=names)
+        lines = write_outputs(output, {name: engine_object.to_numpy(x) for name, x in images.items()}, exposure)
     seconds = time.perf_counter() - start
-    arrays = {name: engine_object.to_numpy(image) for name, image in images.items()}
-    lines = write_outputs(output, arrays, exposure)
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
+    what += f", {len(frames)} frames" if len(frames) > 1 else ""
     _say(escape(f"{what}, {shape[1]} x {shape[0]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
     for line in lines if names != ("color",) else ():
         _say(escape(f"  {line}"))

@@ -22,9 +22,21 @@ ATTRIBUTES = {
     "COLOR_0": ("VEC3 VEC4", "f4 u1 u2 u1/ u2/", ""),
     "indices": ("SCALAR", "u1 u2 u4", ""),
 }
-"""What is read: types of rows; types of numbers; and those that KHR_mesh_quantization adds.
+"""What is read of primitives: types of rows; types of numbers; and those that KHR_mesh_quantization adds.
 
 Integers with "/" are `normalized`: they stand for fractions of their largest value."""
+TABLES = {
+    "joints": ("VEC4", "u1 u2", ""),
+    "weights of joints": ("VEC4", "f4 u1/ u2/", ""),
+    "displacements": ("VEC3", "f4", _INTEGERS),
+    "inverseBindMatrices": ("MAT4", "f4", ""),
+    "input": ("SCALAR", "f4", ""),
+    "translation": ("VEC3", "f4", ""),
+    "rotation": ("VEC4", "f4 i1/ u1/ i2/ u2/", ""),
+    "scale": ("VEC3", "f4", ""),
+    "weights": ("SCALAR", "f4 i1/ u1/ i2/ u2/", ""),
+}
+"""Types of rows and of numbers of other tables, for `read_table`."""
 BOUNDS_TOLERANCE = 1e-3
 """Tolerance of `min` and `max`, as a share of the range that they bound; some writers round them."""
 
@@ -99,6 +111,23 @@ def read_accessor(gltf: Gltf, index: int) -> Accessor:
     return replace(accessor, content=content, start=start, stride=stride)
 
 
+def read_table(gltf: Gltf, name: str, kind: str, index: int, accessors: list[Accessor]) -> np.ndarray:
+    """The numbers (N, C) float32 of an accessor of a kind in `TABLES`; refused if of another type, or not finite.
+
+    `name` is for errors.
+    """
+    if count_of(index) >= len(accessors):
+        raise gltf.fail(f"{name} is accessor {index}, and there are {len(accessors)}")
+    accessor = accessors[index]
+    if "sparse" in accessor.json:
+        raise gltf.fail(f"{name} is sparse, which is not read")
+    _check_types(name, kind, accessor, gltf.uses(QUANTIZATION), gltf.fail)
+    numbers = accessor.numbers()
+    if not np.isfinite(numbers).all():
+        raise gltf.fail(f"{name}, accessor {index}, has rows that are NaN or infinite")
+    return numbers
+
+
 def read_attributes(
     gltf: Gltf, name: str, primitive: dict[str, Any], accessors: list[Accessor]
 ) -> tuple[dict[str, Accessor], np.ndarray]:
@@ -133,7 +162,7 @@ def _check_types(name: str, kind: str, accessor: Accessor, quantized: bool, fail
 
     Args:
         name: of the attribute and its primitive, for errors.
-        kind: of the attribute, such as "POSITION", or "indices"; kinds not in `ATTRIBUTES` may have any type.
+        kind: of the attribute, such as "POSITION", "indices", or one of `TABLES`; others may have any type.
         accessor: the attribute's.
         quantized: True if the file uses KHR_mesh_quantization, which allows more.
         fail: text → error.
@@ -141,9 +170,9 @@ def _check_types(name: str, kind: str, accessor: Accessor, quantized: bool, fail
     json, normalized = accessor.json, accessor.json.get("normalized", False)
     if normalized not in (True, False):
         raise fail(f"{name}, accessor {accessor.index}, has normalized = {normalized!r}; expected true or false")
-    if kind not in ATTRIBUTES:
+    if kind not in {**ATTRIBUTES, **TABLES}:
         return
-    types, numbers, more = (words.split() for words in ATTRIBUTES[kind])
+    types, numbers, more = (words.split() for words in {**ATTRIBUTES, **TABLES}[kind])
     if json["type"] not in types:
         raise fail(f"{name} is of {json['type']}; expected {' or '.join(types)}")
     component = TYPES[json["componentType"]]

@@ -11,7 +11,7 @@ import numpy as np
 from rts.files.damaged_files import warn
 from rts.files.gltf_accessors import Accessor, read_accessor, read_attributes
 from rts.files.gltf_materials import Material, read_material, unit_colors
-from rts.files.gltf_scenes import read_instances
+from rts.files.gltf_scenes import read_instances, warn_of_motion
 from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import Piece
 
@@ -31,21 +31,29 @@ def read_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> list[Pie
             reach beyond the data; or colours are not finite or far off.
     """
     gltf = Gltf(path, data, file)
+    pieces = [piece for piece, _, _ in read_scene(gltf)[0]]
+    gltf.part("its tree", warn_of_motion, gltf)
+    return pieces
+
+
+def read_scene(gltf: Gltf) -> tuple[list[tuple[Piece, dict[str, Any], int]], list[Accessor]]:
+    """The pieces of the scene that is shown, each with the JSON of its primitive and its node; and all accessors."""
     accessors = gltf.each("accessors", lambda index, _: read_accessor(gltf, index))
     materials = gltf.each("materials", lambda index, material: read_material(gltf, index, material))
 
-    def read_mesh(index: int, mesh: dict[str, Any]) -> list[Piece]:
-        return [_piece(gltf, f"mesh {index}", p, accessors, materials) for p in mesh["primitives"]]
+    def read_mesh(index: int, mesh: dict[str, Any]) -> list[tuple[Piece, dict[str, Any]]]:
+        return [(_piece(gltf, f"mesh {index}", p, accessors, materials), p) for p in mesh["primitives"]]
 
     meshes = gltf.each("meshes", read_mesh)
     instances = gltf.part("its scene", read_instances, gltf)
     gltf.part("its tree", gltf.check_names)
     gltf.warn_of_notes()
-    return [
-        piece._replace(transform=None if np.array_equal(place, np.eye(4)) else place)
-        for mesh, place in instances
-        for piece in meshes[mesh]
+    pieces = [
+        (piece._replace(transform=None if np.array_equal(place, np.eye(4)) else place), primitive, node)
+        for mesh, place, node in instances
+        for piece, primitive in meshes[mesh]
     ]
+    return pieces, accessors
 
 
 def _piece(

@@ -9,26 +9,27 @@ import numpy as np
 from rts.files.damaged_files import Fail, warn
 from rts.files.gltf_tree import TOLD, Gltf, count_of
 from rts.files.model_pieces import fault_of
+from rts.scene.clips import node_matrix
 
 _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
-def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
-    """The meshes of the scene that is shown: index, and transform (4, 4) scene-from-local, one for each node."""
+def read_instances(gltf: Gltf) -> list[tuple[int, np.ndarray, int]]:
+    """The meshes of the scene that is shown: index, transform (4, 4) scene-from-local, and node, one for each node."""
     nodes = gltf.tree.get("nodes", [])
-    return [(nodes[index]["mesh"], place) for index, place in read_places(gltf) if "mesh" in nodes[index]]
+    return [(nodes[index]["mesh"], place, index) for index, place in read_places(gltf) if "mesh" in nodes[index]]
 
 
 def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
     """The nodes of the scene that is shown: index, and transform (4, 4) scene-from-local.
 
     Refuses nodes that form no forest or have an unsound transform, and scenes of nodes that are no roots; warns of
-    skins, instances and morph targets, which are not read.
+    instances, which are not read.
     """
     path, fail, tree = gltf.path, gltf.fail, gltf.tree
     nodes, meshes, scenes = tree.get("nodes", []), tree.get("meshes", []), tree.get("scenes", [])
-    parents = _parents(nodes, fail)
-    moves = [_move(f"node {index}", node, fail) for index, node in enumerate(nodes)]
+    parents = parents_of(nodes, fail)
+    moves = [move_of(f"node {index}", node, fail) for index, node in enumerate(nodes)]
     shown = set()
     for index, node in enumerate(nodes):
         if "mesh" in node and count_of(node["mesh"]) >= len(meshes):
@@ -40,14 +41,9 @@ def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
     for index in sorted(shown):
         if fault := fault_of(moves[index]):
             raise fail(f"the transform of node {index} {fault}")
-    bent = [index for index, node in enumerate(nodes) if "skin" in node]
-    if bent:
-        warn(f"{path}: node {bent[0]} is bent by a skin, which is not read; it is loaded as it is without")
     repeated = [index for index, node in enumerate(nodes) if TOLD in node.get("extensions", {})]
     if repeated:
         warn(f"{path}: node {repeated[0]} stands for several instances, which are not read; it is loaded once")
-    if any(np.any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)):
-        warn(f"{path} has morph targets, which are not read; meshes are loaded as they are without")
     if "scene" in tree and count_of(tree["scene"]) >= len(scenes):
         raise fail(f"its scene is number {tree['scene']}, and there are {len(scenes)}")
     for index, scene in enumerate(scenes):
@@ -67,7 +63,7 @@ def read_places(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
     return places
 
 
-def _parents(nodes: list[dict[str, Any]], fail: Fail) -> dict[int, int]:
+def parents_of(nodes: list[dict[str, Any]], fail: Fail) -> dict[int, int]:
     """Child → parent, indices of nodes; refused if nodes form no forest, since a walk among them might never end."""
     parents: dict[int, int] = {}
     for index, node in enumerate(nodes):
@@ -88,7 +84,7 @@ def _parents(nodes: list[dict[str, Any]], fail: Fail) -> dict[int, int]:
     return parents
 
 
-def _move(name: str, node: dict[str, Any], fail: Fail) -> np.ndarray:
+def move_of(name: str, node: dict[str, Any], fail: Fail) -> np.ndarray:
     """The transform (4, 4) of a node in its parent. Its numbers are checked."""
     entries = {key: node[key] for key in _WIDTHS if key in node}
     for key, values in entries.items():
@@ -101,16 +97,29 @@ def _move(name: str, node: dict[str, Any], fail: Fail) -> np.ndarray:
         )
     if "matrix" in entries:
         return np.array(entries["matrix"], np.float64).reshape(4, 4).T
-    quaternion = np.array(entries.get("rotation", [0, 0, 0, 1]), np.float64)
-    if not abs(np.linalg.norm(quaternion) - 1) <= 0.01:
+    translation, rotation, scale = places_of(node)
+    if not abs(np.linalg.norm(rotation) - 1) <= 0.01:
         raise fail(f"rotation of {name} is {entries['rotation']}; expected a quaternion of length 1")
-    x, y, z, w = quaternion * np.sqrt(2 / (quaternion @ quaternion))
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - y * y - z * z, x * y - z * w, x * z + y * w],
-        [x * y + z * w, 1 - x * x - z * z, y * z - x * w],
-        [x * z - y * w, y * z + x * w, 1 - x * x - y * y],
-    ]
-    matrix[:3, :3] *= np.array(entries.get("scale", [1, 1, 1]), np.float64)
-    matrix[:3, 3] = entries.get("translation", 0)
-    return matrix
+    return node_matrix(translation, rotation, scale)
+
+
+def places_of(node: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The translation (3,), rotation (4,), a quaternion x, y, z, w, and scale (3,) of a node of checked numbers."""
+    defaults = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
+    translation, rotation, scale = (np.array(node.get(key, x), np.float64) for key, x in defaults.items())
+    return translation, rotation, scale
+
+
+def warn_of_motion(gltf: Gltf) -> None:
+    """Warn of skins, morph targets and clips, where they are not read."""
+    tree = gltf.tree
+    nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
+    primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
+    there = {
+        "skins": any("skin" in node for node in nodes),
+        "morph targets": any(x.get("targets") for x in primitives) or any(x.get("weights") for x in (*nodes, *meshes)),
+        "clips": bool(tree.get("animations")),
+    }
+    if any(there.values()):
+        what = " and ".join(name for name, is_there in there.items() if is_there)
+        warn(f"{gltf.path} has {what}, which are left out; rts.load_model reads them")

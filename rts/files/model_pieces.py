@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arrays.argument_checks import quoted
 from rts.errors import InputError
 
 WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "tangents": (4,), "colors": (3, 4)}
 """Numbers in a row of each table."""
 LARGEST = float(np.finfo(np.float32).max)
+CULLS = ("none", "back", "file")
 SINGULAR = 1e-9
 """Least volume of a transform's parallelepiped, as a share of the product of its edges."""
 
@@ -94,3 +96,14 @@ def fault_of(matrix: np.ndarray) -> str:
     if not abs(np.linalg.det(linear)) > SINGULAR * np.prod(lengths):
         return "is singular: it makes things flat"
     return ""
+
+
+def check_cull(cull: str) -> None:
+    """Refuse what is none of `CULLS`."""
+    if not isinstance(cull, str) or cull not in CULLS:
+        raise InputError(f"cull is {quoted(cull)}; expected {', '.join(CULLS)}")
+
+
+def cull_of(piece: Piece, cull: str) -> str:
+    """`Part.cull` of a piece, for an argument of `load`."""
+    return "back" if cull == "back" or (cull == "file" and piece.one_sided) else "none"

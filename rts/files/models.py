@@ -7,6 +7,7 @@ without one go through trimesh.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
 from rts.files.damaged_files import contents, gathered, warn_once
 from rts.files.gltf_reader import read_gltf
-from rts.files.model_pieces import Piece, check_piece
+from rts.files.model_pieces import Piece, check_cull, check_piece, cull_of
 from rts.files.obj_reader import read_obj
 from rts.files.off_reader import read_off
 from rts.files.paths import as_path, beside
@@ -28,8 +29,6 @@ from rts.files.trimesh_reader import read_with_trimesh
 from rts.scene.parts import Part
 from rts.shading.pbr import Pbr
 from rts.shading.shaders import Lambert, Textured, Unlit
-
-CULLS = ("none", "back", "file")
 
 
 def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh", cull: str = "none") -> list[Part]:
@@ -49,6 +48,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
     as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say
     that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
+
+    Parts of a glTF are at rest: joints, morph targets and clips are left out, and `rts.load_model` reads them.
 
     Welding may make vertices fewer than the file's. For data of your own, one row for each vertex of the
     file, load with `weld=False`.
@@ -78,8 +79,7 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     for name, flag in (("merge", merge), ("weld", weld)):
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"{name} is {quoted(flag)}; expected True or False")
-    if not isinstance(cull, str) or cull not in CULLS:
-        raise InputError(f"cull is {quoted(cull)}; expected {', '.join(CULLS)}")
+    check_cull(cull)
     if not isinstance(surface, str):
         raise InputError(f"surface is {quoted(surface)}; expected a name, such as 'mesh' or 'bezier'")
     if surface != "mesh":
@@ -89,16 +89,15 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         check_exists(path)
         return [part.replace(cull="back") if cull == "back" else part for part in plugin.load(path)]
     with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # Checks refuse overflow by name.
-        pieces = [_linear(piece) for piece in read_pieces(path)]
+        pieces = [linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):
             pieces = [_merged(path, pieces)]
-        culled = [cull == "back" or (cull == "file" and piece.one_sided) for piece in pieces]
-        parts = [_part(path, piece, weld) for piece in pieces]
+        parts = [part_of(path, piece, weld).replace(cull=cull_of(piece, cull)) for piece in pieces]
     warn_once(path, notes)
-    return [part.replace(cull="back") if back else part for part, back in zip(parts, culled, strict=True)]
+    return parts
 
 
-def _linear(piece: Piece) -> Piece:
+def linear(piece: Piece) -> Piece:
     """The piece with linear colours; textures are sRGB in every format."""
     attributes, color = dict(piece.attributes), piece.color
     if not piece.linear:
@@ -110,11 +109,14 @@ def _linear(piece: Piece) -> Piece:
     return piece._replace(attributes=attributes, color=color, texture=texture)
 
 
-def _part(path: Path, piece: Piece, weld: bool) -> Part:
+def part_of(
+    path: Path, piece: Piece, weld: bool, surface: Callable[[np.ndarray, dict[str, Any]], Any] | None = None
+) -> Part:
+    """The part of a piece; a mesh, or the `surface` (faces, indices of attributes) → surface."""
     vertices, faces = piece.vertices.astype(np.float32), piece.faces
     if weld:
-        rows, faces = _used(vertices, faces)
-        vertices, place = _welded(rows)
+        rows, faces = used_rows(vertices, faces)
+        vertices, place = welded_rows(rows)
         faces = place[faces]
     theta, indices = {"vertices": vertices}, {}
     for name, (rows, table) in piece.attributes.items():
@@ -142,20 +144,20 @@ def _part(path: Path, piece: Piece, weld: bool) -> Part:
     )
     shader = Pbr if piece.entries is not None else Textured if textured else Unlit if piece.unlit else Lambert
     return Part(
-        registry.plugin("rts.surfaces", "mesh")(faces, indices),
+        (surface or registry.plugin("rts.surfaces", "mesh"))(faces, indices),
         theta,
         shader(opaque=not translucent, **piece.options),
         piece.transform,
     )
 
 
-def _used(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def used_rows(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that a table refers to, and the table with indices into these rows."""
     used, inverse = np.unique(table, return_inverse=True)
     return rows[used], inverse.reshape(table.shape)
 
 
-def _welded(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def welded_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct rows in order of first occurrence, and for each given row its index among them."""
     _, first, inverse = np.unique(rows + 0.0, axis=0, return_index=True, return_inverse=True)  # −0 + 0 is 0.
     order = np.argsort(first)
@@ -181,7 +183,7 @@ def _settled(
         return rows, None
     by_vertex = np.zeros((count, rows.shape[1]), rows.dtype)
     by_vertex[faces] = rows[table]
-    return (by_vertex, None) if np.array_equal(by_vertex[faces], rows[table]) else _used(rows, table)
+    return (by_vertex, None) if np.array_equal(by_vertex[faces], rows[table]) else used_rows(rows, table)
 
 
 def _merged(path: Path, pieces: list[Piece]) -> Piece:

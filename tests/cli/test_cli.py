@@ -298,6 +298,25 @@ def test_render_options_reach_the_picture(model, tmp_path):
     assert rts.load_image(tmp_path / "a.png")[..., 3].mean() == 0
 
 
+@pytest.mark.thorough
+def test_a_clip_is_a_picture_or_an_animation(data, tmp_path):
+    from PIL import Image
+
+    common = "render", data / "gltf" / "AnimatedMorphCube.glb", "--size", 24, "--clip"
+    for time in (0, 2):
+        succeed(*common, "Square", "--time", time, "-o", tmp_path / f"{time}.png")
+    first, later = (rts.load_image(tmp_path / f"{time}.png")[..., 3] for time in (0, 2))
+    # One camera sees all of the clip; the cube gets thinner.
+    assert 0 < later.sum() < 0.8 * first.sum()
+    assert "84 frames" in succeed(*common, "0", "-o", tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as animation:
+        assert animation.n_frames == 84
+    assert "its index: 0 ('Square')" in fail(*common, "Circle", "-o", tmp_path / "a.png")
+    assert "give --clip" in fail(*common[:-1], "-o", tmp_path / "a.gif", code=2)
+    assert "--time is for a clip" in fail(*common[:-1], "--time", 1, "-o", tmp_path / "a.png", code=2)
+    assert "--surface beside --clip" in fail(*common, 0, "--surface", "bezier", "-o", tmp_path / "a.png", code=2)
+
+
 def test_the_depth_shader_covers_the_range_of_the_object(model, tmp_path):
     succeed("render", model, "-o", tmp_path / "a.png", "--shader", "depth", "--size", 64, "--splatter", "none")
     image = rts.load_image(tmp_path / "a.png")

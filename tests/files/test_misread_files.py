@@ -147,7 +147,7 @@ WARNED = {
     "glb: byteOffset of view 0 24": "POSITION of mesh 0 go from .* min and max of accessor 0 are",
     "glb: mesh of a node misspelt": "properties that glTF does not know, and that are left out: 'mesx' of nodes 2",
     "gltf: mode 1": "mesh 0 is of lines, which are left out",
-    "glb: a skin of a node": "node 1 is bent by a skin",
+    "glb: a skin of a node": "skins, which are left out",
 }
 
 

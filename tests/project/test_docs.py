@@ -32,6 +32,8 @@ ELSEWHERE = {
     "rts compare model.obj --quick -o out/compare": "make wheel",
     "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
     "rts render model.glb --shader pbr --environment room.hdr --exposure 0.5 -o picture.png": "test_cli.py",
+    "rts render man.glb --clip walk --time 0.4 -o man.png": "test_cli.py",
+    "rts render man.glb --clip 0 -o man.gif": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
     "rts cameras photos/ -o thing": "make apps",
 }

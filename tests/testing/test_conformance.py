@@ -71,6 +71,26 @@ class TestMesh(SurfaceConformance):
         return Mesh.example()
 
 
+class TestSkinned(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return rts.Skinned.example()
+
+
+@pytest.mark.thorough
+class TestSkinnedNormals(SurfaceConformance):
+    """Normals with a table of their own, shared between vertices, which morph targets change."""
+
+    @pytest.fixture
+    def part(self):
+        bar = rts.Skinned.example()
+        faces, vertices = bar.surface.mesh.faces, bar.theta["vertices"]
+        normals = np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
+        table = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
+        theta = {**bar.theta, "normals": normals, "morph_normals": 0.1 * normals[None, :, ::-1]}
+        return bar.replace(surface=rts.Skinned(faces, bar.surface.joints, {"normals": table}), theta=theta)
+
+
 class TestBezier(SurfaceConformance):
     @pytest.fixture
     def part(self):
