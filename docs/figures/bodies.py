@@ -1,4 +1,4 @@
-"""The picture of the guide "Bodies": a bar that a joint bends, and BrainStem at times of its clip.
+"""The picture of the guide "Bodies": a bar that a joint bends, and CesiumMan at times of its clip.
 
 python docs/figures/bodies.py, with the variable RTS_DATA as for tests
 """
@@ -27,9 +27,9 @@ def bar(degrees: float, weight: float) -> np.ndarray:
 
 
 def man(times: list[float]) -> list[np.ndarray]:
-    """BrainStem at some times of its clip, in seconds."""
-    model = rts.load_model(MODELS / "BrainStem.glb")
-    camera = rts.Camera.look_at((1.6, 1.3, 3.9), (0, 0.92, 0), fov_y=35, aspect=SIZE[1] / SIZE[0])
+    """CesiumMan at some times of its clip, in seconds."""
+    model = rts.load_model(MODELS / "CesiumMan.glb")
+    camera = rts.Camera.look_at((2.2, 1.2, 2.4), (0, 0.75, 0), fov_y=32, aspect=SIZE[1] / SIZE[0])
     poses = [model.posed(model.pose(0, time)) for time in times]
     return [rts.render(parts, camera, SIZE, background=BACKGROUND, supersample=2) for parts in poses]
 
@@ -37,7 +37,7 @@ def man(times: list[float]) -> list[np.ndarray]:
 def main() -> None:
     """Write bodies.png to docs/images."""
     bars = [bar(degrees, weight) for degrees, weight in ((0, 0), (30, 0), (60, 0), (90, 0), (60, 1))]
-    rows = [np.concatenate(row, axis=1) for row in (bars, man([0.0, 9.0, 14.0, 20.0, 30.0]))]
+    rows = [np.concatenate(row, axis=1) for row in (bars, man([0.0, 0.4, 0.8, 1.2, 1.6]))]
     rts.save_image(IMAGES / "bodies.png", np.concatenate(rows))
 
 
