@@ -14,7 +14,9 @@ from rts.arrays.argument_checks import quoted
 from rts.errors import InputError
 from rts.files.damaged_files import contents, gathered, warn_once
 from rts.files.gltf_bodies import Deformation, read_deformation, read_nodes, read_skins
+from rts.files.gltf_cameras import read_cameras
 from rts.files.gltf_clips import read_clips
+from rts.files.gltf_lights import read_lights
 from rts.files.gltf_reader import read_scene
 from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import Piece, check_cull, check_piece, cull_of
@@ -73,8 +75,15 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
         if not parts:
             raise InputError(f"{path} holds no faces; expected a mesh with triangles")
         model = Model(
-            tuple(parts), tuple(bindings), tuple(nodes), tuple(skins), tuple(read_clips(gltf, accessors, nodes))
+            tuple(parts),
+            tuple(bindings),
+            tuple(nodes),
+            tuple(skins),
+            tuple(read_clips(gltf, accessors, nodes)),
+            read_lights(gltf),
+            tuple(read_cameras(gltf)),
         )
+        gltf.warn_of_notes()
     warn_once(path, notes)
     return replace(model, parts=tuple(model.posed(model.pose())))
 

@@ -14,6 +14,7 @@ from rts.arrays.array_functions import described, from_numbers, shape_of
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import Array
 from rts.errors import InputError
+from rts.scene.camera import Camera
 from rts.scene.clips import Clip, node_matrix
 from rts.scene.parts import Part
 
@@ -88,6 +89,8 @@ class Model:
         nodes: its nodes.
         skins: its skins.
         clips: its clips.
+        lights: θ["light"] of its directional and point lights, at rest; empty if there are none.
+        cameras: its cameras, at rest, in the order of their nodes.
     """
 
     parts: tuple[Part, ...]
@@ -95,6 +98,8 @@ class Model:
     nodes: tuple[Node, ...]
     skins: tuple[Skin, ...]
     clips: tuple[Clip, ...]
+    lights: dict[str, np.ndarray]
+    cameras: tuple[Camera, ...]
 
     def clip(self, clip: str | int) -> Clip:
         """The clip of a name, or of an index.

@@ -258,3 +258,18 @@ def test_a_walking_man_keeps_his_height_and_feet_on_the_ground(data):
     for share in np.linspace(0, 1, 5):
         y = posed(model, 0, share * model.clips[0].duration)[:, 1]
         assert 1.3 < np.ptp(y) < 1.6 and abs(y.min()) < 0.15
+
+
+def test_a_model_has_the_lights_and_cameras_of_its_file(tmp_path):
+    bar = Bar()
+    bar.nodes[0] |= {"extensions": {"KHR_lights_punctual": {"light": 0}}, "camera": 0}
+    bar.more = {
+        "extensions": {"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": float(np.pi)}]}},
+        "cameras": [{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1}}],
+    }
+    model = rts.load_model(bar.written(tmp_path))
+    np.testing.assert_array_equal(model.lights["position"], [[9, 9, 9]])
+    np.testing.assert_allclose(model.lights["intensity"], [[1, 1, 1]])
+    np.testing.assert_allclose(np.linalg.inv(model.cameras[0].view)[:3, 3], [9, 9, 9])
+    plain = rts.load_model(Bar().written(tmp_path))
+    assert plain.lights == {} and plain.cameras == ()
