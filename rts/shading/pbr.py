@@ -58,17 +58,23 @@ class Pbr(Unlit):
         reflectance = DIELECTRIC + metallic * (color - DIELECTRIC)
         base = (1 - metallic) * (1 - reflectance) * color
         normal, toward = self._normals(theta, gbuffer, camera), unit(camera.toward(gbuffer["position"]))
-        shown = xp.zeros_like(color)
+        facing, shown = dot(normal, toward), None
         for direction, brightness in light.lamps(gbuffer["position"]):
-            a, b, c = microfacets.of_light(normal, toward, direction, roughness)
-            shown = shown + (reflectance * a + b + base * c) * brightness
+            a, b, c = microfacets.of_light(normal, toward, facing, direction, roughness)
+            lit = (reflectance * a + b + base * c) * brightness
+            shown = lit if shown is None else shown + lit
         if light.surrounds:
-            (a, b, c), mean, blurred, flat = microfacets.around(normal, toward, roughness)
-            diffuse, reflected = light.diffuse(normal), light.reflected(mean, blurred)
-            reflected = reflected + flat * (diffuse - reflected)
-            around = (reflectance * a + b) * reflected + base * c * diffuse
+            (a, b, c), lobe = microfacets.around(normal, toward, facing, roughness, light.directed)
+            if lobe is None:
+                around = (reflectance * a + b + base * c) * light.ambient
+            else:
+                diffuse, reflected = light.diffuse(normal), light.reflected(lobe.mean, lobe.roughness)
+                reflected = reflected + lobe.flat * (diffuse - reflected)
+                around = (reflectance * a + b) * reflected + base * c * diffuse
             occlusion = self._entry(theta, gbuffer, "occlusion", 1)
-            shown = shown + (around if occlusion is None else occlusion * around)
+            around = around if occlusion is None else occlusion * around
+            shown = around if shown is None else shown + around
+        shown = xp.zeros_like(color) if shown is None else shown
         emissive = self._entry(theta, gbuffer, "emissive", 3)
         return self.premultiplied(shown if emissive is None else shown + emissive, alpha)
 
