@@ -16,7 +16,7 @@ from rts.scene.row_cameras import RowCameras
 from rts.shading import microfacets
 from rts.shading.light import light_of
 from rts.shading.shaders import Unlit, is_behind
-from rts.shading.tangents import TANGENT
+from rts.shading.tangents import TANGENT, tangent_frame
 from rts.shading.theta_entries import check_base, entry_of
 
 DIELECTRIC = 0.04
@@ -80,14 +80,13 @@ class Pbr(Unlit):
 
     def _normals(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """Unit normals (N, 3), bent by the normal map; frames seen from behind are turned over, as glTF says."""
-        normal, xp = unit(gbuffer["normal"]), namespace(gbuffer["normal"])
         bent = self._entry(theta, gbuffer, "normal_map", 3)
-        if bent is not None:
-            frame = gbuffer[TANGENT]
-            tangent = unit(frame[:, :3] - dot(normal, frame[:, :3]) * normal)
-            bitangent = frame[:, 3:] * xp.linalg.cross(normal, tangent)
-            normal = unit(bent[:, :1] * tangent + bent[:, 1:2] * bitangent + bent[:, 2:] * normal)
-        return xp.where(is_behind(gbuffer, camera), -normal, normal)
+        if bent is None:
+            normal = unit(gbuffer["normal"])
+        else:
+            tangent, bitangent, upright = tangent_frame(gbuffer)
+            normal = unit(bent[:, :1] * tangent + bent[:, 1:2] * bitangent + bent[:, 2:] * upright)
+        return namespace(normal).where(is_behind(gbuffer, camera), -normal, normal)
 
     def _entry(self, theta: Mapping[str, Tree], gbuffer: GBuffer, name: str, channels: int) -> Any:
         """A number (), a colour (3,), or a map's values (N, channels) at the samples; None if θ has no such entry."""
