@@ -79,7 +79,8 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
             return averaged(*rows, most)
         if end > start:
             here = engine.constant(order[start:end])
-            found.append(averaged(*(xp.take(x, here, axis=0) for x in rows), most))
+            a, b, c, d = (xp.take(x, here, axis=0) for x in rows)
+            found.append(averaged(a, b, c, d, most))
             start = end
     return xp.take(xp.concat(found), engine.constant(np.argsort(order)), axis=0)
 

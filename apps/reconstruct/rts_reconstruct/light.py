@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import KDTree
 
 import rts
-from rts import shading
+from rts.shading import irradiance as irradiance_of_harmonics
 
 EVEN = math.sqrt(4 * math.pi)
 """The first coefficient of light of mean 1."""
@@ -34,7 +34,7 @@ def irradiance(normals: Any, light: Any) -> Any:
         normals: (N, 3).
         light: (9, 3), coefficients of radiance as in θ["light"]["sh"]; light whose first row is `EVEN` has a mean of 1.
     """
-    return rts.namespace(normals).clip(shading.irradiance(light, normals), DARK, None)
+    return rts.namespace(normals).clip(irradiance_of_harmonics(light, normals), DARK, None)
 
 
 class Lit(rts.Shader):
