@@ -36,59 +36,74 @@ class Response(NamedTuple):
     c: Array
 
 
-def of_light(normal: Array, toward: Array, direction: Array, roughness: Array) -> Response:
+def of_light(normal: Array, toward: Array, facing: Array, direction: Array, roughness: Array) -> Response:
     """The response (N, 1) to light of irradiance π from one direction.
 
     Args:
         normal: (N, 3) unit vectors.
         toward: (N, 3) unit vectors to the viewer.
+        facing: (N, 1), their scalar products.
         direction: (N, 3) or (3,), unit vectors to the light.
         roughness: (N, 1) or (), perceptual, from `SMOOTHEST` to 1.
     """
-    xp, alpha = namespace(normal), roughness * roughness
-    half = unit(direction + toward)
-    to_light, to_viewer = dot(normal, direction), xp.clip(dot(normal, toward), 1e-4, 1.0)
+    xp, square = namespace(normal), roughness**4
+    half = direction + toward
+    length = xp.sqrt(xp.clip(dot(half, half), 1e-12, None))
+    to_light, to_viewer = dot(normal, direction), xp.clip(facing, 1e-4, 1.0)
     to_light = xp.where(to_light > 0, to_light, 0 * to_light)
     # sin² of the angle between normal and half vector, by the chord: 1 − cos² would lose the highlights' digits.
-    chord = normal - half
+    chord = normal - half / length
     versine = 0.5 * dot(chord, chord)
-    sine = versine * (2 - versine)
-    spread = sine + alpha * alpha * (1 - sine)
-    square = alpha * alpha
+    spread = versine * (2 - versine) * (1 - square) + square
     smith = to_light * xp.sqrt(to_viewer * to_viewer * (1 - square) + square)
     smith = smith + to_viewer * xp.sqrt(to_light * to_light * (1 - square) + square)
     # π D V times the cosine.
     specular = 0.5 * to_light * square / (spread * spread * smith)
-    fresnel = _fifth(1 - xp.clip(dot(toward, half), 0.0, 1.0))
+    # The cosine between viewer and half vector is half the length of the sum of both directions.
+    fresnel = _fifth(1 - xp.clip(0.5 * length, 0.0, 1.0))
     return Response(specular * (1 - fresnel), specular * fresnel, to_light * (1 - fresnel))
 
 
-def around(normal: Array, toward: Array, roughness: Array) -> tuple[Response, Array, Array, Array]:
+class Lobe(NamedTuple):
+    """The average of light that a surface reflects: a blur about a direction, mixed with diffuse light.
+
+    Attributes:
+        mean: the directions (N, 3) of blurs.
+        roughness: of surfaces that blur as much along their normals, (N, 1).
+        flat: the shares (N, 1) of diffuse light, irradiance / π.
+    """
+
+    mean: Array
+    roughness: Array
+    flat: Array
+
+
+def around(
+    normal: Array, toward: Array, facing: Array, roughness: Array, directed: bool
+) -> tuple[Response, Lobe | None]:
     """The response (N, 1) to light from all directions: the split-sum approximation (Karis 2013).
 
     The first two numbers are of light of radiance 1. For other light they are factors of its average over directions
-    that a surface reflects. For this average there is a blur about a direction, mixed with diffuse light.
+    that a surface reflects, its lobe.
 
     Args:
         normal: (N, 3) unit vectors.
         toward: (N, 3) unit vectors to the viewer.
+        facing: (N, 1), their scalar products.
         roughness: (N, 1) or (), perceptual.
-
-    Returns:
-        The response, directions (N, 3) of blurs, the roughnesses (N, 1) of surfaces that blur as much along their
-        normals, and the shares (N, 1) of diffuse light, irradiance / π, in the average.
+        directed: whether light depends on its direction; if not, there is no lobe.
     """
-    cosine = dot(normal, toward)
-    engine = engine_of(cosine, roughness)
-    xp, table, last = engine.namespace, engine.constant(_table(), cosine), TABLE - 1
+    engine = engine_of(facing, roughness)
+    xp, last = engine.namespace, TABLE - 1
+    table = engine.constant(_table() if directed else _table()[:, :3], facing)
 
     def place(value: Array) -> tuple[Array, Array]:
         at = xp.clip(value, 0.0, 1.0) * last
         cell = xp.clip(xp.floor(engine.stop_gradient(at)), 0, last - 1)
         return xp.astype(xp.where(cell == cell, cell, 0 * cell), xp.int32), at - cell
 
-    row, down = place(roughness + 0 * cosine)
-    column, right = place(xp.sqrt(xp.clip(cosine, 1e-6, 1.0)))
+    row, down = place(roughness + 0 * facing)
+    column, right = place(xp.sqrt(xp.clip(facing, 1e-6, 1.0)))
     first = row[:, 0] * TABLE + column[:, 0]
 
     def at(offset: int) -> Array:
@@ -96,9 +111,12 @@ def around(normal: Array, toward: Array, roughness: Array) -> tuple[Response, Ar
 
     upper = at(0) + right * (at(1) - at(0))
     lower = at(TABLE) + right * (at(TABLE + 1) - at(TABLE))
-    a, b, c, along, upright, blurred, flat = ((upper + down * (lower - upper))[:, i : i + 1] for i in range(7))
-    mean = unit(along * (cosine * normal - toward) + upright * normal)
-    return Response(a, b, c), mean, blurred, flat
+    numbers = upper + down * (lower - upper)
+    a, b, c, *lobe = (numbers[:, i : i + 1] for i in range(numbers.shape[1]))
+    if not directed:
+        return Response(a, b, c), None
+    along, upright, blurred, flat = lobe
+    return Response(a, b, c), Lobe(unit(along * (facing * normal - toward) + upright * normal), blurred, flat)
 
 
 @functools.cache

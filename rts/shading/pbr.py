@@ -16,7 +16,7 @@ from rts.scene.row_cameras import RowCameras
 from rts.shading import microfacets
 from rts.shading.light import light_of
 from rts.shading.shaders import Unlit, is_behind
-from rts.shading.tangents import TANGENT
+from rts.shading.tangents import TANGENT, tangent_frame
 from rts.shading.theta_entries import check_base, entry_of
 
 DIELECTRIC = 0.04
@@ -58,30 +58,35 @@ class Pbr(Unlit):
         reflectance = DIELECTRIC + metallic * (color - DIELECTRIC)
         base = (1 - metallic) * (1 - reflectance) * color
         normal, toward = self._normals(theta, gbuffer, camera), unit(camera.toward(gbuffer["position"]))
-        shown = xp.zeros_like(color)
+        facing, shown = dot(normal, toward), None
         for direction, brightness in light.lamps(gbuffer["position"]):
-            a, b, c = microfacets.of_light(normal, toward, direction, roughness)
-            shown = shown + (reflectance * a + b + base * c) * brightness
+            a, b, c = microfacets.of_light(normal, toward, facing, direction, roughness)
+            lit = (reflectance * a + b + base * c) * brightness
+            shown = lit if shown is None else shown + lit
         if light.surrounds:
-            (a, b, c), mean, blurred, flat = microfacets.around(normal, toward, roughness)
-            diffuse, reflected = light.diffuse(normal), light.reflected(mean, blurred)
-            reflected = reflected + flat * (diffuse - reflected)
-            around = (reflectance * a + b) * reflected + base * c * diffuse
+            (a, b, c), lobe = microfacets.around(normal, toward, facing, roughness, light.directed)
+            if lobe is None:
+                around = (reflectance * a + b + base * c) * light.ambient
+            else:
+                diffuse, reflected = light.diffuse(normal), light.reflected(lobe.mean, lobe.roughness)
+                reflected = reflected + lobe.flat * (diffuse - reflected)
+                around = (reflectance * a + b) * reflected + base * c * diffuse
             occlusion = self._entry(theta, gbuffer, "occlusion", 1)
-            shown = shown + (around if occlusion is None else occlusion * around)
+            around = around if occlusion is None else occlusion * around
+            shown = around if shown is None else shown + around
+        shown = xp.zeros_like(color) if shown is None else shown
         emissive = self._entry(theta, gbuffer, "emissive", 3)
         return self.premultiplied(shown if emissive is None else shown + emissive, alpha)
 
     def _normals(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """Unit normals (N, 3), bent by the normal map; frames seen from behind are turned over, as glTF says."""
-        normal, xp = unit(gbuffer["normal"]), namespace(gbuffer["normal"])
         bent = self._entry(theta, gbuffer, "normal_map", 3)
-        if bent is not None:
-            frame = gbuffer[TANGENT]
-            tangent = unit(frame[:, :3] - dot(normal, frame[:, :3]) * normal)
-            bitangent = frame[:, 3:] * xp.linalg.cross(normal, tangent)
-            normal = unit(bent[:, :1] * tangent + bent[:, 1:2] * bitangent + bent[:, 2:] * normal)
-        return xp.where(is_behind(gbuffer, camera), -normal, normal)
+        if bent is None:
+            normal = unit(gbuffer["normal"])
+        else:
+            tangent, bitangent, upright = tangent_frame(gbuffer)
+            normal = unit(bent[:, :1] * tangent + bent[:, 1:2] * bitangent + bent[:, 2:] * upright)
+        return namespace(normal).where(is_behind(gbuffer, camera), -normal, normal)
 
     def _entry(self, theta: Mapping[str, Tree], gbuffer: GBuffer, name: str, channels: int) -> Any:
         """A number (), a colour (3,), or a map's values (N, channels) at the samples; None if θ has no such entry."""

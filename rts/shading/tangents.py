@@ -8,6 +8,7 @@ from dataclasses import replace
 from rts.arrays.array_functions import dot, unit
 from rts.arrays.engines import Context, namespace
 from rts.arrays.trees import Array, Tree
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
 from rts.shading.parameter_steps import check_two_parameters, steps_beside
@@ -50,3 +51,16 @@ def tangents(
     turns_left = dot(xp.linalg.cross(gbuffer["normal"], along_u), xp.where(mirrored, -along_v, along_v)) >= 0
     one = xp.ones_like(position[:, :1])
     return xp.concat([unit(along_u), xp.where(turns_left, one, -one)], axis=1)
+
+
+def tangent_frame(gbuffer: GBuffer) -> tuple[Array, Array, Array]:
+    """Unit tangents along u, bitangents along v, and normals (N, 3) each, at right angles, where maps have directions.
+
+    A direction (x, y, z) of a normal map is x · tangent + y · bitangent + z · normal.
+
+    Args:
+        gbuffer: "normal" (N, 3) and "tangent" (N, 4), as shaders receive them; not turned to the viewer.
+    """
+    normal, frame = unit(gbuffer["normal"]), gbuffer[TANGENT]
+    tangent = unit(frame[:, :3] - dot(normal, frame[:, :3]) * normal)
+    return tangent, frame[:, 3:] * namespace(normal).linalg.cross(normal, tangent), normal

@@ -1,4 +1,4 @@
-"""Textures: bilinear lookup, and trilinear lookup in a pyramid of averages (mipmaps)."""
+"""Textures: bilinear lookup, and anisotropic trilinear lookup in a pyramid of averages (mipmaps)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.array_functions import described, shape_of
-from rts.arrays.engines import engine_of, namespace, stopped
+from rts.arrays.engines import engine_of, namespace, stopped, value_of
 from rts.arrays.trees import Array
 from rts.errors import InputError
 
@@ -15,6 +15,10 @@ WRAPS = ("repeat", "mirror", "clamp")
 """Continuations of a texture outside [0, 1]."""
 FILTERS = ("linear", "nearest")
 """Ways to read between the centres of texels."""
+TAPS = (4, 2, 1)
+"""Numbers of lookups along the longer axis of a footprint."""
+CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""The four texels of a bilinear lookup: down and right."""
 Wrap = str | tuple[str, str]
 """A continuation, or one along u and one along v."""
 
@@ -22,7 +26,7 @@ Wrap = str | tuple[str, str]
 def sample_texture(
     texture: Array, uv: Array, wrap: Wrap = "repeat", footprint: Array | None = None, filter: str = "linear"
 ) -> Array:
-    """Bilinear texture lookup, or trilinear where a footprint is given; differentiable in texture and uv.
+    """Bilinear texture lookup, or the mean over a footprint where one is given; differentiable in texture and uv.
 
     Args:
         texture: (h, w, C), C = 1, 3 or 4, row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w,
@@ -30,7 +34,7 @@ def sample_texture(
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
         wrap: "repeat" or "mirror" outside [0, 1]; any other text is "clamp". A pair is for u and for v.
         footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for a step to the next cell, constant. The texture is averaged
-            over roughly this area, by `mip_levels` and `level_of`. None for no average.
+            over roughly this area, by up to four trilinear lookups; see `taps_of`. None for no average.
         filter: "nearest" takes the texel around a point, without derivative in uv; any other text is "linear".
 
     Returns:
@@ -55,17 +59,38 @@ def sample_texture(
     sizes = np.array([x.shape[:2] for x in levels])
     first = engine.constant(np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1))
     heights, widths = (engine.constant(x.astype(np.float32), uv) for x in sizes.T)
-    level = level_of(footprint, (height, width))
-    finer = xp.clip(xp.floor(level), 0, max(len(levels) - 2, 0))
-    share, lower = (level - finer)[:, None], xp.astype(finer, xp.int32)
 
-    def at(number: Array) -> Array:
-        return _bilinear(
-            table, uv, wrap, *(xp.take(x, number, axis=0) for x in (heights, widths, first)), filter=filter
-        )
+    def averaged(uv: Array, level: Array, step: Array, count: Array, most: int) -> Array:
+        """The mean of each row's taps, of which there are at most `most`."""
+        finer = xp.clip(xp.floor(level), 0, max(len(levels) - 2, 0))
+        # One lookup of all: engines make an array as large as the table for the gradient of each.
+        place = xp.concat([uv + (i - 0.5 * (count - 1))[:, None] * step for i in range(most)] * 2)
+        finer, coarser = (xp.astype(x, xp.int32) for x in (finer, xp.clip(finer + 1, 0, len(levels) - 1)))
+        number = xp.concat([finer] * most + [coarser] * most)
+        of_levels = (xp.take(x, number, axis=0) for x in (heights, widths, first))
+        tap = _bilinear(table, place, wrap, *of_levels, filter=filter)
+        tap = xp.reshape(tap, (2, most, -1, channels))
+        tap = tap[0, ...] + (level - xp.astype(finer, level.dtype))[:, None] * (tap[1, ...] - tap[0, ...])
+        if most == 1:
+            return tap[0, ...]
+        return sum(xp.where(i < count, 1 / count, 0 * count)[:, None] * tap[i, ...] for i in range(most))
 
-    below = at(lower)
-    return below + share * (at(xp.clip(lower + 1, 0, len(levels) - 1)) - below)
+    rows = uv, *taps_of(footprint, (height, width))
+    known = value_of(rows[-1])
+    if known is None or known.ndim != 1:
+        return averaged(*rows, TAPS[0])
+    # Rows of as many taps together, so that only those pay for taps that need them.
+    order, found, start = np.argsort(-known.astype(np.int8), kind="stable"), [], 0
+    for most in TAPS:
+        end = min(engine.room(int((known >= most).sum()), uv), len(known))
+        if end == len(known) and start == 0:
+            return averaged(*rows, most)
+        if end > start:
+            here = engine.constant(order[start:end])
+            a, b, c, d = (xp.take(x, here, axis=0) for x in rows)
+            found.append(averaged(a, b, c, d, most))
+            start = end
+    return xp.take(xp.concat(found), engine.constant(np.argsort(order)), axis=0)
 
 
 def mip_levels(texture: Array) -> list[Array]:
@@ -82,22 +107,40 @@ def mip_levels(texture: Array) -> list[Array]:
     return levels
 
 
-def level_of(footprint: Array, size: tuple[int, int]) -> Array:
-    """The level (N,) of `mip_levels`, a real number, at which texels are as large as the footprint's longer side.
+def taps_of(footprint: Array, size: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Lookups whose mean is that of the texture over footprints, without derivative.
 
-    Level 0 is the texture itself, for sides of at most a texel, and of NaN. The last is a single texel. Without
-    derivative.
+    A footprint is taken for an ellipse. One that is nearly round has one tap. Others have two or four, side by side
+    along the longer axis. Taps and the level together spread as widely as the footprint, in both axes: their variances
+    are the same. A level l with bilinear lookup has (4ˡ − 1) / 4 texels² more than level 0 has, a footprint of side s
+    has s² / 12.
 
     Args:
         footprint: (N, 4), see `sample_texture`.
         size: (height, width) of the texture.
+
+    Returns:
+        The levels (N,) of `mip_levels`, real numbers: 0 is the texture itself, the last a single texel. Steps (N, 2) of
+        uv from tap to tap. The numbers (N,) of taps: 1, 2 or 4.
     """
     xp, (height, width), f = namespace(footprint), size, stopped(footprint)
-    u, v = f[:, 0::2] * width, f[:, 1::2] * height
-    texels = xp.max(u * u + v * v, axis=1)
-    texels = xp.where(texels == texels, texels, 1.0)  # NaN is no level.
     coarsest = max(height, width).bit_length() - 1
-    return xp.clip(0.5 * xp.log2(xp.clip(texels, 1.0, 4.0**coarsest)), 0.0, float(coarsest))
+    f = xp.clip(xp.where(f == f, f, 0.0), -8.0, 8.0)  # Wider ones are of many whole textures; NaN is none.
+    u, v = f[:, 0::2] * width, f[:, 1::2] * height
+    square_u, product, square_v = (xp.sum(x, axis=1) for x in (u * u, u * v, v * v))
+    middle, half = 0.5 * (square_u + square_v), 0.5 * (square_u - square_v)
+    radius = xp.sqrt(half * half + product * product)
+    # 4ˡ of levels as wide as the longer and the shorter axis.
+    longer, shorter = 1 + (middle + radius) / 3, 1 + xp.clip(middle - radius, 0.0, None) / 3
+    one = xp.ones_like(middle)
+    count = xp.where(longer > 8 * shorter, 4 * one, xp.where(longer > 2 * shorter, 2 * one, one))
+    level = xp.where(count > 1, xp.maximum(shorter, longer / (count * count)), longer)
+    apart = xp.sqrt(3 * (longer - level) / xp.where(count > 1, count * count - 1, one))
+    along_u, along_v = xp.where(half > 0, radius + half, product), xp.where(half > 0, product, radius - half)
+    length = xp.sqrt(along_u * along_u + along_v * along_v)
+    apart = apart / xp.where(length > 0, length, one)
+    level = xp.clip(0.5 * xp.log2(level), 0.0, float(coarsest))
+    return level, xp.stack([apart * along_u / width, apart * along_v / height], axis=1), count
 
 
 def _halved(x: Array) -> Array:
@@ -140,14 +183,11 @@ def _bilinear(
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
 
     along_u, along_v = (wrap, wrap) if isinstance(wrap, str) else wrap
-
-    def texel(dx: int, dy: int) -> Array:
-        index = _wrapped(y0 + dy, height, along_v) * columns + _wrapped(x0 + dx, width, along_u)
-        return xp.take(flat, index if first is None else index + first, axis=0)
-
-    top = texel(0, 0) + fx * (texel(1, 0) - texel(0, 0))
-    bottom = texel(0, 1) + fx * (texel(1, 1) - texel(0, 1))
-    return top + fy * (bottom - top)
+    index = [_wrapped(y0 + dy, height, along_v) * columns + _wrapped(x0 + dx, width, along_u) for dy, dx in CORNERS]
+    index = index if first is None else [i + first for i in index]
+    texels = xp.reshape(xp.take(flat, xp.concat(index), axis=0), (4, -1, flat.shape[1]))
+    upper, lower = (texels[i, ...] + fx * (texels[i + 1, ...] - texels[i, ...]) for i in (0, 2))
+    return upper + fy * (lower - upper)
 
 
 def _wrapped(index: Array, count: Any, wrap: str) -> Array:

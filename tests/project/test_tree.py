@@ -135,6 +135,7 @@ def test_measuring_imports_public_names_alone():
     public = {
         "rts": [*rts.__all__, "errors"],
         "rts.diagnostics": [name.rpartition(".")[2] for name in modules],
+        "rts.shading": import_module("rts.shading").__all__,
         **toolkit(),
     }
     public |= {name: defined(FILES[name]) for name in modules}

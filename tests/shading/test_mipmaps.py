@@ -23,7 +23,7 @@ from rts.contracts.records import Cells
 from rts.errors import InputError
 from rts.plugin_api.records import Samples
 from rts.shading.shaders import Textured
-from rts.shading.textures import level_of, mip_levels, sample_texture
+from rts.shading.textures import mip_levels, sample_texture, taps_of
 from rts.shading.uv_footprints import uv_footprint
 
 pytestmark = pytest.mark.rendering
@@ -72,19 +72,35 @@ def test_each_level_averages_equal_areas_of_the_one_before(target, size):
         np.testing.assert_allclose(below, fine.reshape(m, h, n, w, 3).mean(axis=(1, 3)), atol=1e-6)
 
 
-def test_the_level_is_the_logarithm_of_the_longer_side_in_texels():
-    footprint = np.array(
-        [(1 / 16, 0, 0, 1 / 8), (3 / 16, 4 / 8, 0, 0), (0, 0, 0, 0), (9, 0, 0, 9), (0, np.inf, 0, 0), (0, np.nan, 0, 0)]
-    )
-    expected = [0, np.log2(5), 0, 4, 4, 0]
-    np.testing.assert_allclose(level_of(footprint, (8, 16)), expected)
+def test_taps_and_level_have_the_variance_of_the_footprint_in_both_axes():
+    sides = np.exp(RNG.uniform(-2, 3, (300, 2)))
+    longer, shorter = sides.max(axis=1), sides.min(axis=1)
+    turned, other = (np.array([np.cos(a), np.sin(a)]).T for a in RNG.uniform(0, 6, (2, 300)))
+    along, across = turned * longer[:, None], np.stack([-turned[:, 1], turned[:, 0]], axis=1) * shorter[:, None]
+    x, y = (other[:, i : i + 1] * along + (1 - 2 * i) * other[:, 1 - i : 2 - i] * across for i in (0, 1))
+    level, step, count = taps_of(np.concatenate([x, y], axis=1) / [64, 16, 64, 16], (16, 64))
+    step, few = step * [64, 16], level < 6
+    np.testing.assert_allclose((step * across).sum(axis=1), 0, atol=1e-9)
+    spread = (step**2).sum(axis=1) * (count**2 - 1) / 12
+    np.testing.assert_allclose((spread + (4**level - 1) / 4)[few], longer[few] ** 2 / 12, rtol=1e-6)
+    enough = few & (count > 1) & (longer**2 + 3 < count**2 * (shorter**2 + 3))
+    np.testing.assert_allclose((4 ** level[enough] - 1) / 4, shorter[enough] ** 2 / 12, rtol=1e-6)
+    assert {1, 2, 4} == set(count) and enough.sum() > 50 and (count[longer < 1.4 * shorter] == 1).all()
+
+
+def test_wild_footprints_have_a_level():
+    footprint = np.array([(0, 0, 0, 0), (9, 0, 0, 18), (0, np.inf, 0, 0), (0, np.nan, 0, 0), (1e30, 0, 0, 0)])
+    level, step, count = taps_of(footprint.astype(np.float32), (8, 16))
+    np.testing.assert_allclose(level[[0, 1, 3]], [0, 4, 0])
+    assert np.isfinite(step).all() and (level >= 0).all() and (level <= 4).all()
 
 
 @pytest.mark.parametrize("target", ALL)
 def test_lookup_is_linear_between_levels(target):
     texture, uv = RNG.random((6, 5, 3)), RNG.uniform(-1, 2, (20, 2))
     for level in (0, 0.25, 1, 1.75, 2, 7):
-        footprint = np.tile([2**level / 5, 0, 0, 0], (20, 1))
+        side = np.sqrt(3 * (4**level - 1))
+        footprint = np.tile([side / 5, 0, 0, side / 6], (20, 1))
         finer, share = (min(int(level), 1), min(level, 2) - min(int(level), 1))
         a, b = (sample_texture(x, uv) for x in mip_levels(texture)[finer : finer + 2])
         given = arrays(target, (texture, uv, footprint))
@@ -92,10 +108,25 @@ def test_lookup_is_linear_between_levels(target):
         np.testing.assert_allclose(found, a + share * (b - a), atol=2e-5)
 
 
+@pytest.mark.parametrize("target", ALL)
+def test_slanted_footprints_are_means_of_taps_side_by_side(target):
+    texture, uv = RNG.random((12, 10, 3)), RNG.uniform(-1, 2, (40, 2))
+    footprint = RNG.uniform(-0.4, 0.4, (40, 4))
+    level, step, count = taps_of(footprint, (12, 10))
+    assert set(count) == {1, 2, 4}
+    expected = 0
+    for i in range(4):
+        place, side = uv + (i - 0.5 * (count - 1))[:, None] * step, np.sqrt(3 * (4**level - 1))
+        tap = sample_texture(texture, place, "repeat", side[:, None] * [1 / 10, 0, 0, 1 / 12])
+        expected = expected + np.where(i < count, 1 / count, 0)[:, None] * tap
+    given = arrays(target, (texture, uv, footprint))
+    np.testing.assert_allclose(to_numpy(sample_texture(given[0], given[1], "repeat", given[2])), expected, atol=2e-5)
+
+
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
 def test_wrap_modes_hold_in_every_level(wrap):
-    texture, uv, coarse = RNG.random((8, 8, 3)), RNG.uniform(-2, 3, (50, 2)), np.full((50, 4), 1 / 4)
-    coarse[:, 1:] = 0  # Level 1.
+    texture, uv, coarse = RNG.random((8, 8, 3)), RNG.uniform(-2, 3, (50, 2)), np.zeros((50, 4))
+    coarse[:, [0, 3]] = 3 / 8  # Level 1.
     np.testing.assert_allclose(
         sample_texture(texture, uv, wrap, coarse), sample_texture(mip_levels(texture)[1], uv, wrap), atol=1e-12
     )
@@ -246,6 +277,26 @@ def test_a_checker_floor_is_nearer_to_its_average():
     assert np.sqrt(np.mean((finer - brute)[..., :3] ** 2)) < 0.6 * error[1]
 
 
+@pytest.mark.parametrize("degrees, most", [(0, 0.4), (60, 0.2), (75, 0.12), (80, 0.12)])
+def test_slanted_smooth_textures_are_nearer_to_their_average(degrees, most):
+    y, x = np.mgrid[:128, :128] / 128 * 2 * np.pi
+    texture = 0.5 + 0.25 * (np.cos(12 * x + 5 * y) + np.cos(9 * y - 4 * x))[..., None] * np.ones(3)
+    slope, reach = np.radians(degrees), 1.5 / np.cos(np.radians(degrees))
+    corners = np.array([(x, y * np.cos(slope), y * np.sin(slope)) for x, y in 2 * CORNERS * (1, reach) - (1, reach)])
+    theta = {"texture": texture, "uv": CORNERS * np.array([1, reach], np.float32)}
+    plane = mesh_part((corners.astype(np.float32), np.array([(0, 1, 2), (0, 2, 3)])), theta=theta)
+    camera, size = Camera.look_at((0, 0, 9), (0, 0, 0), fov_y=10), (32, 32)
+    brute = show(plane.replace(shader="textured"), camera, size, splatter="none", supersample=16)
+    inside = brute[..., 3] > 0.999
+    errors = [
+        np.sqrt(
+            np.mean((show(plane.replace(shader=Textured(mip=m)), camera, size, splatter="none") - brute)[inside] ** 2)
+        )
+        for m in (False, True)
+    ]
+    assert inside.sum() > 500 and errors[1] < most * errors[0], errors
+
+
 def test_a_texture_of_one_colour_stays_as_it_is():
     part = floor(np.full((7, 5, 3), 0.25, np.float32), (9, 30), shader=Textured(mip=True, wrap="mirror"))
     image = show(part, EYE, splatter="none")
@@ -257,9 +308,10 @@ def test_outlines_and_seams_of_uv_have_no_effect():
     seam = CORNERS[faces.reshape(-1)].copy()
     seam[3:] += 7  # The second triangle repeats the texture elsewhere.
     texture, indices = RNG.random((20, 24, 3)), {"uv": np.arange(6).reshape(2, 3)}
-    part = mesh_part((vertices, faces), theta={"texture": texture, "uv": seam}, indices=indices)
-    image = show(part.replace(shader=Textured(mip=True)), FRONT, splatter="none")
-    np.testing.assert_allclose(image[..., :3], texture, atol=1e-3)
+    cut = mesh_part((vertices, faces), theta={"texture": texture, "uv": seam}, indices=indices)
+    whole = mesh_part((vertices, faces), theta={"texture": texture, "uv": CORNERS})
+    one, two = (show(part.replace(shader=Textured(mip=True)), FRONT, splatter="none") for part in (cut, whole))
+    np.testing.assert_allclose(one, two, atol=1e-4)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

@@ -96,7 +96,7 @@ def test_even_light_from_all_around_is_the_integral_of_the_formulas(metallic, ro
     points, toward = ball(6)
     even = {"direction": np.array([0, 0, 1.0]), "color": np.zeros(3), "ambient": np.ones(3)}
     expected = sampled(points, toward, metallic, roughness, lambda light: 1.0, 8192)
-    np.testing.assert_allclose(shaded(points, metallic, roughness, even), expected, atol=2e-3)
+    np.testing.assert_allclose(shaded(points, metallic, roughness, even), expected, atol=1.2e-3)
 
 
 def sky():

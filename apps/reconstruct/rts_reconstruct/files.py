@@ -80,14 +80,15 @@ def _lit_already(tree: dict[str, Any]) -> None:
 
 
 def write_light(path: Path, model: Model) -> list[Path]:
-    """Write the factors of the model's light, with the names of their functions; a model without leaves no file."""
+    """Write the coefficients of the model's light, as θ["light"] has them; a model without leaves no file."""
     if model.light is None:
         path.unlink(missing_ok=True)  # Of an earlier run.
         return []
-    names = "1", "x", "y", "z", "xy", "yz", "zx", "x² - y²", "3z² - 1"
-    table = {name: [round(float(x), 5) for x in row] for name, row in zip(names, model.light, strict=True)}
-    about = "irradiance of a unit normal (x, y, z) in the world of the cameras: sum of functions times red, green, blue"
-    path.write_text(json.dumps({"about": about, "irradiance": table}, indent=1, ensure_ascii=False), encoding="utf-8")
+    rows = [[round(float(x), 5) for x in row] for row in model.light]
+    about = (
+        "theta['light'] of rts, in the world of the cameras: red, green, blue of real spherical harmonics of radiance"
+    )
+    path.write_text(json.dumps({"about": about, "sh": rows}, indent=1), encoding="utf-8")
     return [path]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,10 @@ import torch
 from scipy.spatial import KDTree
 
 import rts
+from rts.shading import irradiance as irradiance_of_harmonics
 
+EVEN = math.sqrt(4 * math.pi)
+"""The first coefficient of light of mean 1."""
 DARK = 0.05
 """The least irradiance, so that colours can be divided by it."""
 PAIRS, REACH, LEAST = 30_000, 0.2, 2.5
@@ -24,19 +28,13 @@ BLACK, WHITE = 0.05, 0.98
 
 
 def irradiance(normals: Any, light: Any) -> Any:
-    """The irradiance (N, 3) of surfaces with unit normals (N, 3), world space: spherical harmonics to the second order.
-
-    Source: Ramamoorthi and Hanrahan 2001, *An Efficient Representation for Irradiance Environment Maps*.
+    """The irradiance / π (N, 3), of `DARK` at least, of surfaces with unit normals (N, 3), world space.
 
     Args:
         normals: (N, 3).
-        light: (9, 3), factors of 1, x, y, z, xy, yz, zx, x² − y², 3z² − 1. All but the first have mean 0 over all
-            directions, so light whose first row is 1 has a mean irradiance of 1.
+        light: (9, 3), coefficients of radiance as in θ["light"]["sh"]; light whose first row is `EVEN` has a mean of 1.
     """
-    xp = rts.namespace(normals)
-    x, y, z = (normals[:, i] for i in range(3))
-    basis = xp.stack([xp.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], axis=1)
-    return xp.clip(basis @ light, DARK, None)
+    return rts.namespace(normals).clip(irradiance_of_harmonics(light, normals), DARK, None)
 
 
 class Lit(rts.Shader):
@@ -77,12 +75,12 @@ def fitted(points: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> np.nd
     way = torch.tensor(np.float32(normals))
 
     def residuals(p: Any) -> Any:
-        shade = torch.log(irradiance(way, torch.cat([torch.ones(1, 3), p["light"]])))
+        shade = torch.log(irradiance(way, torch.cat([torch.full((1, 3), EVEN), p["light"]])))
         return weights * (difference - (shade[first] - shade[second]))
 
     loss = rts.Loss("soft_l1", f_scale=SCALE)
     fit = rts.fit(residuals, {"light": torch.zeros(8, 3)}, method="lm", loss=loss, progress=False)
-    return np.concatenate([np.ones((1, 3), np.float32), fit.parameters["light"].numpy()])
+    return np.concatenate([np.full((1, 3), EVEN, np.float32), fit.parameters["light"].numpy()])
 
 
 def _pairs(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

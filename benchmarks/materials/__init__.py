@@ -1,0 +1,1 @@
+"""Materials and light beside Mitsuba's `principled`."""
