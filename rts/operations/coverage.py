@@ -1,0 +1,135 @@
+"""How much of a point is covered by the surfaces that lie in front of it in a picture: shadow maps with derivatives.
+
+A picture of depth is a grid of cells with a sample each. Cells in front of a point cover it with the weights of a cubic
+B-spline, which sum to one. The region that these cells fill has sides, from cell to cell. It changes as its sides
+move: each side moves with the sample of the surface in front there, and what happens inside has no effect.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+
+from rts.arrays.engines import namespace, stopped
+from rts.arrays.trees import Array
+from rts.errors import InputError
+from rts.operations.combine import combine
+from rts.operations.operation import Operation
+
+BIAS = 0.1
+"""How far in front of a point a cell must be, in changes of depth over a cell."""
+OWN = 0.5
+"""How far a point may be from the plane of a cell, in changes of depth over a cell, to lie on the same surface."""
+FAR = 1e30
+"""Depth of empty cells."""
+
+
+def coverage(table: Array, points: Array, planes: Array, row: Array) -> Array:
+    """The covered share of points (N, 1), 0 to 1, differentiable in table and points, to first order.
+
+    A cell is in front of a point if its plane is, and if it is in front of the plane of the point's own surface, where
+    some cell around shows that. So neither slopes nor edges of solids shade themselves.
+
+    Args:
+        table: (M, 2) x and y of samples in the picture, cells; with alpha, if the samples are not opaque, (M, 3).
+        points: (N, 3) x, y, and depth. Depth is of a kind that grows evenly on planes; it has no derivative.
+        planes: (H, W, 4) of the sample in each cell: depth, its slopes along x and y, and the depth of a cell's width.
+        row: (H, W) integers, the sample in each cell, or −1; at least 4 × 4.
+    """
+    return COVERAGE(table, points, planes, row)
+
+
+def cubic(d: Array) -> Array:
+    """The cubic B-spline at distances in cells."""
+    xp, d = namespace(d), abs(d)
+    tail = xp.clip(2 - d, 0.0, None)
+    return xp.where(d < 1, 2 / 3 - d * d * (1 - d / 2), tail * tail * tail / 6)
+
+
+def quadratic(d: Array) -> Array:
+    """The quadratic B-spline at distances in cells: how the share of a half-plane changes as its side moves."""
+    xp, d = namespace(d), abs(d)
+    tail = xp.clip(1.5 - d, 0.0, None)
+    return xp.where(d < 0.5, 0.75 - d * d, tail * tail / 2)
+
+
+def _specification(table: Array, points: Array, planes: Array, row: Array) -> Array:
+    xp, still, at = namespace(table), stopped(table), stopped(points)
+    (height, width), (x, y, depth) = row.shape, (at[:, i] for i in range(3))
+    corner = [xp.floor(xp.clip(c - 1.5, 0, n - 4)) for c, n in ((x, width), (y, height))]
+    dx, dy = ([c - k - (i + 0.5) for i in range(4)] for c, k in zip((x, y), corner, strict=True))
+    first = xp.astype(corner[1], row.dtype) * width + xp.astype(corner[0], row.dtype)
+    rows, planes = xp.reshape(row, (-1,)), xp.reshape(planes, (-1, 4))
+    cells, closest, own = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
+    for j, i in itertools.product(range(4), range(4)):
+        index = first + (j * width + i)
+        r, plane = xp.take(rows, index), xp.take(planes, index, axis=0)
+        z, a, b, unit = (plane[:, k] for k in range(4))
+        there, steep = r >= 0, unit + abs(a) + abs(b)
+        seen = xp.where(there, z + a * dx[i] + b * dy[j], FAR)
+        cells[j, i] = r, z, seen, there & (seen < depth - BIAS * steep)
+        off = xp.where(there, abs(seen - depth) / xp.where(there, steep, 1.0), FAR)
+        own = [xp.where(off < closest, new, old) for new, old in zip((a, b, steep), own, strict=True)]
+        closest = xp.where(off < closest, off, closest)
+    covers, ids, weights = {}, [], []
+    for (j, i), (r, z, _, front) in cells.items():
+        front = front & ((closest >= OWN) | (z < depth - own[0] * dx[i] - own[1] * dy[j] - BIAS * own[2]))
+        ids.append(xp.where(front, r, 0))
+        weights.append(xp.where(front, cubic(dx[i]) * cubic(dy[j]), 0.0))
+        alpha = xp.take(still[:, 2], ids[-1]) if table.shape[1] > 2 else xp.ones_like(x)
+        covers[j, i] = xp.where(front, alpha, 0.0)
+    covered = sum(w * covers[cell] for w, cell in zip(weights, covers, strict=True))
+    change = -combine((table - still)[:, 2:], *_stacked(ids, weights)) if table.shape[1] > 2 else 0.0
+    for axis, (across, along) in enumerate(((dx, dy), (dy, dx))):
+        ids, weights = [], []
+        for i, j in itertools.product(range(3), range(4)):
+            before, behind = ((j, i), (j, i + 1)) if axis == 0 else ((i, j), (i + 1, j))
+            nearer = cells[before][2] < cells[behind][2]
+            ids.append(xp.clip(xp.where(nearer, cells[before][0], cells[behind][0]), 0, None))
+            jump = covers[before] - covers[behind]
+            weights.append(jump * quadratic(across[i] - 0.5) * cubic(along[j]))
+        moved = (points - at)[:, axis : axis + 1] * sum(weights)[:, None]
+        change = change + moved - combine((table - still)[:, axis : axis + 1], *_stacked(ids, weights))
+    return xp.clip(covered, 0.0, 1.0)[:, None] - change
+
+
+def _stacked(ids: list[Array], weights: list[Array]) -> tuple[Array, Array]:
+    """Columns as arrays (N, I)."""
+    xp = namespace(ids[0])
+    return xp.stack(ids, axis=1), xp.stack(weights, axis=1)
+
+
+def _shape(table: tuple[int, ...], points: tuple[int, ...], planes: tuple[int, ...], row: tuple) -> tuple[int, int]:
+    return points[0], 1
+
+
+def _check(table: np.ndarray, points: np.ndarray, planes: np.ndarray, row: np.ndarray) -> None:
+    """Refuse arrays of other shapes, and cells whose sample is no row of the table."""
+    if table.shape[1] not in (2, 3) or points.shape[1] != 3 or planes.shape != (*row.shape, 4) or min(row.shape) < 4:
+        shapes = ", ".join(str(x.shape) for x in (table, points, planes, row))
+        raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
+    if row.max() >= len(table):
+        raise InputError(f"a picture has a cell with sample {row.max()} of {len(table)}; expected an index of a row")
+
+
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts.operations import coverage_loops as loops
+
+    return loops.forward, loops.push, loops.pull
+
+
+COVERAGE = Operation.of_loops(
+    "rts.coverage",
+    _specification,
+    (2, 2, 3, 2),
+    _shape,
+    _loops,
+    _check,
+    differentiable=2,
+    packed=(1,),
+    packed_result=True,
+    keeps=True,
+)
+"""The operation of `coverage`."""
