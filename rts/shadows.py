@@ -13,7 +13,7 @@ import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, quoted
 from rts.arrays.array_functions import from_numbers, promote, shape_of, unit
-from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
+from rts.arrays.engines import constants, engine_of, namespace, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checks import check_size
 from rts.errors import InputError
@@ -24,7 +24,7 @@ from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.default_camera import MARGIN, Bounds, bounds_of
 from rts.scene.parts import Part
-from rts.shading.visibility import REACH, Picture, Seen, planes_of, visibility
+from rts.shading.visibility import Picture, Seen, picture_of, visibility
 
 __all__ = ["Seen", "seen_from", "visibility", "with_shadows"]
 
@@ -83,17 +83,15 @@ def _picture(
     )
     scene = Scene.of(parts, camera, sampler, engine).at(size)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, scene.context)
-    xp, row, still = namespace(splats.positions), splats.row, stopped(splats.positions)
     own: Camera = constants(scene.camera, engine_of(splats.positions), splats.positions)
-    there, translucent = row >= 0, not all(part.shader.opaque for part in scene.parts)
-    depth = xp.zeros_like(still[:1, 2])
-    depth = xp.take(xp.concat([depth, still[:, 2]]), xp.reshape(row + 1, (-1,)))
-    depth = xp.reshape(depth, row.shape)
-    count = xp.sum(xp.astype(there, depth.dtype))
-    middle = xp.where(count > 0, xp.sum(depth) / xp.where(count > 0, count, 1.0), 1.0)
-    planes = planes_of(depth, there, stopped(own), middle, size)
-    columns = [splats.positions[:, :2], splats.rgba[:, -1:]] if translucent else [splats.positions[:, :2]]
-    return Picture(own, xp.concat(columns, axis=1), planes, row, middle, size)
+    positions, rgba = (_at_least_one(x) for x in (splats.positions, splats.rgba))
+    opaque = all(part.shader.opaque for part in scene.parts)
+    return picture_of(positions, None if opaque else rgba[:, -1:], splats.row, own, size)
+
+
+def _at_least_one(rows: Array) -> Array:
+    """The rows (M, C), or a row of zeros if there are none."""
+    return rows if rows.shape[0] else constants(np.zeros((1, rows.shape[1])), engine_of(rows), rows)
 
 
 def _without_shadow(part: Part) -> Part:

@@ -10,11 +10,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 
-import numpy as np
-
 from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array
-from rts.errors import InputError
 from rts.operations.combine import combine
 from rts.operations.operation import Operation
 
@@ -26,19 +23,20 @@ FAR = 1e30
 """Depth of empty cells."""
 
 
-def coverage(table: Array, points: Array, planes: Array, row: Array) -> Array:
-    """The covered share of points (N, 1), 0 to 1, differentiable in table and points, to first order.
+def coverage(cells: Array, points: Array, planes: Array) -> Array:
+    """The covered share of points (N, 1), 0 to 1, differentiable in cells and points, to first order.
 
     A cell is in front of a point if its plane is, and if it is in front of the plane of the point's own surface, where
     some cell around shows that. So neither slopes nor edges of solids shade themselves.
 
     Args:
-        table: (M, 2) x and y of samples in the picture, cells; with alpha, if the samples are not opaque, (M, 3).
+        cells: (H · W, 4) the motions of the left, right, upper and lower side of each cell, of which only derivatives
+            count; with alpha, if the samples are not opaque, (H · W, 5).
         points: (N, 3) x, y, and depth. Depth is of a kind that grows evenly on planes; it has no derivative.
-        planes: (H, W, 4) of the sample in each cell: depth, its slopes along x and y, and the depth of a cell's width.
-        row: (H, W) integers, the sample in each cell, or −1; at least 4 × 4.
+        planes: (H, W, 4) of the sample in each cell: depth, its slopes along x and y, and the depth of a cell's width,
+            0 where there is no sample; at least 4 × 4.
     """
-    return COVERAGE(table, points, planes, row)
+    return COVERAGE(cells, points, planes)
 
 
 def cubic(d: Array) -> Array:
@@ -55,44 +53,48 @@ def quadratic(d: Array) -> Array:
     return xp.where(d < 0.5, 0.75 - d * d, tail * tail / 2)
 
 
-def _specification(table: Array, points: Array, planes: Array, row: Array) -> Array:
-    xp, still, at = namespace(table), stopped(table), stopped(points)
-    (height, width), (x, y, depth) = row.shape, (at[:, i] for i in range(3))
+def _specification(cells: Array, points: Array, planes: Array) -> Array:
+    xp, at, translucent = namespace(cells), stopped(points), cells.shape[1] > 4
+    (height, width), (x, y, depth) = planes.shape[:2], (at[:, i] for i in range(3))
     corner = [xp.floor(xp.clip(c - 1.5, 0, n - 4)) for c, n in ((x, width), (y, height))]
     dx, dy = ([c - k - (i + 0.5) for i in range(4)] for c, k in zip((x, y), corner, strict=True))
-    first = xp.astype(corner[1], row.dtype) * width + xp.astype(corner[0], row.dtype)
-    rows, planes = xp.reshape(row, (-1,)), xp.reshape(planes, (-1, 4))
-    cells, closest, own = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
+    first = xp.astype(corner[1], xp.int32) * width + xp.astype(corner[0], xp.int32)
+    flat, alphas = xp.reshape(planes, (-1, 4)), stopped(cells)[:, 4] if translucent else None
+    around, closest, own = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
     for j, i in itertools.product(range(4), range(4)):
         index = first + (j * width + i)
-        r, plane = xp.take(rows, index), xp.take(planes, index, axis=0)
+        plane = xp.take(flat, index, axis=0)
         z, a, b, unit = (plane[:, k] for k in range(4))
-        there, steep = r >= 0, unit + abs(a) + abs(b)
+        there, steep = unit > 0, unit + abs(a) + abs(b)
         seen = xp.where(there, z + a * dx[i] + b * dy[j], FAR)
-        cells[j, i] = r, z, seen, there & (seen < depth - BIAS * steep)
+        around[j, i] = index, z, seen, there & (seen < depth - BIAS * steep)
         off = xp.where(there, abs(seen - depth) / xp.where(there, steep, 1.0), FAR)
         own = [xp.where(off < closest, new, old) for new, old in zip((a, b, steep), own, strict=True)]
         closest = xp.where(off < closest, off, closest)
-    covers, ids, weights = {}, [], []
-    for (j, i), (r, z, _, front) in cells.items():
+    covers, weights = {}, {}
+    for (j, i), (index, z, _, front) in around.items():
         front = front & ((closest >= OWN) | (z < depth - own[0] * dx[i] - own[1] * dy[j] - BIAS * own[2]))
-        ids.append(xp.where(front, r, 0))
-        weights.append(xp.where(front, cubic(dx[i]) * cubic(dy[j]), 0.0))
-        alpha = xp.take(still[:, 2], ids[-1]) if table.shape[1] > 2 else xp.ones_like(x)
+        weights[j, i] = xp.where(front, cubic(dx[i]) * cubic(dy[j]), 0.0)
+        alpha = xp.ones_like(x) if alphas is None else xp.take(alphas, index)
         covers[j, i] = xp.where(front, alpha, 0.0)
-    covered = sum(w * covers[cell] for w, cell in zip(weights, covers, strict=True))
-    change = -combine((table - still)[:, 2:], *_stacked(ids, weights)) if table.shape[1] > 2 else 0.0
+    covered = sum(weights[cell] * covers[cell] for cell in covers)
+    change = xp.zeros_like(covered)[:, None]
+    if translucent:
+        alphas = cells[:, 4:] - stopped(cells[:, 4:])
+        change = combine(alphas, *_stacked([index for index, *_ in around.values()], [*weights.values()]))
+    sides = xp.reshape(cells[:, :4] - stopped(cells[:, :4]), (-1, 1))
     for axis, (across, along) in enumerate(((dx, dy), (dy, dx))):
-        ids, weights = [], []
+        ids, flows = [], []
         for i, j in itertools.product(range(3), range(4)):
             before, behind = ((j, i), (j, i + 1)) if axis == 0 else ((i, j), (i + 1, j))
-            nearer = cells[before][2] < cells[behind][2]
-            ids.append(xp.clip(xp.where(nearer, cells[before][0], cells[behind][0]), 0, None))
+            nearer = around[before][2] < around[behind][2]
+            # The side at the end of the cell before, or at the start of the cell behind.
+            ids.append(xp.where(nearer, 4 * around[before][0] + 1, 4 * around[behind][0]) + 2 * axis)
             jump = covers[before] - covers[behind]
-            weights.append(jump * quadratic(across[i] - 0.5) * cubic(along[j]))
-        moved = (points - at)[:, axis : axis + 1] * sum(weights)[:, None]
-        change = change + moved - combine((table - still)[:, axis : axis + 1], *_stacked(ids, weights))
-    return xp.clip(covered, 0.0, 1.0)[:, None] - change
+            flows.append(jump * quadratic(across[i] - 0.5) * cubic(along[j]))
+        moved = (points - at)[:, axis : axis + 1] * sum(flows)[:, None]
+        change = change - moved + combine(sides, *_stacked(ids, flows))
+    return xp.clip(covered, 0.0, 1.0)[:, None] + change
 
 
 def _stacked(ids: list[Array], weights: list[Array]) -> tuple[Array, Array]:
@@ -101,17 +103,8 @@ def _stacked(ids: list[Array], weights: list[Array]) -> tuple[Array, Array]:
     return xp.stack(ids, axis=1), xp.stack(weights, axis=1)
 
 
-def _shape(table: tuple[int, ...], points: tuple[int, ...], planes: tuple[int, ...], row: tuple) -> tuple[int, int]:
+def _shape(cells: tuple[int, ...], points: tuple[int, ...], planes: tuple[int, ...]) -> tuple[int, int]:
     return points[0], 1
-
-
-def _check(table: np.ndarray, points: np.ndarray, planes: np.ndarray, row: np.ndarray) -> None:
-    """Refuse arrays of other shapes, and cells whose sample is no row of the table."""
-    if table.shape[1] not in (2, 3) or points.shape[1] != 3 or planes.shape != (*row.shape, 4) or min(row.shape) < 4:
-        shapes = ", ".join(str(x.shape) for x in (table, points, planes, row))
-        raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
-    if row.max() >= len(table):
-        raise InputError(f"a picture has a cell with sample {row.max()} of {len(table)}; expected an index of a row")
 
 
 def _loops() -> tuple[Callable, Callable, Callable]:
@@ -123,10 +116,9 @@ def _loops() -> tuple[Callable, Callable, Callable]:
 COVERAGE = Operation.of_loops(
     "rts.coverage",
     _specification,
-    (2, 2, 3, 2),
+    (2, 2, 3),
     _shape,
     _loops,
-    _check,
     differentiable=2,
     packed=(1,),
     packed_result=True,

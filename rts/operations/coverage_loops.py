@@ -11,54 +11,63 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
+from rts.errors import InputError
 from rts.operations.coverage import BIAS, FAR, OWN
 
 WORK = 400
 """Nanoseconds for a point, roughly."""
 
 
-def forward(table: np.ndarray, points: np.ndarray, planes: np.ndarray, row: np.ndarray, out: np.ndarray) -> np.ndarray:
+def forward(cells: np.ndarray, points: np.ndarray, planes: np.ndarray, out: np.ndarray) -> np.ndarray:
     """Fill `out` (N, 1) with the covered shares. Returns (N,) bool, true where the derivative may not be zero."""
+    _check(cells, points, planes)
     kept = np.empty(len(points), np.bool_)
-    parallel(_forward, len(points), table, points, planes, row, out, kept, work=WORK * len(points))
+    parallel(_forward, len(points), cells, points, planes, out, kept, work=WORK * len(points))
     return kept
 
 
 def push(
-    table: np.ndarray,
+    cells: np.ndarray,
     points: np.ndarray,
     planes: np.ndarray,
-    row: np.ndarray,
-    t_table: np.ndarray | None,
+    t_cells: np.ndarray | None,
     t_points: np.ndarray | None,
     out: np.ndarray,
     *,
     kept: np.ndarray | None,
 ) -> None:
-    """Fill `out` (N, 1) with the derivative along `t_table` and `t_points`, each None if zero."""
+    """Fill `out` (N, 1) with the derivative along `t_cells` and `t_points`, each None if zero."""
     kept = np.ones(len(points), np.bool_) if kept is None else kept
-    t_table = np.zeros_like(table) if t_table is None else t_table
+    t_cells = np.zeros_like(cells) if t_cells is None else t_cells
     t_points = np.zeros_like(points) if t_points is None else t_points
     work = WORK * len(points) // 4
-    parallel(_push, len(points), table, points, planes, row, t_table, t_points, kept, out, work=work)
+    parallel(_push, len(points), cells, points, planes, t_cells, t_points, kept, out, work=work)
 
 
 def pull(
-    table: np.ndarray,
+    cells: np.ndarray,
     points: np.ndarray,
     planes: np.ndarray,
-    row: np.ndarray,
     g: np.ndarray,
-    g_table: np.ndarray | None,
+    g_cells: np.ndarray | None,
     g_points: np.ndarray | None,
     *,
     kept: np.ndarray | None,
 ) -> None:
-    """Add to `g_table` and `g_points` the gradients, from `g` (N, 1) of the result, each unless None."""
+    """Add to `g_cells` and `g_points` the gradients, from `g` (N, 1) of the result, each unless None."""
     kept = np.ones(len(points), np.bool_) if kept is None else kept
-    g_table = np.zeros_like(table) if g_table is None else g_table
+    g_cells = np.zeros_like(cells) if g_cells is None else g_cells
     g_points = np.zeros_like(points) if g_points is None else g_points
-    _pull(table, points, planes, row, g, g_table, g_points, kept)
+    _pull(cells, points, planes, g, g_cells, g_points, kept)
+
+
+def _check(cells: np.ndarray, points: np.ndarray, planes: np.ndarray) -> None:
+    """Refuse arrays of other shapes."""
+    height, width, channels = planes.shape
+    fits = cells.shape[0] == height * width and cells.shape[1] in (4, 5) and points.shape[1] == 3
+    if not fits or channels != 4 or min(height, width) < 4:
+        shapes = ", ".join(str(x.shape) for x in (cells, points, planes))
+        raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
 
 
 @compiled
@@ -86,18 +95,17 @@ def _corner(x, n):
 
 
 @compiled
-def _look(table, x, y, depth, planes, row, covers, depths, samples, fronts):
+def _look(cells, x, y, depth, planes, covers, depths, fronts):
     """Fill tables (4, 4) of the cells around a point; True if some cell is in front of it."""
-    height, width = row.shape
+    height, width = planes.shape[:2]
     top, left = _corner(y, height), _corner(x, width)
     closest, own_a, own_b, own_steep, some = OWN, 0.0, 0.0, 0.0, False
     for j in range(4):
         for i in range(4):
-            r = row[top + j, left + i]
-            samples[j, i], covers[j, i], depths[j, i], fronts[j, i] = r, 0, FAR, False
-            if r < 0:
-                continue
             plane = planes[top + j, left + i]
+            covers[j, i], depths[j, i], fronts[j, i] = 0, FAR, False
+            if plane[3] == 0:
+                continue
             a, b = float(plane[1]), float(plane[2])
             steep = plane[3] + abs(a) + abs(b)
             seen = plane[0] + a * (x - (left + i + 0.5)) + b * (y - (top + j + 0.5))
@@ -120,38 +128,40 @@ def _look(table, x, y, depth, planes, row, covers, depths, samples, fronts):
                 fronts[j, i] = False
                 continue
             some = True
-            covers[j, i] = table[samples[j, i], 2] if table.shape[1] > 2 else 1
+            covers[j, i] = cells[(top + j) * width + left + i, 4] if cells.shape[1] > 4 else 1
     return some
 
 
 @compiled
 def _tables():
     """Room for `_look`."""
-    return np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4), np.int64), np.empty((4, 4), np.bool_)
+    return np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4), np.bool_)
 
 
 @compiled
-def _side(covers, depths, samples, axis, i, j):
-    """The side behind cell i along an axis, in line j: how much less is covered behind it, and the nearer sample."""
-    if axis == 0:
-        a, b, c, d = j, i, j, i + 1
-    else:
-        a, b, c, d = i, j, i + 1, j
-    nearer = samples[a, b] if depths[a, b] < depths[c, d] else samples[c, d]
-    return covers[a, b] - covers[c, d], nearer
+def _side(covers, depths, first, width, axis, i, j):
+    """The side behind cell i along an axis, in line j: how much less is covered behind it; the nearer cell; its side.
+
+    `first` is the index of the first of the 4 × 4 cells.
+    """
+    a, b, c, d = (j, i, j, i + 1) if axis == 0 else (i, j, i + 1, j)
+    jump = covers[a, b] - covers[c, d]
+    if depths[a, b] < depths[c, d]:
+        return jump, first + a * width + b, 2 * axis + 1
+    return jump, first + c * width + d, 2 * axis
 
 
 @loop
-def _forward(start, stop, table, points, planes, row, out, kept):
-    covers, depths, samples, fronts = _tables()
-    height, width = row.shape
+def _forward(start, stop, cells, points, planes, out, kept):
+    covers, depths, fronts = _tables()
+    height, width = planes.shape[:2]
     for n in range(start, stop):
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
         out[n, 0], kept[n] = 0, False
-        if not _look(table, x, y, depth, planes, row, covers, depths, samples, fronts):
+        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
         top, left, total = _corner(y, height), _corner(x, width), 0.0
-        kept[n] = table.shape[1] > 2
+        kept[n] = cells.shape[1] > 4
         for j in range(4):
             weight = _cubic(y - (top + j + 0.5))
             for i in range(4):
@@ -161,15 +171,15 @@ def _forward(start, stop, table, points, planes, row, out, kept):
 
 
 @loop
-def _push(start, stop, table, points, planes, row, t_table, t_points, kept, out):
-    covers, depths, samples, fronts = _tables()
-    height, width = row.shape
+def _push(start, stop, cells, points, planes, t_cells, t_points, kept, out):
+    covers, depths, fronts = _tables()
+    height, width = planes.shape[:2]
     for n in range(start, stop):
         out[n, 0] = 0
         if not kept[n]:
             continue
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
-        if not _look(table, x, y, depth, planes, row, covers, depths, samples, fronts):
+        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
         top, left, total = _corner(y, height), _corner(x, width), 0.0
         for axis in range(2):
@@ -177,28 +187,28 @@ def _push(start, stop, table, points, planes, row, t_table, t_points, kept, out)
             for i in range(3):
                 weight = _quadratic(across - (i + 1))
                 for j in range(4):
-                    jump, nearer = _side(covers, depths, samples, axis, i, j)
+                    jump, nearer, side = _side(covers, depths, top * width + left, width, axis, i, j)
                     if jump != 0:
-                        moved = t_table[nearer, axis] - t_points[n, axis]
+                        moved = t_cells[nearer, side] - t_points[n, axis]
                         total += jump * weight * _cubic(along - (j + 0.5)) * moved
-        if table.shape[1] > 2:
+        if cells.shape[1] > 4:
             for j in range(4):
                 for i in range(4):
                     if fronts[j, i]:
                         weight = _cubic(y - (top + j + 0.5)) * _cubic(x - (left + i + 0.5))
-                        total += weight * t_table[samples[j, i], 2]
+                        total += weight * t_cells[(top + j) * width + left + i, 4]
         out[n, 0] = total
 
 
 @loop
-def _pull(table, points, planes, row, g, g_table, g_points, kept):
-    covers, depths, samples, fronts = _tables()
-    height, width = row.shape
+def _pull(cells, points, planes, g, g_cells, g_points, kept):
+    covers, depths, fronts = _tables()
+    height, width = planes.shape[:2]
     for n in range(len(points)):
         if not kept[n] or g[n, 0] == 0:
             continue
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
-        if not _look(table, x, y, depth, planes, row, covers, depths, samples, fronts):
+        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
         top, left = _corner(y, height), _corner(x, width)
         for axis in range(2):
@@ -206,14 +216,14 @@ def _pull(table, points, planes, row, g, g_table, g_points, kept):
             for i in range(3):
                 weight = _quadratic(across - (i + 1)) * g[n, 0]
                 for j in range(4):
-                    jump, nearer = _side(covers, depths, samples, axis, i, j)
+                    jump, nearer, side = _side(covers, depths, top * width + left, width, axis, i, j)
                     if jump != 0:
                         change = jump * weight * _cubic(along - (j + 0.5))
-                        g_table[nearer, axis] += change
+                        g_cells[nearer, side] += change
                         g_points[n, axis] -= change
-        if table.shape[1] > 2:
+        if cells.shape[1] > 4:
             for j in range(4):
                 for i in range(4):
                     if fronts[j, i]:
                         weight = _cubic(y - (top + j + 0.5)) * _cubic(x - (left + i + 0.5))
-                        g_table[samples[j, i], 2] += weight * g[n, 0]
+                        g_cells[(top + j) * width + left + i, 4] += weight * g[n, 0]

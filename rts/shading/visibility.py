@@ -14,30 +14,30 @@ from rts.arrays.engines import context_of, namespace, stopped
 from rts.arrays.trees import Array, record
 from rts.errors import InputError
 from rts.operations.coverage import coverage
+from rts.operations.take import take
 from rts.scene.camera import Camera
 
 REACH = 2
 """Cells around a picture that `visibility` reads."""
+RIM = 1.2
+"""How many times as much depth rises in the last step before a smooth rim as in the step before, at least."""
 
 
 @record(static=("size",))
 class Picture:
-    """The samples that a camera sees in front, and their planes.
+    """The samples that a camera sees in front, and their planes; with `REACH` cells around the picture.
 
     Attributes:
-        camera: the camera.
-        table: (M, 2) x and y of samples, in cells from the corner of the rows; with alpha (M, 3) where samples may be
-            translucent. Differentiable.
-        planes: (K, H, W, 4), see `rts.operations.coverage`.
-        row: (K, H, W) int32, the sample of each cell and layer, or −1; with `REACH` cells around the picture.
+        camera: the camera. Differentiable.
+        cells: (K, H · W, 4 or 5), see `rts.operations.coverage`, of K layers. Differentiable.
+        planes: (K, H, W, 4), likewise.
         middle: () a depth of the scene's, from which depths are counted.
         size: (height, width) of the picture.
     """
 
     camera: Camera
-    table: Array
+    cells: Array
     planes: Array
-    row: Array
     middle: Array
     size: tuple[int, int]
 
@@ -92,31 +92,88 @@ def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
     return (sum(visibility(one, points, outside=1.0) for one in records) / len(records))[:, None]
 
 
-def planes_of(depth: Array, there: Array, camera: Camera, middle: Array, size: tuple[int, int]) -> Array:
-    """The planes (K, H, W, 4) of cells, see `rts.operations.coverage`: slopes are those of the same surface beside.
+def picture_of(positions: Array, alpha: Array | None, row: Array, camera: Camera, size: tuple[int, int]) -> Picture:
+    """The picture of samples in their cells.
 
     Args:
-        depth: (K, H, W) linear depth, without derivative.
-        there: (K, H, W) bool, true where a cell has a sample.
-        camera: the camera, without derivative.
-        middle: () a depth of the scene's.
-        size: (height, width) of the camera's picture, cells.
+        positions: (M, 3) x, y and depth of samples; differentiable.
+        alpha: (M, 1) of samples, or None if they are opaque; differentiable.
+        row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
+        camera: the camera, in arrays of the positions' engine; differentiable.
+        size: (height, width) of the picture.
     """
-    xp, p = namespace(depth), camera.projection
-    depth = xp.where(there, depth, middle)
-    even, w = even_depth(depth, camera, middle), _clip_w(depth, camera)
+    xp, there, still = namespace(positions), row >= 0, stopped(camera)
+    moving = _in_cells(positions[:, :2], row)
+    depth = stopped(_in_cells(positions[:, 2:], row))[..., 0]
+    count = xp.sum(xp.astype(there, depth.dtype))
+    middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
+    even, unit = _even_depths(xp.where(there, depth, middle), still, middle, size)
+    slopes, sides = [], []
+    for axis in (0, 1):
+        rise = _Rise(even, there, 2 - axis)
+        slopes.append(rise.slope(unit))
+        moved = moving[..., axis] - stopped(moving[..., axis])
+        sides += [moved + rise.beyond(unit, end) * (moved - xp.roll(moved, end, axis=2 - axis)) for end in (-1, 1)]
+    planes = xp.stack([even, *slopes, xp.where(there, unit, 0.0)], axis=-1)
+    columns = sides if alpha is None else [*sides, _in_cells(alpha, row)[..., 0]]
+    cells = xp.reshape(xp.stack(columns, axis=-1), (row.shape[0], -1, len(columns)))
+    return Picture(camera, cells, planes, middle, size)
+
+
+def _in_cells(values: Array, row: Array) -> Array:
+    """Values (M, C) of samples as (K, H, W, C); of some sample where a cell has none."""
+    xp = namespace(values)
+    return xp.reshape(take(values, xp.reshape(xp.clip(row, 0, None), (-1,))), (*row.shape, values.shape[1]))
+
+
+class _Rise:
+    """How depth rises from cell to cell along an axis.
+
+    Args:
+        even: (K, H, W) depth, of a kind that grows evenly on planes.
+        there: (K, H, W) bool, true where a cell has a sample.
+        axis: the axis of the arrays.
+    """
+
+    def __init__(self, even: Array, there: Array, axis: int):
+        self._xp, self._axis = namespace(even), axis
+        self._ahead, self._is_ahead = self._at(even, 1) - even, there & self._at(there, 1)
+        self._back, self._is_back = self._at(self._ahead, -1), self._at(self._is_ahead, -1)
+
+    def _at(self, x: Array, steps: int) -> Array:
+        """The array at the cell so many steps ahead."""
+        return self._xp.roll(x, -steps, axis=self._axis)
+
+    def slope(self, unit: Array) -> Array:
+        """The slope of the surface in each cell; where one side shows another surface, that of the other side."""
+        xp, a, b = self._xp, self._ahead, self._back
+        smooth, smaller = abs(a - b) <= unit + xp.minimum(abs(a), abs(b)), xp.where(abs(a) < abs(b), a, b)
+        # Of something thin both sides show another surface.
+        thin = (a * b < 0) & (2 * abs(smaller) > xp.maximum(abs(a), abs(b)))
+        both = xp.where(smooth, (a + b) / 2, xp.where(thin, 0.0, smaller))
+        return xp.where(self._is_ahead & self._is_back, both, xp.where(self._is_ahead, a, xp.where(self._is_back, b, 0.0)))
+
+    def beyond(self, unit: Array, end: int) -> Array:
+        """How many cells beyond the centre the side at an end lies, −1 or 1, to extrapolate motions from within.
+
+        On a smooth rim motions change with the root of the distance from the outline, as depths do.
+        """
+        xp = self._xp
+        first, known = (-self._ahead, self._is_ahead) if end < 0 else (self._back, self._is_back)
+        second, is_second = self._at(first, -end), self._at(known, -end)
+        joined = known & is_second & (abs(first - second) <= unit + 3 * abs(second))
+        rim = (second > 0) & (first > RIM * second) & (first > unit / 2)
+        growth = xp.where(rim, first / xp.where(rim, second, 1.0), 2.0)
+        # e ahead of the outline depths rise as √(e + 1) − √e; this is √e over that, nearly.
+        at_rim = xp.clip(1 / (growth - 1) - 0.7071, 0.0, None)
+        return xp.where(joined, xp.where(rim, at_rim, 0.5), 0.0)
+
+
+def _even_depths(depth: Array, camera: Camera, middle: Array, size: tuple[int, int]) -> tuple[Array, Array]:
+    """`even_depth` of depths, and the even depth of a cell's width there."""
+    p, xp = camera.projection, namespace(depth)
     width = 2 / xp.sqrt(size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
-    unit = width * _clip_w(middle, camera) / w
-    slopes = []
-    for axis in (2, 1):
-        rise = xp.roll(even, -1, axis=axis) - even
-        behind = there & xp.roll(there, -1, axis=axis)
-        fall, before = xp.roll(rise, 1, axis=axis), xp.roll(behind, 1, axis=axis)
-        gentle, steep = xp.minimum(abs(rise), abs(fall)), abs(rise - fall)
-        smaller = xp.where(abs(rise) < abs(fall), rise, fall)
-        both = xp.where(steep <= unit + gentle, (rise + fall) / 2, xp.where(rise * fall > 0, smaller, 0.0))
-        slopes.append(xp.where(behind & before, both, xp.where(behind, rise, xp.where(before, fall, 0.0))))
-    return xp.stack([even, *slopes, unit], axis=-1)
+    return even_depth(depth, camera, middle), width * _clip_w(middle, camera) / _clip_w(depth, camera)
 
 
 def even_depth(depth: Array, camera: Camera, middle: Array) -> Array:
@@ -137,12 +194,10 @@ def _of_picture(picture: Picture, points: Array) -> tuple[Array, Array]:
     inside = (still[:, 0] >= 0) & (still[:, 0] <= width) & (still[:, 1] >= 0) & (still[:, 1] <= height)
     inside = inside & (depth >= near)
     share = xp.ones_like(depth)
-    if picture.table.shape[0] == 0:
-        return share, inside
     even = even_depth(xp.where(inside, depth, picture.middle), camera, picture.middle)
     placed = xp.where(inside[:, None], placed[:, :2], 0.0) + REACH
-    placed = xp.astype(xp.concat([placed, even[:, None]], axis=1), picture.table.dtype, copy=False)
-    for layer in range(picture.row.shape[0]):
-        hidden = coverage(picture.table, placed, picture.planes[layer, ...], picture.row[layer, ...])
+    placed = xp.astype(xp.concat([placed, even[:, None]], axis=1), picture.cells.dtype, copy=False)
+    for layer in range(picture.cells.shape[0]):
+        hidden = coverage(picture.cells[layer, ...], placed, picture.planes[layer, ...])
         share = share * (1 - hidden[:, 0])
     return xp.where(inside, share, 1.0), inside
