@@ -13,10 +13,11 @@ import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, quoted
 from rts.arrays.array_functions import from_numbers, promote, shape_of, unit
-from rts.arrays.engines import constants, engine_of, namespace, uncompiled, value_of
+from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves
 from rts.contracts.checks import check_size
 from rts.errors import InputError
+from rts.operations.take import take
 from rts.rendering.arguments import Layers, SamplerLike
 from rts.rendering.samples import sample
 from rts.rendering.splats import to_splats
@@ -82,16 +83,24 @@ def _picture(
         parts, camera, size, sampler=sampler, splatter=None, layers=layers, capacity=capacity, engine=engine
     )
     scene = Scene.of(parts, camera, sampler, engine).at(size)
-    splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, scene.context)
-    own: Camera = constants(scene.camera, engine_of(splats.positions), splats.positions)
-    positions, rgba = (_at_least_one(x) for x in (splats.positions, splats.rgba))
-    opaque = all(part.shader.opaque for part in scene.parts)
-    return picture_of(positions, None if opaque else rgba[:, -1:], splats.row, own, size)
+    opaque, context = all(scene.opaque), scene.context
+    if opaque and sampled.depth is not None and not context.engine.differentiates:
+        depth, row, own = context.constants((sampled.depth, sampled.row, scene.camera))
+        return picture_of(depth, None, None, row, own, size)
+    splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
+    own = constants(scene.camera, engine_of(splats.positions), splats.positions)
+    positions, rgba = (_in_cells(x, splats.row) for x in (splats.positions, splats.rgba))
+    return picture_of(
+        stopped(positions[..., 2]), positions[..., :2], None if opaque else rgba[..., -1:], splats.row, own, size
+    )
 
 
-def _at_least_one(rows: Array) -> Array:
-    """The rows (M, C), or a row of zeros if there are none."""
-    return rows if rows.shape[0] else constants(np.zeros((1, rows.shape[1])), engine_of(rows), rows)
+def _in_cells(values: Array, row: Array) -> Array:
+    """Values (M, C) of samples as (K, H, W, C); of some sample, or zero, where a cell has none."""
+    if not values.shape[0]:
+        values = constants(np.zeros((1, values.shape[1])), engine_of(values), values)
+    xp = namespace(values)
+    return xp.reshape(take(values, xp.reshape(xp.clip(row, 0, None), (-1,))), (*row.shape, values.shape[1]))
 
 
 def _without_shadow(part: Part) -> Part:
@@ -137,7 +146,9 @@ def with_shadows(
     if not isinstance(light, Mapping) or not ("direction" in light or "position" in light):
         raise InputError(f"light is {quoted(light)}; expected a dict with the 'direction' or 'position' of a light")
     if "color" in light and "direction" not in light:
-        raise InputError("light has a 'color' of distant lights, but no 'direction'; give both: shadows need to know it")
+        raise InputError(
+            "light has a 'color' of distant lights, but no 'direction'; give both: shadows need to know it"
+        )
     sphere = _sphere(part_list, bounds)
     cameras = [[_distant_camera(d, sphere)] for d in _vectors(light, "direction")]
     cameras += [_point_cameras(p, sphere) for p in _vectors(light, "position")]

@@ -14,7 +14,6 @@ from rts.arrays.engines import context_of, namespace, stopped
 from rts.arrays.trees import Array, record
 from rts.errors import InputError
 from rts.operations.coverage import coverage
-from rts.operations.take import take
 from rts.scene.camera import Camera
 
 REACH = 2
@@ -92,19 +91,20 @@ def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
     return (sum(visibility(one, points, outside=1.0) for one in records) / len(records))[:, None]
 
 
-def picture_of(positions: Array, alpha: Array | None, row: Array, camera: Camera, size: tuple[int, int]) -> Picture:
+def picture_of(
+    depth: Array, moving: Array | None, alpha: Array | None, row: Array, camera: Camera, size: tuple[int, int]
+) -> Picture:
     """The picture of samples in their cells.
 
     Args:
-        positions: (M, 3) x, y and depth of samples; differentiable.
-        alpha: (M, 1) of samples, or None if they are opaque; differentiable.
+        depth: (K, H, W) linear depth, without derivative; anything where a cell has no sample.
+        moving: (K, H, W, 2) x and y of samples, of which only derivatives count; None if nothing moves.
+        alpha: (K, H, W, 1) of samples, differentiable; None if they are opaque.
         row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
-        camera: the camera, in arrays of the positions' engine; differentiable.
+        camera: the camera, in arrays of the engine; differentiable.
         size: (height, width) of the picture.
     """
-    xp, there, still = namespace(positions), row >= 0, stopped(camera)
-    moving = _in_cells(positions[:, :2], row)
-    depth = stopped(_in_cells(positions[:, 2:], row))[..., 0]
+    xp, there, still = namespace(depth), row >= 0, stopped(camera)
     count = xp.sum(xp.astype(there, depth.dtype))
     middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
     even, unit = _even_depths(xp.where(there, depth, middle), still, middle, size)
@@ -112,18 +112,15 @@ def picture_of(positions: Array, alpha: Array | None, row: Array, camera: Camera
     for axis in (0, 1):
         rise = _Rise(even, there, 2 - axis)
         slopes.append(rise.slope(unit))
+        if moving is None:
+            sides += [xp.zeros_like(even)] * 2
+            continue
         moved = moving[..., axis] - stopped(moving[..., axis])
         sides += [moved + rise.beyond(unit, end) * (moved - xp.roll(moved, end, axis=2 - axis)) for end in (-1, 1)]
     planes = xp.stack([even, *slopes, xp.where(there, unit, 0.0)], axis=-1)
-    columns = sides if alpha is None else [*sides, _in_cells(alpha, row)[..., 0]]
+    columns = sides if alpha is None else [*sides, alpha[..., 0]]
     cells = xp.reshape(xp.stack(columns, axis=-1), (row.shape[0], -1, len(columns)))
     return Picture(camera, cells, planes, middle, size)
-
-
-def _in_cells(values: Array, row: Array) -> Array:
-    """Values (M, C) of samples as (K, H, W, C); of some sample where a cell has none."""
-    xp = namespace(values)
-    return xp.reshape(take(values, xp.reshape(xp.clip(row, 0, None), (-1,))), (*row.shape, values.shape[1]))
 
 
 class _Rise:
@@ -151,7 +148,9 @@ class _Rise:
         # Of something thin both sides show another surface.
         thin = (a * b < 0) & (2 * abs(smaller) > xp.maximum(abs(a), abs(b)))
         both = xp.where(smooth, (a + b) / 2, xp.where(thin, 0.0, smaller))
-        return xp.where(self._is_ahead & self._is_back, both, xp.where(self._is_ahead, a, xp.where(self._is_back, b, 0.0)))
+        return xp.where(
+            self._is_ahead & self._is_back, both, xp.where(self._is_ahead, a, xp.where(self._is_back, b, 0.0))
+        )
 
     def beyond(self, unit: Array, end: int) -> Array:
         """How many cells beyond the centre the side at an end lies, −1 or 1, to extrapolate motions from within.
