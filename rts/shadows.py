@@ -146,9 +146,7 @@ def with_shadows(
     if not isinstance(light, Mapping) or not ("direction" in light or "position" in light):
         raise InputError(f"light is {quoted(light)}; expected a dict with the 'direction' or 'position' of a light")
     if "color" in light and "direction" not in light:
-        raise InputError(
-            "light has a 'color' of distant lights, but no 'direction'; give both: shadows need to know it"
-        )
+        raise InputError("light has a 'color' of distant lights, but no 'direction'; give both")
     sphere = _sphere(part_list, bounds)
     cameras = [[_distant_camera(d, sphere)] for d in _vectors(light, "direction")]
     cameras += [_point_cameras(p, sphere) for p in _vectors(light, "position")]

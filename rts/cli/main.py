@@ -26,6 +26,7 @@ from rts.cli.options import (
     is_given,
     layers_of,
     refuse_beside,
+    sunlight,
     view_of,
 )
 from rts.scene.parts import Part
@@ -151,6 +152,10 @@ def render(
             help="A picture of all that surrounds the model, and lights it: .hdr, .exr or .png, twice as wide as high."
         ),
     ] = None,
+    shadows: Annotated[
+        bool,
+        typer.Option("--shadows", help="Light from above the camera's left shoulder, which casts shadows."),
+    ] = False,
     exposure: Annotated[
         float | None,
         typer.Option(help="Stops by which a .png is made brighter; bright colours are then compressed, not clipped."),
@@ -180,7 +185,7 @@ def render(
     if exposure is not None and output.suffix.lower() != ".png":
         raise typer.BadParameter("--exposure is for a .png; .hdr and .exr hold colours of any brightness")
     check_exposure(exposure or 0.0)
-    light = None if environment is None else environment_of(environment, up)
+    light: Any = None if environment is None else {"environment": environment_of(environment, up)}
     engine_object = registry.plugin("rts.engines", engine)()
     if pose is None:
         parts = rts.load(model, surface=surface)
@@ -194,9 +199,12 @@ def render(
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
     extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
 
+    if shadows:
+        light = sunlight(seen, light)
+
     def prepared(part: Part) -> Part:
         theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
-        theta = theta if light is None else {**theta, "light": {"environment": light}}
+        theta = theta if light is None else {**theta, "light": light}
         return part.replace(
             theta=map_leaves(engine_object.constant, theta),
             cull=cull,
@@ -204,6 +212,8 @@ def render(
         )
 
     scene = [prepared(p) for p in parts]
+    if shadows:
+        scene = rts.shadows.with_shadows(scene, light, size=2 * max(shape), bounds=bounds, sampler=sampler)
     options: dict[str, Any] = {"sampler": sampler, "splatter": splatter, "layers": layers_of(layers)}
     options["supersample"] = supersample_of(supersample)
     start = time.perf_counter()

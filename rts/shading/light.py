@@ -153,8 +153,8 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
         light.shadows, count = entries["shadow"], len(light.distant) + len(light.points)
         if len(light.shadows) != count:
             raise InputError(
-                f"theta['light']['shadow'] has {len(light.shadows)} entries, and there are {count} lights; expected one "
-                f"for each distant light, then one for each point light: what rts.shadows.seen_from gave, or None"
+                f"theta['light']['shadow'] has {len(light.shadows)} entries, and there are {count} lights; expected "
+                f"one for each distant light, then one for each point light: a result of seen_from, or None"
             )
     return light
 
