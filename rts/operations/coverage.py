@@ -30,11 +30,11 @@ def coverage(cells: Array, points: Array, planes: Array) -> Array:
     some cell around shows that. So neither slopes nor edges of solids shade themselves.
 
     Args:
-        cells: (H · W, 4) the motions of the left, right, upper and lower side of each cell, of which only derivatives
-            count; with alpha, if the samples are not opaque, (H · W, 5).
+        cells: (H · W, 2) x and y of the sample in each cell, of which only derivatives count; with alpha, if the
+            samples are not opaque, (H · W, 3).
         points: (N, 3) x, y, and depth. Depth is of a kind that grows evenly on planes; it has no derivative.
-        planes: (H, W, 4) of the sample in each cell: depth, its slopes along x and y, and the depth of a cell's width,
-            0 where there is no sample; at least 4 × 4.
+        planes: (H, W, 8) of the sample in each cell: depth, and the depth of a cell's width, 0 where there is no
+            sample; and `rts.operations.depth_planes`. At least 4 × 4.
     """
     return COVERAGE(cells, points, planes)
 
@@ -54,17 +54,17 @@ def quadratic(d: Array) -> Array:
 
 
 def _specification(cells: Array, points: Array, planes: Array) -> Array:
-    xp, at, translucent = namespace(cells), stopped(points), cells.shape[1] > 4
+    xp, at, translucent = namespace(cells), stopped(points), cells.shape[1] > 2
     (height, width), (x, y, depth) = planes.shape[:2], (at[:, i] for i in range(3))
     corner = [xp.floor(xp.clip(c - 1.5, 0, n - 4)) for c, n in ((x, width), (y, height))]
     dx, dy = ([c - k - (i + 0.5) for i in range(4)] for c, k in zip((x, y), corner, strict=True))
     first = xp.astype(corner[1], xp.int32) * width + xp.astype(corner[0], xp.int32)
-    flat, alphas = xp.reshape(planes, (-1, 4)), stopped(cells)[:, 4] if translucent else None
+    flat, alphas = xp.reshape(planes, (-1, 8)), stopped(cells)[:, 2] if translucent else None
     around, closest, own = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
     for j, i in itertools.product(range(4), range(4)):
         index = first + (j * width + i)
         plane = xp.take(flat, index, axis=0)
-        z, a, b, unit = (plane[:, k] for k in range(4))
+        z, unit, a, b = (plane[:, k] for k in range(4))
         there, steep = unit > 0, unit + abs(a) + abs(b)
         seen = xp.where(there, z + a * dx[i] + b * dy[j], FAR)
         around[j, i] = index, z, seen, there & (seen < depth - BIAS * steep)
@@ -80,20 +80,24 @@ def _specification(cells: Array, points: Array, planes: Array) -> Array:
     covered = sum(weights[cell] * covers[cell] for cell in covers)
     change = xp.zeros_like(covered)[:, None]
     if translucent:
-        alphas = cells[:, 4:] - stopped(cells[:, 4:])
+        alphas = cells[:, 2:] - stopped(cells[:, 2:])
         change = combine(alphas, *_stacked([index for index, *_ in around.values()], [*weights.values()]))
-    sides = xp.reshape(cells[:, :4] - stopped(cells[:, :4]), (-1, 1))
     for axis, (across, along) in enumerate(((dx, dy), (dy, dx))):
         ids, flows = [], []
         for i, j in itertools.product(range(3), range(4)):
             before, behind = ((j, i), (j, i + 1)) if axis == 0 else ((i, j), (i + 1, j))
             nearer = around[before][2] < around[behind][2]
-            # The side at the end of the cell before, or at the start of the cell behind.
-            ids.append(xp.where(nearer, 4 * around[before][0] + 1, 4 * around[behind][0]) + 2 * axis)
-            jump = covers[before] - covers[behind]
-            flows.append(jump * quadratic(across[i] - 0.5) * cubic(along[j]))
+            cell = xp.where(nearer, around[before][0], around[behind][0])
+            flow = (covers[before] - covers[behind]) * quadratic(across[i] - 0.5) * cubic(along[j])
+            # The side at the end of the cell before, or at the start of the cell behind; motions from within.
+            side = 2 * axis + 4 + xp.astype(nearer, cell.dtype)
+            beyond = flow * xp.take(xp.reshape(planes, (-1,)), 8 * cell + side)
+            within = cell + xp.where(nearer, -1, 1) * (1, width)[axis]
+            ids += [cell, xp.clip(within, 0, height * width - 1)]
+            flows += [flow + beyond, -beyond]
         moved = (points - at)[:, axis : axis + 1] * sum(flows)[:, None]
-        change = change - moved + combine(sides, *_stacked(ids, flows))
+        motions = cells[:, axis : axis + 1] - stopped(cells[:, axis : axis + 1])
+        change = change - moved + combine(motions, *_stacked(ids, flows))
     return xp.clip(covered, 0.0, 1.0)[:, None] + change
 
 

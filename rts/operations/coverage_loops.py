@@ -64,8 +64,8 @@ def pull(
 def _check(cells: np.ndarray, points: np.ndarray, planes: np.ndarray) -> None:
     """Refuse arrays of other shapes."""
     height, width, channels = planes.shape
-    fits = cells.shape[0] == height * width and cells.shape[1] in (4, 5) and points.shape[1] == 3
-    if not fits or channels != 4 or min(height, width) < 4:
+    fits = cells.shape[0] == height * width and cells.shape[1] in (2, 3) and points.shape[1] == 3
+    if not fits or channels != 8 or min(height, width) < 4:
         shapes = ", ".join(str(x.shape) for x in (cells, points, planes))
         raise InputError(f"a picture has arrays of shapes {shapes}; expected what rts.shadows.seen_from gave")
 
@@ -104,10 +104,10 @@ def _look(cells, x, y, depth, planes, covers, depths, fronts):
         for i in range(4):
             plane = planes[top + j, left + i]
             covers[j, i], depths[j, i], fronts[j, i] = 0, FAR, False
-            if plane[3] == 0:
+            if plane[1] == 0:
                 continue
-            a, b = float(plane[1]), float(plane[2])
-            steep = plane[3] + abs(a) + abs(b)
+            a, b = float(plane[2]), float(plane[3])
+            steep = plane[1] + abs(a) + abs(b)
             seen = plane[0] + a * (x - (left + i + 0.5)) + b * (y - (top + j + 0.5))
             depths[j, i] = seen
             if seen < depth - BIAS * steep:
@@ -128,7 +128,7 @@ def _look(cells, x, y, depth, planes, covers, depths, fronts):
                 fronts[j, i] = False
                 continue
             some = True
-            covers[j, i] = cells[(top + j) * width + left + i, 4] if cells.shape[1] > 4 else 1
+            covers[j, i] = cells[(top + j) * width + left + i, 2] if cells.shape[1] > 2 else 1
     return some
 
 
@@ -139,16 +139,22 @@ def _tables():
 
 
 @compiled
-def _side(covers, depths, first, width, axis, i, j):
-    """The side behind cell i along an axis, in line j: how much less is covered behind it; the nearer cell; its side.
+def _side(covers, depths, planes, top, left, axis, i, j):
+    """The side behind cell i along an axis, in line j.
 
-    `first` is the index of the first of the 4 × 4 cells.
+    Returns how much less is covered behind it; the index of the nearer cell; how far the side lies beyond its centre;
+    and the index of the cell within.
     """
+    width = planes.shape[1]
     a, b, c, d = (j, i, j, i + 1) if axis == 0 else (i, j, i + 1, j)
-    jump = covers[a, b] - covers[c, d]
+    jump, step = covers[a, b] - covers[c, d], 1 if axis == 0 else width
     if depths[a, b] < depths[c, d]:
-        return jump, first + a * width + b, 2 * axis + 1
-    return jump, first + c * width + d, 2 * axis
+        y, x, side, step = top + a, left + b, 2 * axis + 5, -step
+    else:
+        y, x, side = top + c, left + d, 2 * axis + 4
+    cell = y * width + x
+    within = min(max(cell + step, 0), planes.shape[0] * width - 1)
+    return jump, cell, float(planes[y, x, side]), within
 
 
 @loop
@@ -161,7 +167,7 @@ def _forward(start, stop, cells, points, planes, out, kept):
         if not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
         top, left, total = _corner(y, height), _corner(x, width), 0.0
-        kept[n] = cells.shape[1] > 4
+        kept[n] = cells.shape[1] > 2
         for j in range(4):
             weight = _cubic(y - (top + j + 0.5))
             for i in range(4):
@@ -187,16 +193,18 @@ def _push(start, stop, cells, points, planes, t_cells, t_points, kept, out):
             for i in range(3):
                 weight = _quadratic(across - (i + 1))
                 for j in range(4):
-                    jump, nearer, side = _side(covers, depths, top * width + left, width, axis, i, j)
+                    jump, nearer, beyond, within = _side(covers, depths, planes, top, left, axis, i, j)
                     if jump != 0:
-                        moved = t_cells[nearer, side] - t_points[n, axis]
+                        moved = t_cells[nearer, axis] - t_points[n, axis]
+                        if beyond != 0:
+                            moved += beyond * (t_cells[nearer, axis] - t_cells[within, axis])
                         total += jump * weight * _cubic(along - (j + 0.5)) * moved
-        if cells.shape[1] > 4:
+        if cells.shape[1] > 2:
             for j in range(4):
                 for i in range(4):
                     if fronts[j, i]:
                         weight = _cubic(y - (top + j + 0.5)) * _cubic(x - (left + i + 0.5))
-                        total += weight * t_cells[(top + j) * width + left + i, 4]
+                        total += weight * t_cells[(top + j) * width + left + i, 2]
         out[n, 0] = total
 
 
@@ -216,14 +224,16 @@ def _pull(cells, points, planes, g, g_cells, g_points, kept):
             for i in range(3):
                 weight = _quadratic(across - (i + 1)) * g[n, 0]
                 for j in range(4):
-                    jump, nearer, side = _side(covers, depths, top * width + left, width, axis, i, j)
+                    jump, nearer, beyond, within = _side(covers, depths, planes, top, left, axis, i, j)
                     if jump != 0:
                         change = jump * weight * _cubic(along - (j + 0.5))
-                        g_cells[nearer, side] += change
+                        g_cells[nearer, axis] += change * (1 + beyond)
+                        if beyond != 0:
+                            g_cells[within, axis] -= change * beyond
                         g_points[n, axis] -= change
-        if cells.shape[1] > 4:
+        if cells.shape[1] > 2:
             for j in range(4):
                 for i in range(4):
                     if fronts[j, i]:
                         weight = _cubic(y - (top + j + 0.5)) * _cubic(x - (left + i + 0.5))
-                        g_cells[(top + j) * width + left + i, 4] += weight * g[n, 0]
+                        g_cells[(top + j) * width + left + i, 2] += weight * g[n, 0]

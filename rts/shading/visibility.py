@@ -14,12 +14,11 @@ from rts.arrays.engines import context_of, namespace, stopped
 from rts.arrays.trees import Array, record
 from rts.errors import InputError
 from rts.operations.coverage import coverage
+from rts.operations.depth_planes import depth_planes
 from rts.scene.camera import Camera
 
 REACH = 2
 """Cells around a picture that `visibility` reads."""
-RIM = 1.2
-"""How many times as much depth rises in the last step before a smooth rim as in the step before, at least."""
 
 
 @record(static=("size",))
@@ -28,8 +27,8 @@ class Picture:
 
     Attributes:
         camera: the camera. Differentiable.
-        cells: (K, H · W, 4 or 5), see `rts.operations.coverage`, of K layers. Differentiable.
-        planes: (K, H, W, 4), likewise.
+        cells: (K, H · W, 2 or 3), see `rts.operations.coverage`, of K layers. Differentiable.
+        planes: (K, H, W, 8), likewise.
         middle: () a depth of the scene's, from which depths are counted.
         size: (height, width) of the picture.
     """
@@ -108,64 +107,12 @@ def picture_of(
     count = xp.sum(xp.astype(there, depth.dtype))
     middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
     even, unit = _even_depths(xp.where(there, depth, middle), still, middle, size)
-    slopes, sides = [], []
-    for axis in (0, 1):
-        rise = _Rise(even, there, 2 - axis)
-        slopes.append(rise.slope(unit))
-        if moving is None:
-            sides += [xp.zeros_like(even)] * 2
-            continue
-        moved = moving[..., axis] - stopped(moving[..., axis])
-        sides += [moved + rise.beyond(unit, end) * (moved - xp.roll(moved, end, axis=2 - axis)) for end in (-1, 1)]
-    planes = xp.stack([even, *slopes, xp.where(there, unit, 0.0)], axis=-1)
-    columns = sides if alpha is None else [*sides, alpha[..., 0]]
-    cells = xp.reshape(xp.stack(columns, axis=-1), (row.shape[0], -1, len(columns)))
-    return Picture(camera, cells, planes, middle, size)
-
-
-class _Rise:
-    """How depth rises from cell to cell along an axis.
-
-    Args:
-        even: (K, H, W) depth, of a kind that grows evenly on planes.
-        there: (K, H, W) bool, true where a cell has a sample.
-        axis: the axis of the arrays.
-    """
-
-    def __init__(self, even: Array, there: Array, axis: int):
-        self._xp, self._axis = namespace(even), axis
-        self._ahead, self._is_ahead = self._at(even, 1) - even, there & self._at(there, 1)
-        self._back, self._is_back = self._at(self._ahead, -1), self._at(self._is_ahead, -1)
-
-    def _at(self, x: Array, steps: int) -> Array:
-        """The array at the cell so many steps ahead."""
-        return self._xp.roll(x, -steps, axis=self._axis)
-
-    def slope(self, unit: Array) -> Array:
-        """The slope of the surface in each cell; where one side shows another surface, that of the other side."""
-        xp, a, b = self._xp, self._ahead, self._back
-        smooth, smaller = abs(a - b) <= unit + xp.minimum(abs(a), abs(b)), xp.where(abs(a) < abs(b), a, b)
-        # Of something thin both sides show another surface.
-        thin = (a * b < 0) & (2 * abs(smaller) > xp.maximum(abs(a), abs(b)))
-        both = xp.where(smooth, (a + b) / 2, xp.where(thin, 0.0, smaller))
-        return xp.where(
-            self._is_ahead & self._is_back, both, xp.where(self._is_ahead, a, xp.where(self._is_back, b, 0.0))
-        )
-
-    def beyond(self, unit: Array, end: int) -> Array:
-        """How many cells beyond the centre the side at an end lies, −1 or 1, to extrapolate motions from within.
-
-        On a smooth rim motions change with the root of the distance from the outline, as depths do.
-        """
-        xp = self._xp
-        first, known = (-self._ahead, self._is_ahead) if end < 0 else (self._back, self._is_back)
-        second, is_second = self._at(first, -end), self._at(known, -end)
-        joined = known & is_second & (abs(first - second) <= unit + 3 * abs(second))
-        rim = (second > 0) & (first > RIM * second) & (first > unit / 2)
-        growth = xp.where(rim, first / xp.where(rim, second, 1.0), 2.0)
-        # e ahead of the outline depths rise as √(e + 1) − √e; this is √e over that, nearly.
-        at_rim = xp.clip(1 / (growth - 1) - 0.7071, 0.0, None)
-        return xp.where(joined, xp.where(rim, at_rim, 0.5), 0.0)
+    unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
+    planes = xp.stack([depth_planes(even[k, ...], unit[k, ...]) for k in layers])
+    planes = xp.concat([even[..., None], unit[..., None], planes], axis=-1)
+    moving = xp.zeros_like(planes[..., :2]) if moving is None else moving
+    cells = moving if alpha is None else xp.concat([moving, alpha], axis=-1)
+    return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, middle, size)
 
 
 def _even_depths(depth: Array, camera: Camera, middle: Array, size: tuple[int, int]) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ import rts
 from rts import shadows
 from rts.diagnostics.example_shapes import box, icosphere
 from rts.operations.coverage import COVERAGE
+from rts.operations.depth_planes import PLANES
 from rts.testing import OperationConformance
 
 SIZE = 64
@@ -235,6 +236,17 @@ def test_a_shadow_tells_the_light_and_what_casts_it(unknown):
     assert np.abs((found.parameters[unknown] - truth[unknown]).numpy()[axes]).max() < 0.02
 
 
+def test_compiled_planes_are_the_specification():
+    """Two smooth bodies over a slope, with holes."""
+    y, x = np.mgrid[:40, :50] + 0.5
+    depth = 30 + 0.3 * x - 0.1 * y
+    for center, radius in (((15, 20), 12.2), ((30, 18), 8.1)):
+        height = radius**2 - (x - center[0]) ** 2 - (y - center[1]) ** 2
+        depth = np.where(height > 0, 20 - np.sqrt(abs(height)), depth)
+    unit = np.where(np.random.default_rng(0).random(depth.shape) < 0.95, 1.0, 0.0)
+    np.testing.assert_allclose(PLANES(depth, unit), PLANES.specification(depth, unit), atol=1e-9)
+
+
 class TestCoverage(OperationConformance):
     @pytest.fixture
     def operation(self):
@@ -245,12 +257,13 @@ class TestCoverage(OperationConformance):
         rng = np.random.default_rng(0)
         height, width = 9, 11
         near = rng.random((height, width)) < 0.4
-        planes = np.zeros((height, width, 4))
+        planes = np.zeros((height, width, 8))
         planes[..., 0] = np.where(near, rng.uniform(-1, 0, (height, width)), 8.0) + 0.2 * np.arange(width)
-        planes[..., 1], planes[..., 3] = 0.2, rng.random((height, width)) < 0.9
+        planes[..., 1], planes[..., 2] = rng.random((height, width)) < 0.9, 0.2
+        planes[..., 4:] = rng.uniform(0, 1, (height, width, 4))
         points = np.stack([rng.uniform(2, 9, 40), rng.uniform(2, 7, 40), np.zeros(40)], axis=1)
         points[:, 2] = 8.0 + 0.2 * (points[:, 0] - 0.5)
-        cells = np.concatenate([np.zeros((height * width, 4)), rng.uniform(0.2, 0.9, (height * width, 1))], axis=1)
+        cells = np.concatenate([np.zeros((height * width, 2)), rng.uniform(0.2, 0.9, (height * width, 1))], axis=1)
         return [cells, points, planes]
 
 
