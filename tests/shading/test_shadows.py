@@ -233,7 +233,9 @@ def test_a_shadow_tells_the_light_and_what_casts_it(unknown):
     loss = rts.ImageResiduals(lambda p: scene({**truth, **p}), camera, (48, 48), target)
     found = rts.fit(loss, free, method="lm", steps=25)
     axes = [0, 1] if unknown == "light" else [0, 2]
-    assert np.abs((found.parameters[unknown] - truth[unknown]).numpy()[axes]).max() < 0.02
+    assert (
+        np.abs((found.parameters[unknown] - truth[unknown]).numpy()[axes]).max() < 2 * 1.05 * 4.5 / 256
+    )  # A pixel of the light's picture.
 
 
 def test_compiled_planes_are_the_specification():
