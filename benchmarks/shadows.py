@@ -31,7 +31,7 @@ CELLS, POINTS = 128, 400
 HALF = 1.6, 1.2
 """Half the extent of the points on the floor."""
 RADIUS, START, ANGLE = 0.8, 0.013, math.radians(17)
-"""Of disk and sphere; where the half-plane ends, and how it is turned."""
+"""The radius of disk and sphere; where the half-plane ends, and how it is turned."""
 LIGHTS = {"distant": (0.3, 1.0, 0.2), "point": (0.8, 4.0, 0.5)}
 SHAPES = ("half-plane", "disk", "sphere")
 CHANGES = ("what casts it moves", "the light moves", "the floor moves", "what casts it grows")

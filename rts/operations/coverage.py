@@ -13,14 +13,8 @@ from collections.abc import Callable
 from rts.arrays.engines import namespace, stopped
 from rts.arrays.trees import Array
 from rts.operations.combine import combine
+from rts.operations.depth_limits import BIAS, FAR, OWN
 from rts.operations.operation import Operation
-
-BIAS = 0.1
-"""How far in front of a point a cell must be, in changes of depth over a cell."""
-OWN = 0.5
-"""How far a point may be from the plane of a cell, in changes of depth over a cell, to lie on the same surface."""
-FAR = 1e30
-"""Depth of empty cells."""
 
 
 def coverage(cells: Array, points: Array, planes: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
 from rts.errors import InputError
-from rts.operations.coverage import BIAS, FAR, OWN
+from rts.operations.depth_limits import BIAS, FAR, OWN
 
 WORK = 400
 """Nanoseconds for a point, roughly."""
@@ -138,102 +138,95 @@ def _tables():
     return np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4), np.bool_)
 
 
-@compiled
-def _side(covers, depths, planes, top, left, axis, i, j):
-    """The side behind cell i along an axis, in line j.
+SIDES = 24
+"""Number of sides between 4 × 4 cells."""
 
-    Returns how much less is covered behind it; the index of the nearer cell; how far the side lies beyond its centre;
-    and the index of the cell within.
+
+@compiled
+def _side(covers, depths, planes, x, y, number):
+    """A side between two of the cells around a point, by its number.
+
+    Returns how much the result changes as the side moves along its axis; the axis; the index of the nearer cell; how
+    far the side lies beyond its centre; and the index of the cell within.
     """
-    width = planes.shape[1]
+    height, width = planes.shape[:2]
+    top, left = _corner(y, height), _corner(x, width)
+    axis, i, j = number // 12, number % 12 // 4, number % 4
     a, b, c, d = (j, i, j, i + 1) if axis == 0 else (i, j, i + 1, j)
     jump, step = covers[a, b] - covers[c, d], 1 if axis == 0 else width
+    if jump == 0:
+        return 0.0, axis, 0, 0.0, 0
+    across, along = (x - left, y - top) if axis == 0 else (y - top, x - left)
     if depths[a, b] < depths[c, d]:
-        y, x, side, step = top + a, left + b, 2 * axis + 5, -step
+        y_cell, x_cell, side, step = top + a, left + b, 2 * axis + 5, -step
     else:
-        y, x, side = top + c, left + d, 2 * axis + 4
-    cell = y * width + x
-    within = min(max(cell + step, 0), planes.shape[0] * width - 1)
-    return jump, cell, float(planes[y, x, side]), within
+        y_cell, x_cell, side = top + c, left + d, 2 * axis + 4
+    cell = y_cell * width + x_cell
+    within = min(max(cell + step, 0), height * width - 1)
+    change = jump * _quadratic(across - (i + 1)) * _cubic(along - (j + 0.5))
+    return change, axis, cell, float(planes[y_cell, x_cell, side]), within
+
+
+@compiled
+def _cell(x, y, planes, number):
+    """The index of one of the cells around a point, by its number, and its weight."""
+    height, width = planes.shape[:2]
+    top, left = _corner(y, height) + number // 4, _corner(x, width) + number % 4
+    return top * width + left, _cubic(y - (top + 0.5)) * _cubic(x - (left + 0.5))
 
 
 @loop
 def _forward(start, stop, cells, points, planes, out, kept):
     covers, depths, fronts = _tables()
-    height, width = planes.shape[:2]
     for n in range(start, stop):
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
         out[n, 0], kept[n] = 0, False
         if not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
-        top, left, total = _corner(y, height), _corner(x, width), 0.0
-        kept[n] = cells.shape[1] > 2
-        for j in range(4):
-            weight = _cubic(y - (top + j + 0.5))
-            for i in range(4):
-                total += covers[j, i] * weight * _cubic(x - (left + i + 0.5))
-                kept[n] |= covers[j, i] != covers[0, 0]
+        total, kept[n] = 0.0, cells.shape[1] > 2
+        for c in range(16):
+            total += covers[c // 4, c % 4] * _cell(x, y, planes, c)[1]
+            kept[n] |= covers[c // 4, c % 4] != covers[0, 0]
         out[n, 0] = min(max(total, 0.0), 1.0)
 
 
 @loop
 def _push(start, stop, cells, points, planes, t_cells, t_points, kept, out):
     covers, depths, fronts = _tables()
-    height, width = planes.shape[:2]
     for n in range(start, stop):
-        out[n, 0] = 0
-        if not kept[n]:
-            continue
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
-        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
+        out[n, 0], total = 0, 0.0
+        if not kept[n] or not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
-        top, left, total = _corner(y, height), _corner(x, width), 0.0
-        for axis in range(2):
-            across, along = (x - left, y - top) if axis == 0 else (y - top, x - left)
-            for i in range(3):
-                weight = _quadratic(across - (i + 1))
-                for j in range(4):
-                    jump, nearer, beyond, within = _side(covers, depths, planes, top, left, axis, i, j)
-                    if jump != 0:
-                        moved = t_cells[nearer, axis] - t_points[n, axis]
-                        if beyond != 0:
-                            moved += beyond * (t_cells[nearer, axis] - t_cells[within, axis])
-                        total += jump * weight * _cubic(along - (j + 0.5)) * moved
+        for s in range(SIDES):
+            change, axis, cell, beyond, within = _side(covers, depths, planes, x, y, s)
+            if change != 0:
+                moved = t_cells[cell, axis] - t_points[n, axis]
+                total += change * (moved + beyond * (t_cells[cell, axis] - t_cells[within, axis]))
         if cells.shape[1] > 2:
-            for j in range(4):
-                for i in range(4):
-                    if fronts[j, i]:
-                        weight = _cubic(y - (top + j + 0.5)) * _cubic(x - (left + i + 0.5))
-                        total += weight * t_cells[(top + j) * width + left + i, 2]
+            for c in range(16):
+                if fronts[c // 4, c % 4]:
+                    cell, weight = _cell(x, y, planes, c)
+                    total += weight * t_cells[cell, 2]
         out[n, 0] = total
 
 
 @loop
 def _pull(cells, points, planes, g, g_cells, g_points, kept):
     covers, depths, fronts = _tables()
-    height, width = planes.shape[:2]
     for n in range(len(points)):
-        if not kept[n] or g[n, 0] == 0:
-            continue
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
-        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
+        if not kept[n] or g[n, 0] == 0 or not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
-        top, left = _corner(y, height), _corner(x, width)
-        for axis in range(2):
-            across, along = (x - left, y - top) if axis == 0 else (y - top, x - left)
-            for i in range(3):
-                weight = _quadratic(across - (i + 1)) * g[n, 0]
-                for j in range(4):
-                    jump, nearer, beyond, within = _side(covers, depths, planes, top, left, axis, i, j)
-                    if jump != 0:
-                        change = jump * weight * _cubic(along - (j + 0.5))
-                        g_cells[nearer, axis] += change * (1 + beyond)
-                        if beyond != 0:
-                            g_cells[within, axis] -= change * beyond
-                        g_points[n, axis] -= change
+        for s in range(SIDES):
+            change, axis, cell, beyond, within = _side(covers, depths, planes, x, y, s)
+            if change != 0:
+                change *= g[n, 0]
+                g_cells[cell, axis] += change * (1 + beyond)
+                g_cells[within, axis] -= change * beyond
+                g_points[n, axis] -= change
         if cells.shape[1] > 2:
-            for j in range(4):
-                for i in range(4):
-                    if fronts[j, i]:
-                        weight = _cubic(y - (top + j + 0.5)) * _cubic(x - (left + i + 0.5))
-                        g_cells[(top + j) * width + left + i, 2] += weight * g[n, 0]
+            for c in range(16):
+                if fronts[c // 4, c % 4]:
+                    cell, weight = _cell(x, y, planes, c)
+                    g_cells[cell, 2] += weight * g[n, 0]

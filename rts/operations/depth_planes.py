@@ -6,12 +6,8 @@ from collections.abc import Callable
 
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array
+from rts.operations.depth_limits import FLAT, RIM
 from rts.operations.operation import Operation
-
-RIM = 1.2
-"""How many times as much depth rises in the last step before a smooth rim as in the step before, at least."""
-FLAT = 0.5
-"""Where the side of a cell of a flat surface lies, in cells from its centre."""
 
 
 def depth_planes(even: Array, unit: Array) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 
 from rts.compiling.loops import compiled, loop
 from rts.compiling.threads import parallel
-from rts.operations.depth_planes import FLAT, RIM
+from rts.operations.depth_limits import FLAT, RIM
 
 WORK = 30
 """Nanoseconds for a cell, roughly."""

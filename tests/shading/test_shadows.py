@@ -13,6 +13,8 @@ from rts.operations.coverage import COVERAGE
 from rts.operations.depth_planes import PLANES
 from rts.testing import OperationConformance
 
+pytestmark = pytest.mark.rendering
+
 SIZE = 64
 FLOOR = np.array([[-3, 0, -3], [3, 0, -3], [3, 0, 3], [-3, 0, 3]], np.float32)
 SQUARE = np.array([[0, 2, 1], [0, 3, 2]], np.int32)
