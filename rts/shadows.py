@@ -68,10 +68,12 @@ def seen_from(
     scene = Scene.of(parts, camera, sampler, engine)
     size = check_size(size, layers, capacity, 1)
     solid = [part.replace(theta=part.read, shader="silhouette") for part in scene.parts if part.shader.opaque]
-    groups: list[tuple[Sequence[Part], Layers]] = [(solid, 1)] if solid else []
+    settings = camera, size, sampler
+    pictures = [_picture(solid, *settings, 1, capacity, engine)] if solid else []
     # Translucent parts have pictures of their own, so that what they hide is hidden where they end, too.
-    groups += [([_without_shadow(part)], layers) for part in scene.parts if not part.shader.opaque]
-    pictures = [_picture(group, camera, size, sampler, count, capacity, engine) for group, count in groups]
+    for part in scene.parts:
+        if not part.shader.opaque:
+            pictures.append(_picture([_without_shadow(part)], *settings, layers, capacity, engine))
     return Seen(tuple(pictures))
 
 

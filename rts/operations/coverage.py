@@ -89,7 +89,7 @@ def _specification(cells: Array, points: Array, planes: Array) -> Array:
             within = cell + xp.where(nearer, -1, 1) * (1, width)[axis]
             ids += [cell, xp.clip(within, 0, height * width - 1)]
             flows += [flow + beyond, -beyond]
-        moved = (points - at)[:, axis : axis + 1] * sum(flows)[:, None]
+        moved = (points - at)[:, axis : axis + 1] * xp.sum(xp.stack(flows, axis=1), axis=1, keepdims=True)
         motions = cells[:, axis : axis + 1] - stopped(cells[:, axis : axis + 1])
         change = change - moved + combine(motions, *_stacked(ids, flows))
     return xp.clip(covered, 0.0, 1.0)[:, None] + change

@@ -68,7 +68,7 @@ class _Rise:
         return xp.where(joined, xp.where(rim, at_rim, FLAT), 0.0)
 
 
-def _shape(even: tuple[int, ...], unit: tuple[int, ...]) -> tuple[int, int, int]:
+def _shape(even: tuple[int, ...], unit: tuple[int, ...]) -> tuple[int, ...]:
     return *even, 6
 
 

@@ -87,7 +87,8 @@ def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
     if seen is None:
         return 1.0
     records = [seen] if isinstance(seen, Seen) else seen
-    return (sum(visibility(one, points, outside=1.0) for one in records) / len(records))[:, None]
+    total: Any = sum(visibility(one, points, outside=1.0) for one in records)
+    return total[:, None] / len(records)
 
 
 def picture_of(
@@ -110,8 +111,8 @@ def picture_of(
     unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
     planes = xp.stack([depth_planes(even[k, ...], unit[k, ...]) for k in layers])
     planes = xp.concat([even[..., None], unit[..., None], planes], axis=-1)
-    moving = xp.zeros_like(planes[..., :2]) if moving is None else moving
-    cells = moving if alpha is None else xp.concat([moving, alpha], axis=-1)
+    cells: Array = xp.zeros_like(planes[..., :2]) if moving is None else moving
+    cells = cells if alpha is None else xp.concat([cells, alpha], axis=-1)
     return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, middle, size)
 
 
