@@ -26,6 +26,7 @@ from rts import errors as errors
 from rts import registry as registry
 from rts import regularizers as regularizers
 from rts import results as results
+from rts import shadows as shadows
 from rts.arrays.engine_base import Engine
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array, Tree

@@ -45,7 +45,8 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
             entries[key] = value if _is_plain(value) else from_numbers(value, f"{name}[{key!r}]")
         return entries
     if isinstance(tree, (list, tuple)):
-        if tree and not is_named(tree) and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
+        numbers = [isinstance(x, (bool, int, float)) for x in leaves(tree)]
+        if numbers and all(numbers) and not is_named(tree):
             try:
                 return np.asarray(tree, np.float32)
             except (ValueError, OverflowError):

@@ -26,6 +26,7 @@ from rts.cli.options import (
     is_given,
     layers_of,
     refuse_beside,
+    sunlight,
     view_of,
 )
 from rts.scene.parts import Part
@@ -158,6 +159,10 @@ def render(
             help="A picture of all that surrounds the model, and lights it: .hdr, .exr or .png, twice as wide as high."
         ),
     ] = None,
+    shadows: Annotated[
+        bool,
+        typer.Option("--shadows", help="Light from above the camera's left shoulder, which casts shadows."),
+    ] = False,
     exposure: Annotated[
         float | None,
         typer.Option(help="Stops by which a .png is made brighter; bright colours are then compressed, not clipped."),
@@ -196,7 +201,7 @@ def render(
     if exposure is not None and output.suffix.lower() != ".png":
         raise typer.BadParameter("--exposure is for a .png; .hdr and .exr hold colours of any brightness")
     check_exposure(exposure or 0.0)
-    light = None if environment is None else environment_of(environment, up)
+    light: Any = None if environment is None else {"environment": environment_of(environment, up)}
     engine_object = registry.plugin("rts.engines", engine)()
     if clip is None:
         frames = [rts.load(model, surface=surface, cull=cull)]
@@ -215,25 +220,35 @@ def render(
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
     extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
 
+    if shadows:
+        light = sunlight(seen, light)
+
     def prepared(part: Part) -> Part:
         theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
-        theta = theta if light is None else {**theta, "light": {"environment": light}}
+        theta = theta if light is None else {**theta, "light": light}
         return part.replace(
             theta=map_leaves(engine_object.constant, theta),
             shader=part.shader if shader == "auto" else shader,
         )
 
-    scene, parts = [prepared(p) for p in frames[0]], frames[0]
+    def lit(parts: list[Part]) -> list[Part]:
+        scene = [prepared(part) for part in parts]
+        if not shadows:
+            return scene
+        return rts.shadows.with_shadows(scene, light, size=2 * max(shape), bounds=bounds, sampler=sampler)
+
+    parts = frames[0]
+    scene = lit(parts)
     options: dict[str, Any] = {"sampler": sampler, "splatter": splatter, "layers": layers_of(layers)}
     options["supersample"] = supersample_of(supersample)
     start = time.perf_counter()
     lines: list[str] = []
     if output.suffix.lower() in ANIMATIONS:
-        moving = ([prepared(p) for p in frame] for frame in frames)
-        rts.save_animation(output, (rts.render(x, seen, shape, **options, background=color) for x in moving), FPS)
+        images = (rts.render(lit(frame), seen, shape, **options, background=color) for frame in frames)
+        rts.save_animation(output, images, FPS)
     else:
-        images = rts.render(scene, seen, shape, **options, background=color, outputs=names)
-        lines = write_outputs(output, {name: engine_object.to_numpy(x) for name, x in images.items()}, exposure)
+        found = rts.render(scene, seen, shape, **options, background=color, outputs=names)
+        lines = write_outputs(output, {name: engine_object.to_numpy(x) for name, x in found.items()}, exposure)
     seconds = time.perf_counter() - start
     what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
     what += f", {len(frames)} frames" if len(frames) > 1 else ""

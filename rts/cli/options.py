@@ -55,6 +55,15 @@ def environment_of(path: Path, up: str) -> Any:
     return prefiltered(image)
 
 
+def sunlight(camera: Any, light: dict[str, Any] | None) -> dict[str, Any]:
+    """θ["light"] with a distant light above the camera's left shoulder, beside light from all around."""
+    from rts.shading.light import AMBIENT, COLOR, DIRECTION
+
+    around = {"ambient": np.array(AMBIENT, np.float32)} if light is None else light
+    direction, color = np.asarray(camera.to_world(DIRECTION), np.float32), np.full(3, COLOR, np.float32)
+    return {**around, "direction": direction, "color": color}
+
+
 def is_given(context: typer.Context, option: str) -> bool:
     """True if an option was given, and not left at its default."""
     source = context.get_parameter_source(option)

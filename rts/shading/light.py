@@ -13,6 +13,8 @@
     "sh" (1, 3), (4, 3), (9, 3)      radiance from each direction, as coefficients of `rts.shading.harmonics`
       or (16, 3)
     "environment" (h, w, 3)          radiance from each direction, as an image; see `rts.shading.prefiltered`
+    "shadow" list                    for each distant light, then for each point light, what is seen from it: a result
+                                     of `rts.shadows.seen_from`; a list of several, whose shadows are averaged; or None
 
 The defaults hold while θ["light"] has none of "position", "sh" and "environment". A light with one of them has no
 distant lights unless it has a "direction" or a "color", and no ambient light unless it has "ambient".
@@ -20,10 +22,11 @@ distant lights unless it has a "direction" or a "color", and no ambient light un
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import dot, shape_of, unit
 from rts.arrays.engines import namespace, value_of
 from rts.arrays.trees import Array, Tree
@@ -33,6 +36,7 @@ from rts.scene.row_cameras import RowCameras
 from rts.shading.environment import blurs, prefiltered, reflected
 from rts.shading.spherical_harmonics import COUNTS, irradiance, radiance
 from rts.shading.theta_entries import check_entry
+from rts.shading.visibility import Seen, mean_visibility
 
 AMBIENT, COLOR = 0.2, 0.8
 DIRECTION = (-0.3, 0.5, 0.81)
@@ -40,7 +44,7 @@ DIRECTION = (-0.3, 0.5, 0.81)
 FURTHER = ("position", "sh", "environment")
 """Entries besides which there are no defaults."""
 PLURALS = {"color": "colors", "intensity": "intensities"}
-ENTRIES = ("direction", "color", "position", "intensity", "ambient", "sh", "environment")
+ENTRIES = ("direction", "color", "position", "intensity", "ambient", "sh", "environment", "shadow")
 
 
 @dataclass
@@ -53,6 +57,7 @@ class Light:
         ambient: the radiance from all around, a number, () or (3,); None for none.
         sh: coefficients (n, 3); None for none.
         environment: the result of `prefiltered`; None for none.
+        shadows: what is seen from each distant light, then from each point light; empty for no shadows.
     """
 
     distant: list[tuple[Array, Any]] = field(default_factory=list)
@@ -60,13 +65,22 @@ class Light:
     ambient: Any = None
     sh: Array | None = None
     environment: Mapping[str, Array] | None = None
+    shadows: Sequence[Any] = ()
 
     def lamps(self, positions: Array) -> Iterator[tuple[Array, Any]]:
         """For each distant or point light the unit vectors towards it, (3,) or (N, 3), and irradiances / π at points.
 
+        Where a light has a shadow, its irradiances are less by it.
+
         Args:
             positions: (N, 3) world.
         """
+        shadows = self.shadows or [None] * (len(self.distant) + len(self.points))
+        for (direction, brightness), shadow in zip(self._unshadowed(positions), shadows, strict=True):
+            yield direction, brightness if shadow is None else brightness * mean_visibility(shadow, positions)
+
+    def _unshadowed(self, positions: Array) -> Iterator[tuple[Array, Any]]:
+        """The result of `lamps` without shadows."""
         yield from self.distant
         for position, intensity in self.points:
             offset = position - positions
@@ -135,6 +149,13 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
     if "environment" in entries:
         environment = entries["environment"]
         light.environment = environment if isinstance(environment, Mapping) else prefiltered(environment)
+    if "shadow" in entries:
+        light.shadows, count = entries["shadow"], len(light.distant) + len(light.points)
+        if len(light.shadows) != count:
+            raise InputError(
+                f"theta['light']['shadow'] has {len(light.shadows)} entries, and there are {count} lights; expected "
+                f"one for each distant light, then one for each point light: a result of seen_from, or None"
+            )
     return light
 
 
@@ -145,6 +166,8 @@ def _check(name: str, value: Any) -> None:
     place, shape = f"['light'][{name!r}]", shape_of(value)
     if name == "ambient":
         check_entry(place, value, "() or (3,)", shape in ((), (1,), (3,)))
+    elif name == "shadow":
+        _check_shadow(value)
     elif name == "sh":
         check_entry(place, value, "(n, 3), n = 1, 4, 9 or 16", len(shape) == 2 and shape in [(n, 3) for n in COUNTS])
     elif name == "environment":
@@ -155,6 +178,18 @@ def _check(name: str, value: Any) -> None:
             check_entry(place, value, "(h, w, 3)", len(shape) == 3 and shape[2] == 3 and 0 not in shape)
     else:
         check_entry(place, value, "(3,) or (L, 3)", len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0)
+
+
+def _check_shadow(value: Any) -> None:
+    """Refuse shadows that are no list of records, of lists of records, and of None."""
+    shadows = value if isinstance(value, (list, tuple)) else [value]
+    for shadow in shadows:
+        several = shadow if isinstance(shadow, (list, tuple)) and shadow else [shadow]
+        if value is not shadows or not (shadow is None or all(isinstance(one, Seen) for one in several)):
+            raise InputError(
+                f"theta['light']['shadow'] has {quoted(shadow)}; expected a list with an entry for each light: what "
+                f"rts.shadows.seen_from gave, a list of several, or None"
+            )
 
 
 def _paired(place: str, places: list[Array], name: str, entries: Mapping[str, Any], default: float) -> list[tuple]:

@@ -275,6 +275,18 @@ def test_render_is_lit_by_an_environment_and_exposed(model, tmp_path, up):
     assert "--exposure is for a .png" in fail(*common, "-o", tmp_path / "a.hdr", "--exposure", "1", code=2)
 
 
+def test_render_casts_shadows(tmp_path):
+    corners = [(x, y, z) for y, s in ((0, 1.0), (0.4, 0.3)) for x, z in ((-s, -s), (-s, s), (s, s), (s, -s))]
+    lines = [*(f"v {x} {y} {z}" for x, y, z in corners), "f 1 2 3 4", "f 5 6 7 8"]
+    (tmp_path / "card.obj").write_text("\n".join(lines))
+    pictures = []
+    for options in ((), ("--shadows",)):
+        succeed("render", tmp_path / "card.obj", "-o", tmp_path / "a.hdr", "--size", 48, "--camera", "0,70", *options)
+        pictures.append(rts.load_image(tmp_path / "a.hdr")[..., 0])
+    darker = pictures[0] - pictures[1]
+    assert darker.min() > -0.01 and 0.005 < (darker > 0.3).mean() < 0.05
+
+
 def test_render_options_reach_the_picture(model, tmp_path):
     def picture(*options):
         succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, *options)

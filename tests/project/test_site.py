@@ -42,7 +42,15 @@ OF_THE_LIBRARY = ("warn", "warn_deprecated", "in_one_line")
 def public_names():
     """Every name that users and plugins may import, as it is written."""
     yield from (f"rts.{name}" for name in {*rts.__all__, *registry.built_in_attributes()})
-    for module in ("rts.errors", "rts.regularizers", "rts.results", "rts.splatting", "rts.testing", "rts_compare"):
+    for module in (
+        "rts.errors",
+        "rts.regularizers",
+        "rts.results",
+        "rts.shadows",
+        "rts.splatting",
+        "rts.testing",
+        "rts_compare",
+    ):
         found = import_module(module)
         own = [name for name, value in vars(found).items() if getattr(value, "__module__", None) == module]
         names = getattr(found, "__all__", [name for name in own if name not in OF_THE_LIBRARY])

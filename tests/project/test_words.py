@@ -34,7 +34,7 @@ FOLDERS = (*PACKAGES, "apps", "benchmarks", "docs", "tests")
 FILES = [str(p.relative_to(ROOT)) for f in (*FOLDERS, ".github") for p in (ROOT / f).rglob("*") if p.is_file()]
 RECORDS = "rts.contracts.records"
 MODULES = (
-    *("rts.errors", "rts.regularizers", "rts.results", "rts.splatting", "rts.testing", "rts_compare"),
+    *("rts.errors", "rts.regularizers", "rts.results", "rts.shadows", "rts.splatting", "rts.testing", "rts_compare"),
     *(f"rts.plugin_api.{path.stem}" for path in (ROOT / "rts/plugin_api").glob("[a-z]*.py")),
 )
 NAME = re.compile(r"(?<![\w./…-])[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*(?![\w/])")

@@ -1,0 +1,82 @@
+"""The planes of the samples in a picture of depth, and where outlines lie beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
+from rts.operations.depth_limits import FLAT, RIM
+from rts.operations.operation import Operation
+
+
+def depth_planes(even: Array, unit: Array) -> Array:
+    """The slopes of the surface in each cell along x and y, and how far beyond its centre its sides lie: (H, W, 6).
+
+    The last four are of the left, right, upper and lower side, in cells; by them motions are extrapolated from within.
+    On a smooth rim motions change with the root of the distance from the outline, as depths do. The result has no
+    derivative.
+
+    Args:
+        even: (H, W) depth, of a kind that grows evenly on planes.
+        unit: (H, W) the depth of a cell's width; 0 where a cell has no sample.
+    """
+    return PLANES(even, unit)
+
+
+def _specification(even: Array, unit: Array) -> Array:
+    sides, slopes = [], []
+    for axis in (1, 0):
+        rise = _Rise(even, unit, axis)
+        slopes.append(rise.slope())
+        sides += [rise.beyond(-1), rise.beyond(1)]
+    return namespace(even).stack([*slopes, *sides], axis=-1)
+
+
+class _Rise:
+    """How depth rises from cell to cell along an axis. The picture is continued as if it were repeated."""
+
+    def __init__(self, even: Array, unit: Array, axis: int):
+        self._xp, self._axis, self._unit, there = namespace(even), axis, unit, unit > 0
+        self._ahead, self._is_ahead = self._at(even, 1) - even, there & self._at(there, 1)
+        self._back, self._is_back = self._at(self._ahead, -1), self._at(self._is_ahead, -1)
+
+    def _at(self, x: Array, steps: int) -> Array:
+        """The array at the cell so many steps ahead."""
+        return self._xp.roll(x, -steps, axis=self._axis)
+
+    def slope(self) -> Array:
+        """The slope of the surface in each cell; where one side shows another surface, that of the other side."""
+        xp, a, b = self._xp, self._ahead, self._back
+        smooth, smaller = abs(a - b) <= self._unit + xp.minimum(abs(a), abs(b)), xp.where(abs(a) < abs(b), a, b)
+        # Of something thin both sides show another surface.
+        thin = (a * b < 0) & (2 * abs(smaller) > xp.maximum(abs(a), abs(b)))
+        both = xp.where(smooth, (a + b) / 2, xp.where(thin, 0.0, smaller))
+        one = xp.where(self._is_ahead, a, xp.where(self._is_back, b, 0.0))
+        return xp.where(self._is_ahead & self._is_back, both, one)
+
+    def beyond(self, end: int) -> Array:
+        """How many cells beyond the centre the side at an end lies, −1 or 1; 0 where no cell within tells motions."""
+        xp, unit = self._xp, self._unit
+        first, known = (-self._ahead, self._is_ahead) if end < 0 else (self._back, self._is_back)
+        second, is_second = self._at(first, -end), self._at(known, -end)
+        joined = known & is_second & (abs(first - second) <= unit + 3 * abs(second))
+        rim = (second > 0) & (first > RIM * second) & (first > unit / 2)
+        growth = xp.where(rim, first / xp.where(rim, second, 1.0), 2.0)
+        # e ahead of the outline depths rise as √(e + 1) − √e; this is √e over that, nearly.
+        at_rim = xp.clip(1 / (growth - 1) - 0.7071, 0.0, None)
+        return xp.where(joined, xp.where(rim, at_rim, FLAT), 0.0)
+
+
+def _shape(even: tuple[int, ...], unit: tuple[int, ...]) -> tuple[int, ...]:
+    return *even, 6
+
+
+def _loops() -> tuple[Callable, Callable, Callable]:
+    from rts.operations import depth_planes_loops as loops
+
+    return loops.forward, loops.push, loops.pull
+
+
+PLANES = Operation.of_loops("rts.depth_planes", _specification, (2, 2), _shape, _loops, differentiable=2)
+"""The operation of `depth_planes`."""

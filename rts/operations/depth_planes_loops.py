@@ -1,0 +1,73 @@
+"""`rts.operations.depth_planes`, as compiled loops for arrays on the host. It is used without derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel
+from rts.operations.depth_limits import FLAT, RIM
+
+WORK = 30
+"""Nanoseconds for a cell, roughly."""
+
+
+def forward(even: np.ndarray, unit: np.ndarray, out: np.ndarray) -> None:
+    """Fill `out` (H, W, 6) with slopes and sides."""
+    parallel(_forward, len(even), even, unit, out, work=WORK * even.size)
+
+
+def push(even: np.ndarray, unit: np.ndarray, t_even: object, t_unit: object, out: np.ndarray) -> None:
+    """Fill `out` with zeros."""
+    out[...] = 0
+
+
+def pull(even: np.ndarray, unit: np.ndarray, g: np.ndarray, g_even: object, g_unit: object) -> None:
+    """Add no gradient."""
+
+
+@compiled
+def _slope(a, is_ahead, b, is_back, unit):
+    """The slope between a rise ahead and one behind; see `_Rise.slope` of the specification."""
+    if not (is_ahead and is_back):
+        return a if is_ahead else (b if is_back else 0 * a)
+    least, most = min(abs(a), abs(b)), max(abs(a), abs(b))
+    if abs(a - b) <= unit + least:
+        return (a + b) / 2
+    if a * b < 0 and 2 * least > most:
+        return 0 * a
+    return a if abs(a) < abs(b) else b
+
+
+@compiled
+def _beyond(first, second, known, unit):
+    """How far a side lies beyond a centre; see `_Rise.beyond` of the specification."""
+    if not known or abs(first - second) > unit + 3 * abs(second):
+        return 0 * first
+    if second > 0 and first > RIM * second and first > unit / 2:
+        return max(1 / (first / second - 1) - 0.7071, 0.0)
+    return FLAT + 0 * first
+
+
+@loop
+def _forward(start, stop, even, unit, out):
+    height, width = even.shape
+    for y in range(start, stop):
+        for x in range(width):
+            z, u = even[y, x], unit[y, x]
+            for axis in range(2):
+                # The cells from two behind to two ahead; the picture is continued as if it were repeated.
+                if axis == 0:
+                    i, j, k, m = (x - 2) % width, (x - 1) % width, (x + 1) % width, (x + 2) % width
+                    far_back, back, ahead, far_ahead = even[y, i], even[y, j], even[y, k], even[y, m]
+                    is_far_back, is_back = unit[y, i] > 0, unit[y, j] > 0
+                    is_ahead, is_far_ahead = unit[y, k] > 0, unit[y, m] > 0
+                else:
+                    i, j, k, m = (y - 2) % height, (y - 1) % height, (y + 1) % height, (y + 2) % height
+                    far_back, back, ahead, far_ahead = even[i, x], even[j, x], even[k, x], even[m, x]
+                    is_far_back, is_back = unit[i, x] > 0, unit[j, x] > 0
+                    is_ahead, is_far_ahead = unit[k, x] > 0, unit[m, x] > 0
+                is_back, is_ahead = is_back and u > 0, is_ahead and u > 0
+                out[y, x, axis] = _slope(ahead - z, is_ahead, z - back, is_back, u)
+                out[y, x, 2 + 2 * axis] = _beyond(z - ahead, ahead - far_ahead, is_ahead and is_far_ahead, u)
+                out[y, x, 3 + 2 * axis] = _beyond(z - back, back - far_back, is_back and is_far_back, u)

@@ -1,0 +1,150 @@
+"""How much of a point is seen from a camera: pictures of depth, compared with points of any surface.
+
+Pictures are of samples without derivative, evaluated with derivatives: see `rts.operations.coverage`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import described, from_numbers, shape_of
+from rts.arrays.engines import context_of, namespace, stopped
+from rts.arrays.trees import Array, record
+from rts.errors import InputError
+from rts.operations.coverage import coverage
+from rts.operations.depth_planes import depth_planes
+from rts.scene.camera import Camera
+
+REACH = 2
+"""Cells around a picture that `visibility` reads."""
+
+
+@record(static=("size",))
+class Picture:
+    """The samples that a camera sees in front, and their planes; with `REACH` cells around the picture.
+
+    Attributes:
+        camera: the camera. Differentiable.
+        cells: (K, H · W, 2 or 3), see `rts.operations.coverage`, of K layers. Differentiable.
+        planes: (K, H, W, 8), likewise.
+        middle: () a depth of the scene's, from which depths are counted.
+        size: (height, width) of the picture.
+    """
+
+    camera: Camera
+    cells: Array
+    planes: Array
+    middle: Array
+    size: tuple[int, int]
+
+
+@record()
+class Seen:
+    """A scene as it is seen from a place: the result of `rts.shadows.seen_from`, and a pytree of every engine.
+
+    Attributes:
+        pictures: what is seen, in one picture or several. A point is seen if no picture hides it.
+    """
+
+    pictures: tuple[Picture, ...]
+
+
+def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
+    """The share of each point that is seen, 0 to 1: of its surroundings, a few pixels of `seen` wide.
+
+    It is differentiable in the points, and in all that `seen` was made of. Derivatives are of first order.
+
+    Args:
+        seen: the result of `rts.shadows.seen_from`.
+        points: (N, 3) world.
+        outside: the result for points outside of all pictures, or behind the camera.
+
+    Returns:
+        (N,) of the engine of `seen` and points.
+
+    Raises:
+        InputError: an argument is of another kind or shape.
+    """
+    if not isinstance(seen, Seen):
+        raise InputError(f"seen is {quoted(seen)}; expected what rts.shadows.seen_from gave")
+    points = from_numbers(points, "points")
+    if len(shape_of(points)) != 2 or shape_of(points)[1] != 3:
+        raise InputError(f"points {described(points)}; expected (N, 3)")
+    context = context_of(seen, points)
+    seen, points = context.constants((seen, points))
+    xp, share, anywhere = namespace(points), None, None
+    for picture in seen.pictures:
+        one, inside = _of_picture(picture, points)
+        share = one if share is None else share * one
+        anywhere = inside if anywhere is None else anywhere | inside
+    return xp.where(anywhere, share, outside)
+
+
+def mean_visibility(seen: Seen | Sequence[Seen] | None, points: Array) -> Any:
+    """The visibility (N, 1) of a lamp at points: the mean over several records; 1.0 for None. Outside all is seen."""
+    if seen is None:
+        return 1.0
+    records = [seen] if isinstance(seen, Seen) else seen
+    total: Any = sum(visibility(one, points, outside=1.0) for one in records)
+    return total[:, None] / len(records)
+
+
+def picture_of(
+    depth: Array, moving: Array | None, alpha: Array | None, row: Array, camera: Camera, size: tuple[int, int]
+) -> Picture:
+    """The picture of samples in their cells.
+
+    Args:
+        depth: (K, H, W) linear depth, without derivative; anything where a cell has no sample.
+        moving: (K, H, W, 2) x and y of samples, of which only derivatives count; None if nothing moves.
+        alpha: (K, H, W, 1) of samples, differentiable; None if they are opaque.
+        row: (K, H, W) the sample of each cell and layer, or −1; with `REACH` cells around the picture.
+        camera: the camera, in arrays of the engine; differentiable.
+        size: (height, width) of the picture.
+    """
+    xp, there, still = namespace(depth), row >= 0, stopped(camera)
+    count = xp.sum(xp.astype(there, depth.dtype))
+    middle = xp.where(count > 0, xp.sum(xp.where(there, depth, 0.0)) / xp.where(count > 0, count, 1.0), 1.0)
+    even, unit = _even_depths(xp.where(there, depth, middle), still, middle, size)
+    unit, layers = xp.where(there, unit, 0.0), range(row.shape[0])
+    planes = xp.stack([depth_planes(even[k, ...], unit[k, ...]) for k in layers])
+    planes = xp.concat([even[..., None], unit[..., None], planes], axis=-1)
+    cells: Array = xp.zeros_like(planes[..., :2]) if moving is None else moving
+    cells = cells if alpha is None else xp.concat([cells, alpha], axis=-1)
+    return Picture(camera, xp.reshape(cells, (row.shape[0], -1, cells.shape[-1])), planes, middle, size)
+
+
+def _even_depths(depth: Array, camera: Camera, middle: Array, size: tuple[int, int]) -> tuple[Array, Array]:
+    """`even_depth` of depths, and the even depth of a cell's width there."""
+    p, xp = camera.projection, namespace(depth)
+    width = 2 / xp.sqrt(size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
+    return even_depth(depth, camera, middle), width * _clip_w(middle, camera) / _clip_w(depth, camera)
+
+
+def even_depth(depth: Array, camera: Camera, middle: Array) -> Array:
+    """A depth that grows evenly with x and y on planes: linear depth itself if orthographic, else as −1 / depth."""
+    return (depth - middle) / _clip_w(depth, camera)
+
+
+def _clip_w(depth: Array, camera: Camera) -> Array:
+    """Clip w at linear depths."""
+    return camera.projection[3, 3] - camera.projection[3, 2] * depth
+
+
+def _of_picture(picture: Picture, points: Array) -> tuple[Array, Array]:
+    """Visibility (N,) in one picture, 1 outside, and whether points are inside (N,) bool."""
+    xp, (height, width), camera = namespace(points), picture.size, stopped(picture.camera)
+    placed = picture.camera.project(points, picture.size)
+    still, depth, (near, _) = stopped(placed), stopped(placed)[:, 2], camera.depth_range()
+    inside = (still[:, 0] >= 0) & (still[:, 0] <= width) & (still[:, 1] >= 0) & (still[:, 1] <= height)
+    inside = inside & (depth >= near)
+    share = xp.ones_like(depth)
+    even = even_depth(xp.where(inside, depth, picture.middle), camera, picture.middle)
+    placed = xp.where(inside[:, None], placed[:, :2], 0.0) + REACH
+    placed = xp.astype(xp.concat([placed, even[:, None]], axis=1), picture.cells.dtype, copy=False)
+    for layer in range(picture.cells.shape[0]):
+        hidden = coverage(picture.cells[layer, ...], placed, picture.planes[layer, ...])
+        share = share * (1 - hidden[:, 0])
+    return xp.where(inside, share, 1.0), inside

@@ -1,0 +1,226 @@
+"""Shadows of any surface, with derivatives: a scene is sampled from its lights, and these samples hide points.
+
+`with_shadows` gives a light its shadows; `seen_from` and `visibility` are its two halves, of use for other questions of
+what is seen from where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.arrays.argument_checks import check_numbers, quoted
+from rts.arrays.array_functions import from_numbers, promote, shape_of, unit
+from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
+from rts.arrays.trees import Array, map_leaves
+from rts.contracts.checks import check_size
+from rts.errors import InputError
+from rts.operations.take import take
+from rts.rendering.arguments import Layers, SamplerLike
+from rts.rendering.samples import sample
+from rts.rendering.splats import to_splats
+from rts.sampling.scene import Scene
+from rts.scene.camera import Camera
+from rts.scene.default_camera import MARGIN, Bounds, bounds_of
+from rts.scene.parts import Part
+from rts.shading.visibility import Picture, Seen, picture_of, visibility
+
+__all__ = ["Seen", "seen_from", "visibility", "with_shadows"]
+
+INSIDE = 1.25
+"""Point lights nearer to the scene's centre than so many radii see it in six pictures, which make a cube."""
+NEAREST = 0.01
+"""The depth of the near plane of a point light inside the scene, in radii."""
+
+
+@uncompiled
+def seen_from(
+    parts: Part | Sequence[Part],
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    sampler: SamplerLike = "auto",
+    layers: Layers = "auto",
+    capacity: int | None = None,
+    engine: str | None = None,
+) -> Seen:
+    """What a camera sees, for `visibility`: a picture of the depths of all parts, differentiable as the parts are.
+
+    Args:
+        parts: as in `rts.render`.
+        camera: as in `rts.render`; a light's point of view, for instance.
+        size: (height, width) in pixels. Edges of what is hidden are sharp to a pixel or two.
+        sampler: as in `rts.render`.
+        layers: as in `rts.render`, of translucent parts; opaque ones need one layer.
+        capacity: as in `rts.render`.
+        engine: as in `rts.render`.
+
+    Returns:
+        A record of arrays, which may be an argument of `jax.jit`, and be kept as long as nothing moves.
+
+    Raises:
+        InputError: an argument is wrong; the scene cannot be sampled.
+        EngineError: torch and jax arrays in one scene, or arrays on two devices.
+        PluginError: a plugin cannot be imported, such as for want of a package.
+    """
+    scene = Scene.of(parts, camera, sampler, engine)
+    size = check_size(size, layers, capacity, 1)
+    solid = [part.replace(theta=part.read, shader="silhouette") for part in scene.parts if part.shader.opaque]
+    settings = camera, size, sampler
+    pictures = [_picture(solid, *settings, 1, capacity, engine)] if solid else []
+    # Translucent parts have pictures of their own, so that what they hide is hidden where they end, too.
+    for part in scene.parts:
+        if not part.shader.opaque:
+            pictures.append(_picture([_without_shadow(part)], *settings, layers, capacity, engine))
+    return Seen(tuple(pictures))
+
+
+def _picture(
+    parts: Sequence[Part], camera: Camera, size: tuple[int, int], sampler: Any, layers: Any, capacity: Any, engine: Any
+) -> Picture:
+    """The picture of parts that have one number of layers."""
+    sampled = sample(
+        parts, camera, size, sampler=sampler, splatter=None, layers=layers, capacity=capacity, engine=engine
+    )
+    scene = Scene.of(parts, camera, sampler, engine).at(size)
+    opaque, context = all(scene.opaque), scene.context
+    if opaque and sampled.depth is not None and not context.engine.differentiates:
+        depth, row, own = context.constants((sampled.depth, sampled.row, scene.camera))
+        return picture_of(depth, None, None, row, own, size)
+    splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
+    own = constants(scene.camera, engine_of(splats.positions), splats.positions)
+    positions, rgba = (_in_cells(x, splats.row) for x in (splats.positions, splats.rgba))
+    return picture_of(
+        stopped(positions[..., 2]), positions[..., :2], None if opaque else rgba[..., -1:], splats.row, own, size
+    )
+
+
+def _in_cells(values: Array, row: Array) -> Array:
+    """Values (M, C) of samples as (K, H, W, C); of some sample, or zero, where a cell has none."""
+    if not values.shape[0]:
+        values = constants(np.zeros((1, values.shape[1])), engine_of(values), values)
+    xp = namespace(values)
+    return xp.reshape(take(values, xp.reshape(xp.clip(row, 0, None), (-1,))), (*row.shape, values.shape[1]))
+
+
+def _without_shadow(part: Part) -> Part:
+    """The part whose light has no shadows: alpha does not depend on light."""
+    light = part.theta.get("light")
+    if not isinstance(light, Mapping) or "shadow" not in light:
+        return part
+    return part.replace(theta={**part.theta, "light": {k: v for k, v in light.items() if k != "shadow"}})
+
+
+def with_shadows(
+    parts: Part | Sequence[Part],
+    light: Mapping[str, Any],
+    *,
+    size: int = 512,
+    bounds: tuple[Any, float] | None = None,
+    sampler: SamplerLike = "auto",
+    layers: Layers = "auto",
+    capacity: int | None = None,
+) -> list[Part]:
+    """The parts in a light that casts shadows: `seen_from` of each distant and each point light.
+
+    Args:
+        parts: one part or several; all of them cast shadows.
+        light: θ["light"] of all parts, see `rts.shading.light`, with "direction" or "position". Light from all around
+            casts no shadow.
+        size: height and width of each picture, pixels. A pixel as small as one of the image's, or smaller, is best.
+        bounds: (center, radius) of a sphere around all that casts or receives shadows, world space; None to find it.
+            Needed where the parts are traced, as in `jax.jit`.
+        sampler: as in `rts.render`.
+        layers: as in `seen_from`.
+        capacity: as in `rts.render`, of each picture.
+
+    Returns:
+        The parts with the light, and its "shadow", in their θ. Call this again whenever something moves.
+
+    Raises:
+        InputError: an argument is wrong; the light has no place or direction; or the scene is traced, without bounds.
+    """
+    part_list: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
+    if not part_list or not all(isinstance(part, Part) for part in part_list):
+        raise InputError(f"parts is {quoted(parts)}; expected an rts.Part or several")
+    if not isinstance(light, Mapping) or not ("direction" in light or "position" in light):
+        raise InputError(f"light is {quoted(light)}; expected a dict with the 'direction' or 'position' of a light")
+    if "color" in light and "direction" not in light:
+        raise InputError("light has a 'color' of distant lights, but no 'direction'; give both")
+    sphere = _sphere(part_list, bounds)
+    cameras = [[_distant_camera(d, sphere)] for d in _vectors(light, "direction")]
+    cameras += [_point_cameras(p, sphere) for p in _vectors(light, "position")]
+    settings: dict[str, Any] = {"sampler": sampler, "layers": layers, "capacity": capacity}
+    shadows = []
+    for several in cameras:
+        records = [seen_from(part_list, camera, (size, size), **settings) for camera in several]
+        shadows.append(Seen(tuple(picture for one in records for picture in one.pictures)))
+    shadowed = {**light, "shadow": shadows}
+    return [part.replace(theta={**part.theta, "light": shadowed}) for part in part_list]
+
+
+def _vectors(light: Mapping[str, Any], name: str) -> list[Array]:
+    """The vectors (3,) of an entry (3,) or (L, 3); none if there is no such entry."""
+    if name not in light:
+        return []
+    vectors = from_numbers(light[name], f"light[{name!r}]")
+    if shape_of(vectors)[-1:] != (3,) or len(shape_of(vectors)) > 2:
+        raise InputError(f"light[{name!r}] is {quoted(light[name])}; expected vectors (3,) or (L, 3)")
+    vectors = namespace(vectors).reshape(vectors, (-1, 3))
+    return [vectors[i, :] for i in range(vectors.shape[0])]
+
+
+def _sphere(parts: Sequence[Part], bounds: Any) -> Bounds:
+    """The sphere around the parts, as given or found."""
+    if bounds is not None:
+        ok = isinstance(bounds, (list, tuple)) and len(bounds) == 2
+        center = check_numbers("the center of bounds", bounds[0], (3,)) if ok else None
+        if center is None or not 0 < bounds[1] < np.inf:
+            raise InputError(f"bounds is {quoted(bounds)}; expected (center, radius) of a sphere around the scene")
+        return Bounds(center, float(bounds[1]))
+
+    def known(x: Any) -> Any:
+        value = value_of(x)
+        if value is None:
+            raise InputError("the scene is traced, so its extent is not known; give bounds=(center, radius)")
+        return value
+
+    return bounds_of(
+        [
+            part.replace(theta=map_leaves(known, _read(part)), transform=map_leaves(known, part.transform))
+            for part in parts
+        ]
+    )
+
+
+def _read(part: Part) -> dict[str, Any]:
+    """The entries of θ that the part's surface reads."""
+    return {name: part.theta[name] for name in part.surface.reads(part.theta)}
+
+
+def _distant_camera(direction: Array, sphere: Bounds) -> Camera:
+    """The camera of a distant light, which sees all of a sphere."""
+    value, reach = value_of(direction), MARGIN * sphere.radius
+    if value is not None and not value.any():
+        raise InputError("light['direction'] is zero; expected a vector towards the light")
+    _, (toward, center) = promote(unit(direction), sphere.center)
+    return Camera.orthographic(center + reach * toward, center, height=2 * reach, aspect=1.0, far=2 * reach)
+
+
+def _point_cameras(position: Array, sphere: Bounds) -> list[Camera]:
+    """The cameras of a point light: one if it is well outside of a sphere, else those of a cube."""
+    value = value_of(position)
+    distance = 0.0 if value is None else float(np.linalg.norm(value - sphere.center))
+    if distance > INSIDE * MARGIN * sphere.radius:
+        reach = MARGIN * sphere.radius
+        fov = 2 * np.degrees(np.arcsin(reach / distance))
+        planes = {"near": distance - reach, "far": distance + reach}
+        return [Camera.look_at(position, sphere.center, fov_y=fov, aspect=1.0, **planes)]
+    planes = {"near": NEAREST * sphere.radius, "far": 4 * sphere.radius}
+    _, (position, axes) = promote(position, np.concatenate([np.eye(3), -np.eye(3)]))
+    return [
+        Camera.look_at(position, position + axes[i, :], np.eye(3)[(i + 1) % 3], fov_y=90.0, aspect=1.0, **planes)
+        for i in range(6)
+    ]
