@@ -6,7 +6,7 @@ With any ordinary renderer, find where camera rays meet a surface; evaluate it t
 differentiate only that.
 
 Names that only plugins need are in `rts.plugin_api`, the kinds of warnings in `rts.errors`, types of results in
-`rts.results`.
+`rts.results`, shadows in `rts.shadows`.
 
 The built-in surfaces are attributes of `rts`, imported on first use: `rts.Mesh`, `rts.Bezier`, `rts.BSpline`,
 `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface`, `rts.Sdf` and `rts.Skinned`. So are `rts.tune`, of the package

@@ -262,11 +262,11 @@ def test_shaders_without_colors_have_no_such_mode(shader):
 
 
 def test_what_only_looks_like_points_or_colors_stays():
-    mesh = rts.plugin("surfaces", "mesh")(QUAD, indices={"tangents": None})
+    mesh = rts.plugin("surfaces", "mesh")(QUAD, indices={"rest": None})
     light = {"direction": np.array([0.0, 0, 1]), "color": np.ones(3)}
     more = {
         "normals": np.ones((4, 3)),
-        "tangents": CARD.theta["vertices"],
+        "rest": CARD.theta["vertices"],
         "uv": UV,
         "light": light,
         "axis": np.ones(3),

@@ -60,6 +60,13 @@ WRONG = {
 }
 
 
+BAR = rts.Skinned.example()
+
+
+def bar(**entries):
+    return BAR.replace(theta={**BAR.theta, **entries})
+
+
 def theta(**entries):
     return PART.replace(theta={**PART.theta, **entries})
 
@@ -127,6 +134,12 @@ CALLS = {
     "Mesh.vertices": lambda v: rts.render(theta(vertices=v), CAMERA, SIZE),
     "Mesh.colors": lambda v: rts.render(theta(colors=v), CAMERA, SIZE),
     "Mesh.normals": lambda v: rts.render(theta(normals=v), CAMERA, SIZE),
+    "Skinned.faces": rts.Skinned,
+    "Skinned.joints": lambda v: rts.Skinned(PART.surface.faces, v),
+    "Skinned.joint_transforms": lambda v: rts.render(bar(joint_transforms=v), CAMERA, SIZE),
+    "Skinned.joint_weights": lambda v: rts.render(bar(joint_weights=v), CAMERA, SIZE),
+    "Skinned.morph_weights": lambda v: rts.render(bar(morph_weights=v), CAMERA, SIZE),
+    "Skinned.morph_vertices": lambda v: rts.render(bar(morph_vertices=v), CAMERA, SIZE),
     "Mesh.uv": shaded("textured", uv=None, texture=TEXTURE),
     "shader.texture": shaded("textured", uv=UV, texture=None),
     "shader.color": shaded("unlit", color=None),
