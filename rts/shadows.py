@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.argument_checks import check_numbers, quoted
-from rts.arrays.array_functions import from_numbers, promote, shape_of, unit
+from rts.arrays.array_functions import dot, from_numbers, promote, shape_of, unit
 from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves
+from rts.contracts.checked_parts import check_scene
 from rts.contracts.checks import check_size
 from rts.errors import InputError
 from rts.operations.take import take
@@ -25,6 +26,7 @@ from rts.sampling.scene import Scene
 from rts.scene.camera import Camera
 from rts.scene.default_camera import MARGIN, Bounds, bounds_of
 from rts.scene.parts import Part
+from rts.shading.light import check_light
 from rts.shading.visibility import Picture, Seen, picture_of, visibility
 
 __all__ = ["Seen", "seen_from", "visibility", "with_shadows"]
@@ -87,13 +89,13 @@ def _picture(
     scene = Scene.of(parts, camera, sampler, engine).at(size)
     opaque, context = all(scene.opaque), scene.context
     if opaque and sampled.depth is not None and not context.engine.differentiates:
-        depth, row, own = context.constants((sampled.depth, sampled.row, scene.camera))
-        return picture_of(depth, None, None, row, own, size)
+        depth, row, place = context.constants((sampled.depth, sampled.row, scene.camera))
+        return picture_of(depth, None, None, row, place, size)
     splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, context)
-    own = constants(scene.camera, engine_of(splats.positions), splats.positions)
+    place = constants(scene.camera, engine_of(splats.positions), splats.positions)
     positions, rgba = (_in_cells(x, splats.row) for x in (splats.positions, splats.rgba))
     return picture_of(
-        stopped(positions[..., 2]), positions[..., :2], None if opaque else rgba[..., -1:], splats.row, own, size
+        stopped(positions[..., 2]), positions[..., :2], None if opaque else rgba[..., -1:], splats.row, place, size
     )
 
 
@@ -126,12 +128,13 @@ def with_shadows(
     """The parts in a light that casts shadows: `seen_from` of each distant and each point light.
 
     Args:
-        parts: one part or several; all of them cast shadows.
+        parts: one part or several; all of them cast shadows, those that are culled from either side.
         light: θ["light"] of all parts, see `rts.shading.light`, with "direction" or "position". Light from all around
             casts no shadow.
         size: height and width of each picture, pixels. A pixel as small as one of the image's, or smaller, is best.
-        bounds: (center, radius) of a sphere around all that casts or receives shadows, world space; None to find it.
-            Needed where the parts are traced, as in `jax.jit`.
+        bounds: (center, radius) of a sphere around all that casts or receives shadows, world space, known numbers;
+            None to find it. Needed where the parts are traced, as in `jax.jit`. Where the position of a point light is
+            traced, it has six pictures, in which things far from it are small.
         sampler: as in `rts.render`.
         layers: as in `seen_from`.
         capacity: as in `rts.render`, of each picture.
@@ -149,13 +152,15 @@ def with_shadows(
         raise InputError(f"light is {quoted(light)}; expected a dict with the 'direction' or 'position' of a light")
     if "color" in light and "direction" not in light:
         raise InputError("light has a 'color' of distant lights, but no 'direction'; give both")
+    check_light({name: value for name, value in light.items() if name != "shadow"})
+    check_scene(part_list, Camera.look_at((0, 0, 1), (0, 0, 0)))
     sphere = _sphere(part_list, bounds)
     cameras = [[_distant_camera(d, sphere)] for d in _vectors(light, "direction")]
     cameras += [_point_cameras(p, sphere) for p in _vectors(light, "position")]
     settings: dict[str, Any] = {"sampler": sampler, "layers": layers, "capacity": capacity}
-    shadows = []
+    shadows, casters = [], [part.replace(cull="none") for part in part_list]
     for several in cameras:
-        records = [seen_from(part_list, camera, (size, size), **settings) for camera in several]
+        records = [seen_from(casters, camera, (size, size), **settings) for camera in several]
         shadows.append(Seen(tuple(picture for one in records for picture in one.pictures)))
     shadowed = {**light, "shadow": shadows}
     return [part.replace(theta={**part.theta, "light": shadowed}) for part in part_list]
@@ -177,9 +182,12 @@ def _sphere(parts: Sequence[Part], bounds: Any) -> Bounds:
     if bounds is not None:
         ok = isinstance(bounds, (list, tuple)) and len(bounds) == 2
         center = check_numbers("the center of bounds", bounds[0], (3,)) if ok else None
-        if center is None or not 0 < bounds[1] < np.inf:
-            raise InputError(f"bounds is {quoted(bounds)}; expected (center, radius) of a sphere around the scene")
-        return Bounds(center, float(bounds[1]))
+        radius = check_numbers("the radius of bounds", bounds[1], ()) if ok else None
+        if center is None or radius is None or radius <= 0:
+            raise InputError(
+                f"bounds is {quoted(bounds)}; expected (center, radius) of a sphere around the scene, known numbers"
+            )
+        return Bounds(center, float(radius))
 
     def known(x: Any) -> Any:
         value = value_of(x)
@@ -189,14 +197,17 @@ def _sphere(parts: Sequence[Part], bounds: Any) -> Bounds:
 
     return bounds_of(
         [
-            part.replace(theta=map_leaves(known, _read(part)), transform=map_leaves(known, part.transform))
-            for part in parts
+            part.replace(theta=map_leaves(known, _read(index, part)), transform=map_leaves(known, part.transform))
+            for index, part in enumerate(parts)
         ]
     )
 
 
-def _read(part: Part) -> dict[str, Any]:
+def _read(index: int, part: Part) -> dict[str, Any]:
     """The entries of θ that the part's surface reads."""
+    missing = [name for name in part.surface.reads(part.theta) if name not in part.theta]
+    if missing:
+        raise InputError(f"part {index} lacks {', '.join(f'theta[{name!r}]' for name in missing)}")
     return {name: part.theta[name] for name in part.surface.reads(part.theta)}
 
 
@@ -218,8 +229,12 @@ def _point_cameras(position: Array, sphere: Bounds) -> list[Camera]:
         fov = 2 * np.degrees(np.arcsin(reach / distance))
         planes = {"near": distance - reach, "far": distance + reach}
         return [Camera.look_at(position, sphere.center, fov_y=fov, aspect=1.0, **planes)]
-    planes = {"near": NEAREST * sphere.radius, "far": 4 * sphere.radius}
     _, (position, axes) = promote(position, np.concatenate([np.eye(3), -np.eye(3)]))
+    far = 4 * sphere.radius
+    if value is None:  # As far as the scene's other end.
+        offset = stopped(position) - constants(sphere.center, engine_of(position), position)
+        far = namespace(position).sqrt(dot(offset, offset)[0]) + MARGIN * sphere.radius
+    planes = {"near": NEAREST * sphere.radius, "far": far}
     return [
         Camera.look_at(position, position + axes[i, :], np.eye(3)[(i + 1) % 3], fov_y=90.0, aspect=1.0, **planes)
         for i in range(6)

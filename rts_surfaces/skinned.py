@@ -125,6 +125,13 @@ class Skinned(TriangleSurface):
         if "normals" in theta:
             check_rows(who, theta, "normals", self._normal_count)
         rows = shape_of(theta["vertices"])[0]
+        if self.joints is not None and self._normal_rows is None and "normals" in theta:
+            normals = shape_of(theta["normals"])[0]
+            if normals != rows:
+                raise InputError(
+                    f"theta['normals'] of {who} has {normals} rows, and there are {rows} vertices; expected one a "
+                    "vertex, or indices of normals"
+                )
 
         def check(name: str, *shape: int | str) -> None:
             def expected(x: tuple[int, ...]) -> str | None:

@@ -15,6 +15,8 @@ from rts.scene.parts import Part
 ANIMATIONS = (".gif", ".mp4")
 FPS = 20.0
 """Frames a second of an animation."""
+TINY = 1e-6
+"""The scale of a part in a frame that has no others."""
 SEEN = 24
 """Times of a clip at which the model is measured, so that a camera sees it in all of them."""
 
@@ -51,4 +53,12 @@ def frames_of(
 
     seen = [part for seconds in np.linspace(0, duration, SEEN) for part in parts_at(float(seconds))]
     times = np.arange(max(round(duration * FPS), 1)) / FPS if moving else [time or 0.0]
-    return [parts_at(float(seconds)) for seconds in times], bounds_of(seen)
+    frames = [parts_at(float(seconds)) for seconds in times]
+    if not any(frames):
+        raise rts.InputError(f"the clip {clip} of {model} hides all parts then; choose another time")
+    return [frame or [_nowhere(seen[0])] for frame in frames], bounds_of(seen)
+
+
+def _nowhere(part: Part) -> Part:
+    """The part too small to be seen: for a frame in which all parts are hidden."""
+    return part.replace(transform=np.diag([TINY, TINY, TINY, 1.0]))

@@ -13,7 +13,7 @@ from rts.arrays.array_functions import is_finite
 from rts.arrays.engines import value_of
 from rts.arrays.trees import Array, map_leaves
 from rts.errors import InputError, PluginError
-from rts.files.images import png_of
+from rts.files.images import pixels_of, png_of
 from rts.fitting.fit import Fit
 from rts.rendering.image import render
 from rts.sampling.prepared import Prepared
@@ -75,12 +75,11 @@ def show(thing: Array | Part | Sequence[Part] | Prepared | Fit, over: Array | No
 
 def _laid_over(image: Any, picture: Any) -> Array:
     """A premultiplied image (H, W, 4), half transparent, over a picture of the same size."""
-    image, picture = (value_of(x) if hasattr(x, "shape") else None for x in (image, picture))
-    shapes = [None if x is None else x.shape for x in (image, picture)]
-    if image is None or picture is None or image.shape[2:] != (4,) or picture.shape[2:] not in ((3,), (4,)):
-        raise InputError(f"an image {shapes[0]} over a picture {shapes[1]}; expected (H, W, 4) over (H, W, 3 or 4)")
-    if image.shape[:2] != picture.shape[:2]:
-        raise InputError(f"an image {shapes[0]} over a picture {shapes[1]}; expected one size")
+    image, picture = pixels_of(image, "the image"), pixels_of(picture, "the picture that it is laid over")
+    if image.shape[2:] != (4,) or picture.shape[2:] not in ((3,), (4,)) or image.shape[:2] != picture.shape[:2]:
+        raise InputError(
+            f"an image {image.shape} over a picture {picture.shape}; expected (H, W, 4) over (H, W, 3 or 4)"
+        )
     channels = picture.shape[2]
     return image[..., :channels] / 2 + picture * (1 - image[..., 3:] / 2)
 

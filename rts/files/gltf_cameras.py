@@ -28,14 +28,15 @@ def read_cameras(gltf: Gltf) -> list[Camera]:
     nodes, kinds = gltf.tree.get("nodes", []), gltf.tree.get("cameras", [])
     places = gltf.part("its scene", read_places, gltf) if kinds else []
     return [
-        gltf.part(f"the camera of node {index}", _camera, gltf, kinds[count_of(nodes[index]["camera"])], index, place)
+        gltf.part(f"the camera of node {index}", _camera, gltf, kinds, index, place)
         for index, place in sorted(places, key=lambda pair: pair[0])
         if "camera" in nodes[index]
     ]
 
 
-def _camera(gltf: Gltf, camera: dict[str, Any], index: int, place: np.ndarray) -> Camera:
+def _camera(gltf: Gltf, cameras: list[dict[str, Any]], index: int, place: np.ndarray) -> Camera:
     """The camera of a node, of index `index` and transform `place` (4, 4)."""
+    camera = cameras[count_of(gltf.tree["nodes"][index]["camera"])]
     if fault := fault_of(place):
         raise gltf.fail(f"the transform of the camera of node {index} {fault}")
     left, _, right = np.linalg.svd(place[:3, :3])
@@ -51,8 +52,8 @@ def _camera(gltf: Gltf, camera: dict[str, Any], index: int, place: np.ndarray) -
             return Camera(view, orthographic(2 * height, aspect, near, far), aspect)
     else:
         fov_y, far = float(numbers["yfov"]), float(numbers.get("zfar", FAR * near))
-        aspect = numbers.get("aspectRatio", "open")
-        if 0 < near < far < math.inf and 0 < fov_y < math.pi and (aspect == "open" or 0 < aspect < math.inf):
-            ratio = 1.0 if aspect == "open" else aspect
+        ratio = float(numbers.get("aspectRatio", 1.0))
+        if 0 < near < far < math.inf and 0 < fov_y < math.pi and 0 < ratio < math.inf:
+            aspect = ratio if "aspectRatio" in numbers else "open"
             return Camera(view, perspective(math.degrees(fov_y), ratio, near, far), aspect)
     raise gltf.fail(f"the camera of node {index} makes no image: {str(numbers)[:200]}")

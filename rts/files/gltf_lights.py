@@ -12,6 +12,8 @@ from rts.files.gltf_tree import Gltf, count_of
 from rts.files.model_pieces import fault_of
 
 LIGHTS = "KHR_lights_punctual"
+BRIGHTEST = 1e12
+"""Brighter lights are mistakes: the sun, seen from here, has 1e5 lux."""
 
 
 def read_lights(gltf: Gltf) -> dict[str, np.ndarray]:
@@ -39,9 +41,12 @@ def _add(gltf: Gltf, lights: list[Any], index: int, place: np.ndarray, found: di
     """Add the light of a node, of index `index` and transform `place` (4, 4), to the rows of θ["light"]."""
     name = f"the light of node {index}"
     light = lights[count_of(gltf.tree["nodes"][index]["extensions"][LIGHTS]["light"])]
-    color = np.array(light.get("color", [1.0] * 3), np.float64) * float(light.get("intensity", 1.0)) / math.pi
-    if color.shape != (3,) or not (np.isfinite(color) & (color >= 0)).all():
-        raise gltf.fail(f"{name} has color {light.get('color')} and intensity {light.get('intensity')}")
+    color, intensity = np.array(light.get("color", [1.0] * 3), np.float64), light.get("intensity", 1.0)
+    if color.shape != (3,) or not ((color >= 0) & (color <= BRIGHTEST)).all():
+        raise gltf.fail(f"{name} has color {str(light['color'])[:80]}; expected three numbers, at least 0")
+    if type(intensity) not in (int, float) or not 0 <= intensity <= BRIGHTEST:
+        raise gltf.fail(f"{name} has intensity {str(intensity)[:80]}; expected a number from 0 to {BRIGHTEST:g}")
+    color *= intensity / math.pi
     if fault := fault_of(place):
         raise gltf.fail(f"the transform of {name} {fault}")
     match light["type"]:

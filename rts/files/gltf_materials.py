@@ -122,7 +122,7 @@ def _entries(maps: Maps, material: dict[str, Any], look: dict[str, Any], name: s
         raise gltf.fail(f"the emissiveFactor of {name} is {factor.tolist()}; expected three numbers from 0 to 1")
     factor = factor * _number(gltf, strong, "emissiveStrength", 1.0, name)
     if factor.any():
-        glow = maps.read(material, "emissiveTexture", f"the emissiveTexture of {name}")
+        glow = maps.read(material, "emissiveTexture", f"the emissiveTexture of {name}", srgb=True)
         entries["emissive"] = factor if glow is None else factor * decode_srgb(glow[..., :3])
     return {entry: np.asarray(value, np.float32) for entry, value in entries.items()}
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.files.gltf_tree import Gltf, count_of
+from rts.files.srgb import decode_srgb, encode_srgb
 from rts.shading.textures import Wrap
 
 TRANSFORM = "KHR_texture_transform"
@@ -52,11 +53,12 @@ class Maps:
         self.gltf = gltf
         self.lookup: Lookup | None = None
 
-    def read(self, entry: dict[str, Any], key: str, name: str) -> np.ndarray | None:
+    def read(self, entry: dict[str, Any], key: str, name: str, srgb: bool = False) -> np.ndarray | None:
         """The pixels of a map as the file has them; None if the entry has no such key, or the kind is not read.
 
         A map with other coordinates than the first becomes its mean (1, 1, C), and one with another sampler has the
-        first one's; both are noted. `name` is for this note, and for errors.
+        first one's; both are noted. `name` is for this note, and for errors. `srgb`: the map is of encoded colours,
+        whose mean is that of what they stand for.
         """
         if key not in entry:
             return None
@@ -68,7 +70,9 @@ class Maps:
         self.lookup = first = self.lookup or lookup
         if lookup[:2] != first[:2]:
             self.gltf.note("maps with coordinates other than their material's, whose mean is taken", name)
-            return pixels.mean(axis=(0, 1), keepdims=True, dtype=np.float64).astype(np.float32)
+            pixels = decode_srgb(pixels[..., :3]) if srgb else pixels
+            mean = pixels.mean(axis=(0, 1), keepdims=True, dtype=np.float64).astype(np.float32)
+            return encode_srgb(mean) if srgb else mean
         if lookup != first:
             self.gltf.note("maps with a sampler other than their material's, which they get", name)
         return pixels

@@ -48,7 +48,7 @@ def save_image(path: Any, image: Array, exposure: float | None = None) -> None:
     from PIL import Image
 
     path = output_file(path, "picture", PICTURES)
-    kind, pixels = path.suffix.lower(), _host(image, "the image")
+    kind, pixels = path.suffix.lower(), pixels_of(image, "the image")
     if exposure is not None:
         check_exposure(exposure)
         if kind != ".png" or pixels.ndim == 2:
@@ -69,7 +69,7 @@ def png_of(image: Array) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(_bytes(_host(image, "the image"))).save(file, "PNG")
+    Image.fromarray(_bytes(pixels_of(image, "the image"))).save(file, "PNG")
     return file.getvalue()
 
 
@@ -133,7 +133,7 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
     if not (is_real(fps) and np.isfinite(fps) and fps > 0):
         raise InputError(f"fps is {quoted(fps)}; expected a positive number of frames a second")
     duration = _duration(kind, float(fps))
-    pictures = [_bytes(_on_white(_host(f, f"frame {i}"))) for i, f in enumerate(_each(frames))]
+    pictures = [_bytes(_on_white(pixels_of(f, f"frame {i}"))) for i, f in enumerate(_each(frames))]
     if not pictures or len({p.shape for p in pictures}) > 1:
         shapes = ", ".join(sorted({str(p.shape) for p in pictures})) or "nothing"
         raise InputError(f"the frames are {shapes}; expected at least one, and all of one shape")
@@ -194,7 +194,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     writer.close()
 
 
-def _host(image: Any, name: str) -> np.ndarray:
+def pixels_of(image: Any, name: str) -> np.ndarray:
     """An image as NumPy floats, (H, W, 3 or 4), or (H, W) for one channel; all else is refused, as `name`."""
     shapes = "(H, W, 4), (H, W, 3), (H, W, 1) or (H, W)"
     pixels: Any = image

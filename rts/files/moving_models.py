@@ -64,9 +64,7 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
             if not len(piece.faces):
                 continue
             check_piece(path, piece)
-            skin = gltf.tree["nodes"][node].get("skin")
-            if skin is not None and count_of(skin) >= len(skins):
-                raise gltf.fail(f"node {node} has skin {skin}, and there are {len(skins)}")
+            skin = gltf.part(f"node {node}", _skin_of, gltf, node, len(skins))
             name, count = f"the mesh of node {node}", None if skin is None else len(skins[skin].joints)
             deformation = gltf.part(name, read_deformation, gltf, name, primitive, accessors, count)
             is_bent = deformation is not None and deformation.joints is not None
@@ -86,6 +84,14 @@ def load_model(path: Any, *, weld: bool = True, cull: str = "none") -> Model:
         gltf.warn_of_notes()
     warn_once(path, notes)
     return replace(model, parts=tuple(model.posed(model.pose())))
+
+
+def _skin_of(gltf: Gltf, node: int, count: int) -> int | None:
+    """The skin of a node, of so many; None if it has none."""
+    skin = gltf.tree["nodes"][node].get("skin")
+    if skin is not None and count_of(skin) >= count:
+        raise gltf.fail(f"node {node} has skin {skin}, and there are {count}")
+    return skin
 
 
 def _part(path: Path, piece: Piece, deformation: Deformation | None, weld: bool) -> Part:

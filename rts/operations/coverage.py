@@ -21,7 +21,8 @@ def coverage(cells: Array, points: Array, planes: Array) -> Array:
     """The covered share of points (N, 1), 0 to 1, differentiable in cells and points, to first order.
 
     A cell is in front of a point if its plane is, and if it is in front of the plane of the point's own surface, where
-    some cell around shows that. So neither slopes nor edges of solids shade themselves.
+    some cell around shows that. So neither slopes nor edges of solids shade themselves, if they are two cells wide:
+    the slope of a surface across a single cell is not known.
 
     Args:
         cells: (H · W, 2) x and y of the sample in each cell, of which only derivatives count; with alpha, if the
@@ -54,7 +55,7 @@ def _specification(cells: Array, points: Array, planes: Array) -> Array:
     dx, dy = ([c - k - (i + 0.5) for i in range(4)] for c, k in zip((x, y), corner, strict=True))
     first = xp.astype(corner[1], xp.int32) * width + xp.astype(corner[0], xp.int32)
     flat, alphas = xp.reshape(planes, (-1, 8)), stopped(cells)[:, 2] if translucent else None
-    around, closest, own = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
+    around, closest, surface = {}, xp.ones_like(x) * OWN, [xp.zeros_like(x)] * 3
     for j, i in itertools.product(range(4), range(4)):
         index = first + (j * width + i)
         plane = xp.take(flat, index, axis=0)
@@ -63,11 +64,12 @@ def _specification(cells: Array, points: Array, planes: Array) -> Array:
         seen = xp.where(there, z + a * dx[i] + b * dy[j], FAR)
         around[j, i] = index, z, seen, there & (seen < depth - BIAS * steep)
         off = xp.where(there, abs(seen - depth) / xp.where(there, steep, 1.0), FAR)
-        own = [xp.where(off < closest, new, old) for new, old in zip((a, b, steep), own, strict=True)]
+        surface = [xp.where(off < closest, new, old) for new, old in zip((a, b, steep), surface, strict=True)]
         closest = xp.where(off < closest, off, closest)
     covers, weights = {}, {}
     for (j, i), (index, z, _, front) in around.items():
-        front = front & ((closest >= OWN) | (z < depth - own[0] * dx[i] - own[1] * dy[j] - BIAS * own[2]))
+        rise_x, rise_y, steep = surface
+        front = front & ((closest >= OWN) | (z < depth - rise_x * dx[i] - rise_y * dy[j] - BIAS * steep))
         weights[j, i] = xp.where(front, cubic(dx[i]) * cubic(dy[j]), 0.0)
         alpha = xp.ones_like(x) if alphas is None else xp.take(alphas, index)
         covers[j, i] = xp.where(front, alpha, 0.0)

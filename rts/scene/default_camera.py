@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.arrays.array_functions import described
 from rts.errors import InputError
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
@@ -40,8 +41,12 @@ def bounds_of(parts: Sequence[Part]) -> Bounds:
         InputError: all vertices are in one point, or a surface cannot become a mesh.
     """
     points = []
-    for part in parts:
+    for index, part in enumerate(parts):
+        if not hasattr(part.surface, "tessellate"):
+            raise InputError(f"the extent of part {index}, {part.surface!r}, is not known: it cannot become a mesh")
         vertices = np.asarray(part.surface.tessellate(part.theta, ROUGHLY)[0], np.float64)
+        if vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
+            raise InputError(f"the vertices of part {index}: {described(vertices)}; expected finite numbers (V, 3)")
         m = part.transform
         points.append(vertices if m is None else vertices @ m[:3, :3].T + m[:3, 3])
     everything = np.concatenate(points)

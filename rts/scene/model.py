@@ -159,10 +159,10 @@ class Model:
         xp = engine.namespace
         done, order = [], []
         for nodes, parents in self._levels:
-            own = xp.take(local, engine.constant(nodes, local), axis=0)
+            level = xp.take(local, engine.constant(nodes, local), axis=0)
             if done:
-                own = _products(xp.take(done[-1], engine.constant(parents, local), axis=0), own)
-            done.append(own)
+                level = _products(xp.take(done[-1], engine.constant(parents, local), axis=0), level)
+            done.append(level)
             order.append(nodes)
         if not done:
             return local
@@ -172,7 +172,8 @@ class Model:
         """The parts in a pose, differentiable in its arrays.
 
         θ["joint_transforms"] and θ["morph_weights"] of parts of the surface `skinned` are those of the pose; parts
-        without joints have their node's place as transform. θ stays in float32 where the pose is in NumPy.
+        without joints have their node's place as transform, which clips may make singular to hide them: leave such
+        parts out. θ stays in float32 where the pose is in NumPy.
 
         Args:
             pose: as `pose` gives it, perhaps with arrays of another engine in place of its own.
@@ -180,6 +181,8 @@ class Model:
         Raises:
             InputError: the pose has another number of nodes, or of morph weights.
         """
+        if not isinstance(pose, Pose) or not isinstance(pose.morph_weights, (list, tuple)):
+            raise InputError(f"pose is {quoted(pose)}; expected a Pose, such as model.pose(clip, time) gives")
         if len(pose.morph_weights) != len(self.nodes):
             raise InputError(
                 f"pose.morph_weights has {len(pose.morph_weights)} entries; expected {len(self.nodes)}, one a node"
@@ -193,7 +196,10 @@ class Model:
             if skin is not None:
                 theta["joint_transforms"] = joints[skin]
             if "morph_vertices" in theta:
-                theta["morph_weights"] = pose.morph_weights[node]
+                weights, count = pose.morph_weights[node], shape_of(theta["morph_vertices"])[0]
+                if not hasattr(weights, "shape") or shape_of(weights) != (count,):
+                    raise InputError(f"pose.morph_weights[{node}] is {quoted(weights)}; expected an array ({count},)")
+                theta["morph_weights"] = weights
             place = None if skin is not None else places[node, :, :]
             if engine.name == "numpy" and place is not None and np.array_equal(place, np.eye(4)):
                 place = None

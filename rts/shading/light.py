@@ -127,8 +127,7 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
     entries = theta.get("light", {})
     if not isinstance(entries, Mapping):
         raise InputError(f"theta['light'] is a {type(entries).__name__}; expected a dict of {', '.join(ENTRIES)}")
-    for name, value in entries.items():
-        _check(name, value)
+    check_light(entries)
     usual = not any(name in entries for name in FURTHER)
     light = Light(ambient=entries.get("ambient", AMBIENT if usual else None), sh=entries.get("sh"))
     if usual or "direction" in entries or "color" in entries:
@@ -157,6 +156,12 @@ def light_of(theta: Mapping[str, Tree], camera: Camera | RowCameras) -> Light:
                 f"one for each distant light, then one for each point light: a result of seen_from, or None"
             )
     return light
+
+
+def check_light(entries: Mapping[str, Any]) -> None:
+    """Refuse entries of θ["light"] with a wrong name, shape or dtype, or that are not finite."""
+    for name, value in entries.items():
+        _check(name, value)
 
 
 def _check(name: str, value: Any) -> None:

@@ -193,7 +193,7 @@ def _bilinear(
 def _wrapped(index: Array, count: Any, wrap: str) -> Array:
     """Whole-numbered floats as int32 in [0, count), by `wrap` where they lie outside; 0 for NaN."""
     xp = namespace(index)
-    index = xp.where(index == index, index, 0.0)  # NaN has no texel; as an index it would be out of range.
+    index = xp.where(index - index == 0, index, 0.0)  # NaN and infinity have no texel; they would be out of range.
     if wrap == "repeat":
         index = index - xp.floor(index / count) * count
     elif wrap == "mirror":

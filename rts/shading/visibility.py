@@ -12,6 +12,7 @@ from rts.arrays.argument_checks import quoted
 from rts.arrays.array_functions import described, from_numbers, shape_of
 from rts.arrays.engines import context_of, namespace, stopped
 from rts.arrays.trees import Array, record
+from rts.contracts.checks import is_real
 from rts.errors import InputError
 from rts.operations.coverage import coverage
 from rts.operations.depth_planes import depth_planes
@@ -72,13 +73,15 @@ def visibility(seen: Seen, points: Array, outside: float = 0.0) -> Array:
     points = from_numbers(points, "points")
     if len(shape_of(points)) != 2 or shape_of(points)[1] != 3:
         raise InputError(f"points {described(points)}; expected (N, 3)")
+    if not is_real(outside) or not 0 <= outside <= 1:
+        raise InputError(f"outside is {quoted(outside)}; expected a number from 0 to 1")
     context = context_of(seen, points)
     seen, points = context.constants((seen, points))
-    xp, share, anywhere = namespace(points), None, None
+    xp = namespace(points)
+    share, anywhere = xp.ones_like(points[:, 0]), xp.zeros_like(points[:, 0], dtype=xp.bool)
     for picture in seen.pictures:
         one, inside = _of_picture(picture, points)
-        share = one if share is None else share * one
-        anywhere = inside if anywhere is None else anywhere | inside
+        share, anywhere = share * one, anywhere | inside
     return xp.where(anywhere, share, outside)
 
 

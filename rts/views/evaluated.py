@@ -14,6 +14,7 @@ from rts.arrays.trees import Array, leaves
 from rts.contracts.checked_parts import CheckedPart
 from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
+from rts.contracts.shader import Shader
 from rts.rendering.shade import evaluate, split_by_view
 from rts.rendering.splats import concatenated
 from rts.shading.tangents import TANGENT
@@ -82,11 +83,19 @@ def _reads_tangents(part: CheckedPart) -> bool:
     return part.reads is None or TANGENT in part.reads
 
 
+def _differ(a: Shader, b: Shader) -> bool:
+    """True unless two shaders are known to be equal; records that hold arrays do not say whether they are."""
+    try:
+        return a is not b and not bool(a == b)
+    except ValueError:
+        return True
+
+
 def _of_all(parts: Sequence[CheckedPart | None], gbuffers: Sequence[GBuffer]) -> CheckedPart | None:
     """A part whose shader sees the same θ, and the same attributes, in all views; None if there is none."""
     known = [part for part in parts if part is not None]
     first, reads = known[0], known[0].reads
-    if reads is None or any(part.shader != first.shader for part in known):
+    if reads is None or any(_differ(part.shader, first.shader) for part in known):
         return None
     if any(set(gbuffer) != set(gbuffers[0]) for gbuffer in gbuffers):
         return None

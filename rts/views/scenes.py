@@ -23,7 +23,7 @@ def scenes_of_views(parts: Any, cameras: Sequence[Camera], sampler: SamplerLike,
         return [scene._replace(camera=camera) for camera in cameras]
     if len(parts) != len(cameras):
         raise InputError(
-            f"{len(parts)} scenes were given with {len(cameras)} cameras; expected a camera for each scene"
+            f"{len(parts)} scene{'s'[: len(parts) != 1]} came with {len(cameras)} cameras; expected one for each"
         )
     scenes = []
     for b, (own, camera) in enumerate(zip(parts, cameras, strict=True)):

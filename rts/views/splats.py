@@ -116,19 +116,17 @@ def _positions_and_colors(
         assert counts is not None
 
         def colored(view: tuple) -> Array:
-            own, transform, grid_camera, camera, (samples, local) = view
-            if own is None or not local["position"].shape[0]:
-                # Shaders may expect a row at least.
-                like = shown.gbuffer["position"]
-                channels = next(p for p in parts if p is not None).shader.channels
-                return context.constants(namespace(like).broadcast_to(like[:1, :1], (1, channels + 1))[:0, ...])
-            add_footprint(own, samples, local, grid_camera, size, inputs)
-            theta = theta_of(own, inputs)
-            return context.constants(shade(own, theta, transform, samples, local, camera, engine)[1])
+            seen, transform, grid_camera, camera, (samples, local) = view
+            add_footprint(seen, samples, local, grid_camera, size, inputs)
+            theta = theta_of(seen, inputs)
+            return context.constants(shade(seen, theta, transform, samples, local, camera, engine)[1])
 
         split = shown.split(whole, counts, engine)
         views = list(zip(parts, shown.transforms, local_cameras, cameras, split, strict=True))
-        colors = [colored(views[0])]
+        # Shaders may expect a row at least. Rows of other views are none.
+        views = [view for view in views if view[0] is not None and view[-1][1]["position"].shape[0]]
+        channels = next(p for p in parts if p is not None).shader.channels
+        colors = [colored(views[0]) if views else context.constants(np.zeros((0, channels + 1), np.float32))]
         colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray else map(colored, views[1:])
         (rgba,) = concatenated(colors)
     rgba = context.constants(rgba)
@@ -137,8 +135,8 @@ def _positions_and_colors(
     # Values in unused rows are not checked.
     count = shown.gbuffer["position"].shape[0]
     every = np.arange(count, dtype=np.int32)[None, None] if counts is not None else whole.row
-    own = next(p for p in parts if p is not None)
-    check_splats(index, own, shown.gbuffer, positions, rgba, every, 0)
+    seen = next(p for p in parts if p is not None)
+    check_splats(index, seen, shown.gbuffer, positions, rgba, every, 0)
     return positions, rgba
 
 

@@ -79,7 +79,9 @@ def test_files_without_lights_have_none(tmp_path):
     [
         ({"type": "sun"}, {}, "the light of node 0 is of type 'sun'; expected directional, point or spot"),
         ({"type": "point", "color": [1, 2]}, {}, r"the light of node 0 has color \[1, 2\]"),
-        ({"type": "point", "intensity": -1}, {}, "the light of node 0 has color None and intensity -1"),
+        ({"type": "point", "intensity": -1}, {}, "the light of node 0 has intensity -1"),
+        ({"type": "point", "intensity": 1e300}, {}, "has intensity 1e.300; expected a number from 0 to 1e.12"),
+        ({"type": "point", "intensity": True}, {}, "has intensity True; expected a number"),
         ({"type": "point"}, {"scale": [1, 1, 0]}, "the transform of the light of node 0 is singular"),
         ({}, {}, "the light of node 0: 'type' is missing"),
     ],

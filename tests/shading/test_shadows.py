@@ -1,5 +1,7 @@
 """Shadows: closed forms of their edges and derivatives, no shadow of a surface on itself, and lights that cast them."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -302,3 +304,41 @@ def test_wrong_arguments_are_refused():
         shadows.visibility(seen, FLOOR[0])
     with pytest.raises(rts.InputError, match="traced"):
         jax.jit(lambda v: shadows.with_shadows(part(v, SQUARE), {"direction": np.ones(3)})[0].theta["vertices"])(FLOOR)
+
+
+def test_a_scene_that_has_no_extent_is_refused_and_culled_parts_cast_shadows():
+    light = {"direction": np.array([0, 1.0, 0])}
+    lid = part(FLOOR * np.float32(0.3) + np.float32([0, 1, 0]), np.ascontiguousarray(SQUARE[:, ::-1])).replace(
+        cull="back"
+    )
+    lit = shadows.with_shadows([part(FLOOR, SQUARE), lid], light, size=32)
+    seen = lit[0].theta["light"]["shadow"][0]
+    assert lit[1].cull == "back" and shadows.visibility(seen, np.zeros((1, 3), np.float32), 1.0)[0] < 1e-6
+    field = rts.plugin("surfaces", "sdf").example()
+    for wrong, message in (
+        ([field], "cannot become a mesh"),
+        ([part(FLOOR, SQUARE).replace(theta={})], "vertices"),
+        ([part(FLOOR[:, :2], SQUARE)], "vertices"),
+        ([part(FLOOR * np.nan, SQUARE)], "finite"),
+    ):
+        with pytest.raises(rts.InputError, match=message):
+            shadows.with_shadows(wrong, light, size=16)
+    for bounds in (([0, 0, 0], "x"), ([0, 0, 0], np.ones(2)), ([0, 0, 0], -1.0)):
+        with pytest.raises(rts.InputError, match="bounds"):
+            shadows.with_shadows([part(FLOOR, SQUARE)], light, size=16, bounds=bounds)
+    for outside in ("a", math.nan, None):
+        with pytest.raises(rts.InputError, match="outside"):
+            shadows.visibility(seen, FLOOR, outside)
+
+
+def test_a_far_point_light_keeps_its_shadow_where_its_place_is_traced():
+    lid = part(jnp.asarray(FLOOR * np.float32(0.5) + np.float32([0, 1, 0])), SQUARE)
+
+    def share(place):
+        lit = shadows.with_shadows(
+            [part(jnp.asarray(FLOOR), SQUARE), lid], {"position": place}, size=64, bounds=([0, 0, 0], 4.5)
+        )
+        return shadows.visibility(lit[0].theta["light"]["shadow"][0], jnp.zeros((1, 3)), 1.0)[0]
+
+    place = jnp.array([0.0, 25.0, 0.0])
+    assert share(place) < 0.01 and jax.jit(share)(place) < 0.3

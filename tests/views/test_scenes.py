@@ -1,5 +1,7 @@
 """Scenes of their own in one call of `rts.render_views`: images and gradients of a loop."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers import TORCH, arrays, box, gradient, icosphere, relative_error, rigid, to_numpy
@@ -185,9 +187,48 @@ def test_residuals_of_outputs_take_scenes():
 def test_wrong_scenes_are_refused():
     transforms, scenes = pieces()
     own = scenes(transforms)
-    with pytest.raises(InputError, match="4 scenes were given with 3 cameras"):
+    with pytest.raises(InputError, match="4 scenes came with 3 cameras"):
         rts.render_views(own, CAMERAS[:3], SIZE)
     with pytest.raises(InputError, match="both parts and scenes"):
         rts.render_views([own[0], own[1][0]], CAMERAS[:2], SIZE)
     with pytest.raises(InputError, match="scene 1: parts holds nothing"):
         rts.render_views([own[0], []], CAMERAS[:2], SIZE)
+
+
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
+def test_views_that_see_nothing_take_the_kind_of_the_others():
+    weight = torch.tensor(0.5, requires_grad=True)
+
+    def shader(theta, gbuffer, camera):
+        rows = torch.as_tensor(np.asarray(gbuffer["position"]))
+        return torch.cat([(rows * 0 + 1) * weight, rows[:, :1] * 0 + 1], 1)
+
+    quad = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    part = rts.Part(rts.Mesh([[0, 1, 2], [0, 2, 3]]), {"vertices": quad}, shader)
+    here, away = (rts.Camera.look_at((0, 0, 5), (0, 0, z)) for z in (0, 20))
+    for cameras in ([here, here, away], [away, here, here]):
+        images = rts.render_views(part, cameras, (24, 24), layers=1)
+        for image, camera in zip(images, cameras, strict=True):
+            torch.testing.assert_close(
+                image, torch.as_tensor(rts.render(part, camera, (24, 24), layers=1)).to(image.dtype)
+            )
+        images.sum().backward()
+
+
+def test_shaders_that_hold_arrays_are_those_of_their_scenes():
+    @dataclasses.dataclass
+    class Tint(rts.Shader):
+        tint: np.ndarray
+        opaque: bool = True
+        reads: tuple = ("normal",)
+        channels: int = 3
+
+        def __call__(self, theta, gbuffer, camera):
+            return np.concatenate([0 * gbuffer["position"] + self.tint, np.ones((len(gbuffer["position"]), 1))], 1)
+
+    quad = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    mesh, camera = rts.Mesh([[0, 1, 2], [0, 2, 3]]), rts.Camera.look_at((0, 0, 5), (0, 0, 0))
+    colors = np.eye(3)[:2]
+    scenes = [[rts.Part(mesh, {"vertices": quad}, Tint(color))] for color in colors]
+    images = rts.render_views(scenes, [camera] * 2, (24, 24))
+    np.testing.assert_allclose(images[:, 12, 12, :3], colors, atol=1e-6)

@@ -77,7 +77,12 @@ def find_cameras(photos: Any, out: Any, *, size: int = 1600) -> FoundCameras:
             cameras found: photographs overlap too little, or show too little texture.
         PluginError: pycolmap is missing (extra `photos`).
     """
+    for name, value in (("photos", photos), ("out", out)):
+        if not isinstance(value, (str, os.PathLike)):
+            raise rts.InputError(f"{name} is {value!r:.60}; expected a folder")
     photos, out = Path(photos), Path(out)
+    if out.exists() and not out.is_dir():
+        raise rts.InputError(f"{out} is a file; expected a folder")
     if isinstance(size, bool) or not isinstance(size, int) or size < 64:
         raise rts.InputError(f"size is {size!r:.40}; expected a number of pixels, at least 64")
     files = photographs_in(photos)
@@ -166,7 +171,7 @@ def _upright(files: list[Path], photos: Path, to: Path) -> tuple[tuple[str, ...]
             with Image.open(file) as picture:
                 exif = picture.getexif()
                 lens = exif.get_ifd(0x8769)
-                upright = ImageOps.exif_transpose(picture) if exif.get(ORIENTATION, 1) != 1 else None
+                upright = ImageOps.exif_transpose(picture) if exif.get(ORIENTATION) in range(2, 9) else None
                 if upright is None:
                     picture.load()
                     shutil.copy2(file, to / file.name)
@@ -174,7 +179,7 @@ def _upright(files: list[Path], photos: Path, to: Path) -> tuple[tuple[str, ...]
                     upright.save(to / file.name, exif=upright.getexif(), quality=95)
                     turned.append(file.name)
                 found = (upright or picture).size
-        except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
             raise rts.InputError(f"{file} cannot be read as a picture ({error}); take it out of {photos}") from None
         groups.setdefault((found, str(lens.get(37386)), exif.get(272)), []).append(file.name)
     return tuple(turned), groups
