@@ -115,21 +115,21 @@ class Joint:
         real = np.float64 if context.like is not None and floating_bits(context.like) == 64 else np.float32
         arrays: list[np.ndarray] = [row, packed.depth, ids, packed.overflow]
         names = []
-        for part, (own, params, seen) in zip(self.parts, tables, strict=True):
-            used = np.arange(len(own), dtype=np.int32)[None, None] - np.int32(not seen)
-            known = _evaluated(part, own, params, context.engine.differentiates)
+        for part, (ids_of_part, params, seen) in zip(self.parts, tables, strict=True):
+            used = np.arange(len(ids_of_part), dtype=np.int32)[None, None] - np.int32(not seen)
+            known = _evaluated(part, ids_of_part, params, context.engine.differentiates)
             names.append(None if known is None else list(known))
-            arrays += [own, params, used, *(np.asarray(x, real) for x in (known or {}).values())]
+            arrays += [ids_of_part, params, used, *(np.asarray(x, real) for x in (known or {}).values())]
         specs = [ArraySpec(x.shape, x.dtype) for x in arrays]
         like = [] if context.like is None else [context.like]
         results = iter(context.engine.call_host(lambda *_: arrays, specs, *like))
         row, depth, triangle, overflow = (next(results) for _ in range(4))
         samples = []
         for part, known in zip(self.parts, names, strict=True):
-            own, params, used = next(results), next(results), next(results)
+            ids_of_part, params, used = next(results), next(results), next(results)
             gbuffer = None if known is None else {name: next(results) for name in known}
             cells = Cells(used)
-            samples.append(Samples(own, params, cells, overflow, gbuffer=gbuffer, gbuffer_names=part.reads))
+            samples.append(Samples(ids_of_part, params, cells, overflow, gbuffer=gbuffer, gbuffer_names=part.reads))
         return Sampled(tuple(samples), Cells(row, depth, triangle), overflow)
 
     def _by_part(
@@ -194,9 +194,9 @@ def _joined(scene: Scene, grid: Grid, indices: Sequence[int]) -> Iterator[Joint]
         return 0 < len(proxy.faces) <= MOST, scene.parts[index].cull == "back" and mirrored, *tables
 
     for (few, *_), run in itertools.groupby(indices, kind):
-        own = list(run)
-        if few and len(own) > 1:
-            yield Joint.of(scene, own[0], [proxies[i] for i in own], [cameras[i] for i in own])
+        numbers = list(run)
+        if few and len(numbers) > 1:
+            yield Joint.of(scene, numbers[0], [proxies[i] for i in numbers], [cameras[i] for i in numbers])
 
 
 def is_suited(part: CheckedPart, sampler: object) -> bool:

@@ -56,8 +56,8 @@ class View(NamedTuple):
         sampler, cull, like = scene.samplers[0], scene.parts[0].cull, scene.context.like
         if not isinstance(sampler, TriangleSampler) or (like is not None and scene.context.engine.padded(like)):
             return None
-        for part, own in zip(scene.parts, scene.samplers, strict=True):
-            if own is not sampler or part.cull != cull or not is_suited(part, own):
+        for part, chosen_sampler in zip(scene.parts, scene.samplers, strict=True):
+            if chosen_sampler is not sampler or part.cull != cull or not is_suited(part, chosen_sampler):
                 return None
         if not is_known(scene, grid):
             return None
@@ -71,8 +71,8 @@ class View(NamedTuple):
             local = on_host(grid.camera.within(part.transform).for_size(grid.size))
             local = check_camera(local, *([] if part.transform is None else [host_value(part.transform)]))
             if entry is None:
-                own = map_leaves(host_value, proxy_inputs(part)) if inputs is None else inputs[index]
-                entry = entry_of(part, sampler, own, local, grid.size)
+                arrays = map_leaves(host_value, proxy_inputs(part)) if inputs is None else inputs[index]
+                entry = entry_of(part, sampler, arrays, local, grid.size)
             if not 0 < len(entry.proxy.faces) <= MOST:
                 return None
             rows = np.concatenate([p[:2] @ local.view, local.view[2:3]])
@@ -81,7 +81,9 @@ class View(NamedTuple):
             mirrored |= local.kept_sign(cull) != sign
         if mirrored or not all(_is_inside(x, camera, grid.size) for x in seen):
             return None
-        tables = {tuple(None if x is None else x.shape[1:] for x in (own.ids, own.corner_params)) for own in proxies}
+        tables = {
+            tuple(None if x is None else x.shape[1:] for x in (proxy.ids, proxy.corner_params)) for proxy in proxies
+        }
         widths = tuple(f"{x:.5g}" for x in pixel_widths(camera, grid.size))
         kind = id(sampler), cull, sign, widths, p[3].tobytes(), grid.size, *tables
         return cls(scene, grid, camera, proxies, seen, kind)

@@ -61,7 +61,7 @@ class Evaluated(NamedTuple):
                 pieces.append((of_view, GBuffer(position=params[:, :1])))
             else:
                 pieces.append((of_view, evaluate(part, of_view, inputs)))
-        shown = [local for (own, local) in pieces if own.ids.shape[0]]
+        shown = [local for (samples, local) in pieces if samples.ids.shape[0]]
         (position,) = concatenated([local["position"] for local in shown])
         whole = GBuffer(position=position)
         for name in set.intersection(*(set(local) for local in shown)) - {"position"}:

@@ -40,10 +40,12 @@ def _by_place(sampled: Sampled, picture: Picture, numbers: Sequence[int]) -> Vie
         numbers: the number of parts of each view.
     """
     places = np.concatenate([np.arange(n) for n in numbers])
-    sizes = np.array([own.ids.shape[0] for own in sampled.samples])
+    sizes = np.array([table.ids.shape[0] for table in sampled.samples])
     counts = np.zeros((max(numbers), len(numbers)), np.int64)
     counts[places, np.repeat(np.arange(len(numbers)), numbers)] = sizes
-    tables = [[own for own, at in zip(sampled.samples, places, strict=True) if at == n] for n in range(max(numbers))]
+    tables = [
+        [table for table, at in zip(sampled.samples, places, strict=True) if at == n] for n in range(max(numbers))
+    ]
     samples = tuple(map(_in_one_table, tables))
     cells, outlines = replace(sampled.cells, triangle=None), sampled.outlines
     if max(numbers) > 1:
@@ -59,9 +61,9 @@ def _by_place(sampled: Sampled, picture: Picture, numbers: Sequence[int]) -> Vie
 
 def _in_one_table(samples: Sequence[Samples]) -> Samples:
     """The samples of several parts as one table, with attributes if all of them have the same."""
-    names = {None if own.gbuffer is None else (*own.gbuffer, own.gbuffer_names) for own in samples}
+    names = {None if table.gbuffer is None else (*table.gbuffer, table.gbuffer_names) for table in samples}
     if len(names) > 1:
-        samples = [replace(own, gbuffer=None) for own in samples]
+        samples = [replace(table, gbuffer=None) for table in samples]
     whole = in_one_table(samples)
     row = np.arange(whole.ids.shape[0], dtype=np.int32)[None, None]
     return replace(whole, cells=Cells(engine_of(whole.ids).constant(row, whole.ids)))

@@ -129,7 +129,7 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
     """The images (B, H, W, C + 1) of several views, without a background."""
     of_scene = {id(scene.parts): settings.of(scene) for scene in distinct(scenes)}
     of_views = [of_scene[id(scene.parts)] for scene in scenes]
-    views = [_view(scene, size, own) for scene, own in zip(scenes, of_views, strict=True)]
+    views = [_view(scene, size, chosen) for scene, chosen in zip(scenes, of_views, strict=True)]
     kinds: dict[Any, list[int]] = {}
     for b, view in enumerate(views):
         kinds.setdefault(None if view is None else (of_views[b], view.kind), []).append(b)
@@ -137,14 +137,14 @@ def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, se
         kinds = {None: list(range(len(scenes)))}
     images: list[Any] = [None] * len(scenes)
     for kind, indices in kinds.items():
-        own = [scenes[b] for b in indices]
+        of_kind = [scenes[b] for b in indices]
         if kind is not None and len(indices) > 1:
             together = [view for b in indices if (view := views[b]) is not None]
             drawn = _drawn_at_once(together, context, of_views[indices[0]])
-        elif len(distinct(own)) == 1 and len(own) > 1:
-            drawn = _images_of_scene(own, size, context, of_views[indices[0]])
+        elif len(distinct(of_kind)) == 1 and len(of_kind) > 1:
+            drawn = _images_of_scene(of_kind, size, context, of_views[indices[0]])
         else:
-            drawn = [image_of(scene, size, context, settings) for scene in own]
+            drawn = [image_of(scene, size, context, settings) for scene in of_kind]
         if len(indices) == len(scenes) and not isinstance(drawn, list):
             return drawn
         for b, image in zip(indices, drawn, strict=True):

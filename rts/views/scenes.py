@@ -26,9 +26,9 @@ def scenes_of_views(parts: Any, cameras: Sequence[Camera], sampler: SamplerLike,
             f"{len(parts)} scene{'s'[: len(parts) != 1]} came with {len(cameras)} cameras; expected one for each"
         )
     scenes = []
-    for b, (own, camera) in enumerate(zip(parts, cameras, strict=True)):
+    for b, (of_view, camera) in enumerate(zip(parts, cameras, strict=True)):
         try:
-            scenes.append(Scene.of(own, camera, sampler, engine))
+            scenes.append(Scene.of(of_view, camera, sampler, engine))
         except InputError as error:
             raise InputError(f"scene {b}: {error}") from error
     return scenes
@@ -42,7 +42,7 @@ def are_scenes(parts: Any) -> bool:
     """
     if not isinstance(parts, (list, tuple)):
         return False
-    several = [isinstance(own, (list, tuple, Prepared)) for own in parts]
+    several = [isinstance(x, (list, tuple, Prepared)) for x in parts]
     if any(several) and not all(several):
         raise InputError(
             "parts holds both parts and scenes; expected the parts of one scene, or a list of parts for each scene"

@@ -56,7 +56,7 @@ def views_to_splats(
         here = slice(start, start := start + picture.picture.views)
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = concatenated(*zip(*of_parts, strict=True))
-        splats.append(splats_of(whole, [own for several in parts for own in several], positions, rgba, context))
+        splats.append(splats_of(whole, [table for several in parts for table in several], positions, rgba, context))
     return splats
 
 
