@@ -240,6 +240,7 @@ CALLS = {
     "load.merge": lambda v: rts.load("no such model.obj", merge=v),
     "load_image.path": rts.load_image,
     "show.thing": rts.show,
+    "show.over": lambda v: rts.show(np.zeros((2, 2, 4)), v),
     "save_image.path": lambda v: rts.save_image(v, np.zeros((2, 2, 4))),
     "save_image.image": lambda v: rts.save_image("never written.png", v),
     "save_animation.path": lambda v: rts.save_animation(v, [np.zeros((2, 2, 4))]),
@@ -298,8 +299,8 @@ def splatter():
 
 OPTIONAL = """
     render.background render.capacity render.engine render.outputs sample.splatter render_samples.background
-    prepare.camera prepare.size
-    Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
+    prepare.camera prepare.size show.over splatter.calibration
+    Part.transform Mesh.indices Skinned.joints look_at.aspect look_at.near look_at.far within.transform
     ImageResiduals.weights ImageResiduals.f_scale fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
     fit.patience fit.schedule Stage.supersample pyramid.largest
     Isosurface.band Isosurface.lipschitz Isosurface.reads Isosurface.attributes Sdf.lipschitz Sdf.steps
