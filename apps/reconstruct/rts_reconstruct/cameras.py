@@ -136,6 +136,7 @@ def with_cameras(views: Any, out: Path) -> Any:
     if (folder / "sparse").exists() or any(file.suffix in TABLES for file in folder.iterdir()):
         return views
     if not (out / "sparse").exists():
+        _pycolmap()  # Where it is missing, that is all there is to say.
         print(f"{folder} has photographs without cameras: looking for them, which takes minutes", file=sys.stderr)
         print(f"{find_cameras(folder, out)}; {out} is a data set of COLMAP", file=sys.stderr)
     return out
