@@ -15,7 +15,7 @@ from rts.arrays.argument_checks import check_numbers, quoted
 from rts.arrays.array_functions import dot, from_numbers, promote, shape_of, unit
 from rts.arrays.engines import constants, engine_of, namespace, stopped, uncompiled, value_of
 from rts.arrays.trees import Array, map_leaves
-from rts.contracts.checked_parts import check_scene
+from rts.contracts.checked_parts import check_parts, listed_parts
 from rts.contracts.checks import check_size
 from rts.errors import InputError
 from rts.operations.take import take
@@ -48,7 +48,7 @@ def seen_from(
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Seen:
-    """What a camera sees, for `visibility`: a picture of the depths of all parts, differentiable as the parts are.
+    """Sample a scene from a camera, for `visibility`: a picture of depths, differentiable as the parts are.
 
     Args:
         parts: as in `rts.render`.
@@ -145,15 +145,13 @@ def with_shadows(
     Raises:
         InputError: an argument is wrong; the light has no place or direction; or the scene is traced, without bounds.
     """
-    part_list: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
-    if not part_list or not all(isinstance(part, Part) for part in part_list):
-        raise InputError(f"parts is {quoted(parts)}; expected an rts.Part or several")
+    part_list = listed_parts(parts)
+    check_parts(part_list)
     if not isinstance(light, Mapping) or not ("direction" in light or "position" in light):
         raise InputError(f"light is {quoted(light)}; expected a dict with the 'direction' or 'position' of a light")
     if "color" in light and "direction" not in light:
         raise InputError("light has a 'color' of distant lights, but no 'direction'; give both")
     check_light({name: value for name, value in light.items() if name != "shadow"})
-    check_scene(part_list, Camera.look_at((0, 0, 1), (0, 0, 0)))
     sphere = _sphere(part_list, bounds)
     cameras = [[_distant_camera(d, sphere)] for d in _vectors(light, "direction")]
     cameras += [_point_cameras(p, sphere) for p in _vectors(light, "position")]

@@ -15,8 +15,6 @@ from rts.scene.parts import Part
 ANIMATIONS = (".gif", ".mp4")
 FPS = 20.0
 """Frames a second of an animation."""
-TINY = 1e-6
-"""The scale of a part in a frame that has no others."""
 SEEN = 24
 """Times of a clip at which the model is measured, so that a camera sees it in all of them."""
 
@@ -33,6 +31,8 @@ def frames_of(
     model: Path, clip: str, time: float | None, moving: bool, cull: str = "none"
 ) -> tuple[list[list[Part]], Bounds]:
     """The parts of a model at one time of a clip, or, if `moving`, at each frame; and the bounds of the whole clip.
+
+    A frame has no parts where the clip hides them all.
 
     Args:
         model: a GLB or glTF.
@@ -56,9 +56,4 @@ def frames_of(
     frames = [parts_at(float(seconds)) for seconds in times]
     if not any(frames):
         raise rts.InputError(f"the clip {clip} of {model} hides all parts then; choose another time")
-    return [frame or [_nowhere(seen[0])] for frame in frames], bounds_of(seen)
-
-
-def _nowhere(part: Part) -> Part:
-    """The part too small to be seen: for a frame in which all parts are hidden."""
-    return part.replace(transform=np.diag([TINY, TINY, TINY, 1.0]))
+    return frames, bounds_of(seen)

@@ -190,6 +190,7 @@ def render(
     from rts.diagnostics.measuring_api import size_of, supersample_of
     from rts.files.images import PICTURES
     from rts.files.paths import output_file
+    from rts.rendering.image import over_background
     from rts.scene.default_camera import bounds_of, orbit
     from rts.shading.tone_mapping import check_exposure
 
@@ -237,14 +238,15 @@ def render(
             return scene
         return rts.shadows.with_shadows(scene, light, size=2 * max(shape), bounds=bounds, sampler=sampler)
 
-    parts = frames[0]
-    scene = lit(parts)
     options: dict[str, Any] = {"sampler": sampler, "splatter": splatter, "layers": layers_of(layers)}
     options["supersample"] = supersample_of(supersample)
     start = time.perf_counter()
     lines: list[str] = []
+    parts = next(filter(None, frames))
+    scene = lit(parts)
     if output.suffix.lower() in ANIMATIONS:
-        images = (rts.render(lit(frame), seen, shape, **options, background=color) for frame in frames)
+        empty = over_background(np.zeros((*shape, 4), np.float32), color)
+        images = (rts.render(lit(f), seen, shape, **options, background=color) if f else empty for f in frames)
         rts.save_animation(output, images, FPS)
     else:
         found = rts.render(scene, seen, shape, **options, background=color, outputs=names)

@@ -57,10 +57,7 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
 
     Shaders are looked up by name, and lists of numbers become arrays. Arrays of several engines are not detected here.
     """
-    part_list: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
-    if not part_list or not all(isinstance(p, Part) for p in part_list):
-        kinds = ", ".join(sorted({type(p).__name__ for p in part_list})) or "nothing"
-        raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
+    part_list = listed_parts(parts)
     if not isinstance(camera, Camera):
         several = isinstance(camera, (list, tuple)) and any(isinstance(c, Camera) for c in camera)
         hint = "; rts.render_views takes several" if several else ""
@@ -71,9 +68,23 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
             f"takes several, and camera.unstack() gives them one by one"
         )
     camera = _check_camera(camera)
-    checked = [_check_part(index, part) for index, part in enumerate(part_list)]
+    return check_parts(part_list), camera
+
+
+def listed_parts(parts: Any) -> list[Part]:
+    """A list of one part, or of several; anything else raises an `InputError`."""
+    part_list: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
+    if not part_list or not all(isinstance(p, Part) for p in part_list):
+        kinds = ", ".join(sorted({type(p).__name__ for p in part_list})) or "nothing"
+        raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
+    return part_list
+
+
+def check_parts(parts: Sequence[Part]) -> list[CheckedPart]:
+    """The parts, checked as `check_scene` says."""
+    checked = [_check_part(index, part) for index, part in enumerate(parts)]
     check_channels(checked)
-    return checked, camera
+    return checked
 
 
 def check_cameras(cameras: Any) -> list[Camera]:

@@ -28,7 +28,7 @@ MARGIN = 1
 
 
 class View(NamedTuple):
-    """What a view shows. Host arrays.
+    """A view that can be drawn along with others: its scene, and where its triangles are seen. Host arrays.
 
     Attributes:
         scene: the scene.

@@ -56,7 +56,7 @@ class Skin(NamedTuple):
 
 
 class Binding(NamedTuple):
-    """What moves a part.
+    """The node, and perhaps the skin, that move a part.
 
     Attributes:
         node: the index of the node that it belongs to.

@@ -6,9 +6,13 @@ import json
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, rotation, to_numpy
+from PIL import Image, ImageSequence
+from typer.testing import CliRunner
 
 import rts
 from rts import InputError
+from rts.cli.clip_frames import frames_of
+from rts.cli.main import app
 from rts.errors import FileWarning
 from rts.results import Channel, Clip
 
@@ -273,3 +277,20 @@ def test_a_model_has_the_lights_and_cameras_of_its_file(tmp_path):
     np.testing.assert_allclose(np.linalg.inv(model.cameras[0].view)[:3, 3], [9, 9, 9])
     plain = rts.load_model(Bar().written(tmp_path))
     assert plain.lights == {} and plain.cameras == ()
+
+
+def test_frames_in_which_a_clip_hides_everything_are_background(tmp_path):
+    bar = Bar()
+    bar.nodes[0] = {"mesh": 0}
+    del bar.primitive["attributes"]["JOINTS_0"], bar.primitive["attributes"]["WEIGHTS_0"]
+    sizes = np.array([(1, 1, 1), (0, 0, 0), (1, 1, 1)])
+    bar.sampler |= {"output": bar.add(sizes.astype(float)), "interpolation": "STEP"}
+    bar.clip["channels"][0]["target"] = {"node": 0, "path": "scale"}
+    model, options = str(bar.written(tmp_path)), ["--clip", "wave", "--size", "16"]
+    done = CliRunner().invoke(app, ["render", model, *options, "-o", str(tmp_path / "a.gif")])
+    assert done.exit_code == 0, done.output
+    with Image.open(tmp_path / "a.gif") as frames:
+        shown = [bool(np.ptp(np.asarray(f.convert("RGB")), axis=(0, 1)).any()) for f in ImageSequence.Iterator(frames)]
+    assert shown[0] and not all(shown)
+    with pytest.raises(InputError, match="hides all parts then; choose another time"):
+        frames_of(bar.written(tmp_path), "wave", 1.5, False)

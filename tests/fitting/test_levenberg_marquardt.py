@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, to_numpy
+from linear_problem import MATRIX, SOLUTION, joined, line
 
 import rts
 from rts.fitting.least_squares import _Model
@@ -14,23 +15,10 @@ pytestmark = pytest.mark.fitting
 
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 
-MATRIX = np.random.default_rng(5).normal(size=(9, 3))
-SOLUTION = np.array([1.0, -2.0, 0.5])
-
-
-def line(target):
-    """Residuals of linear least squares that vanish at SOLUTION, and where to start."""
-    matrix, goal = arrays(target, MATRIX), arrays(target, MATRIX @ SOLUTION)
-    return lambda p: matrix @ p - goal, arrays(target, np.zeros(3))
-
 
 def rosenbrock(p):
     """Its two residuals, by the arithmetic that every engine has."""
     return p[:1] * 0 + 1 - p[:1], 10 * (p[1:] - p[:1] ** 2)
-
-
-def joined(target, pieces):
-    return pytest.importorskip("jax").numpy.concatenate(pieces) if target == "jax" else _torch().cat(pieces)
 
 
 def _torch():

@@ -30,7 +30,7 @@ ORIENTATION = 274
 
 @dataclass(frozen=True)
 class FoundCameras:
-    """What `find_cameras` found. Its text is a line on how good it is.
+    """Cameras of photographs, as `find_cameras` gives them. Printed, they are a line on how good they are.
 
     Attributes:
         folder: a data set of COLMAP: `images`, and the model `sparse/0`. `rts.load_views` reads it.
