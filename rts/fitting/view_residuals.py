@@ -41,12 +41,14 @@ class ViewResiduals(Residuals):
     are needed, and kept within a bound of memory. With jax, pictures of one size share a compiled program.
 
     Args:
-        scene: parameters → part or parts, in the world of the views' cameras.
+        scene: parameters → part or parts, in the world of the views' cameras. With `per_view`, `scene(parameters, view)`.
         views: the views, such as `rts.load_views` gives; at least one.
         batch: the number of views that count at a step: all are shuffled, taken one batch after the other, and
             shuffled again. None for all views at every step, as Levenberg–Marquardt needs them.
         window: (height, width) of the part of each picture that counts at a step, at random places; None for all of it.
         seed: of the shuffles and places. The same seed and step give the same.
+        per_view: True where each view shows a scene of its own, such as a robot with other joints: `scene` also gets the
+            view's number, an integer array that may be traced.
         cameras: `cameras(parameters, camera, view)` → camera, to fit cameras: from the view's own `camera` and the
             view's number, an integer array that may be traced. None for the views' own cameras. For example
             `lambda p, camera, i: camera.within(rts.rigid(p["poses"][i]))`, where the world moves before the camera.
@@ -82,12 +84,13 @@ class ViewResiduals(Residuals):
 
     def __init__(
         self,
-        scene: Callable[[Tree], Any],
+        scene: Callable[..., Any],
         views: Sequence[View],
         *,
         batch: int | None = None,
         window: tuple[int, int] | None = None,
         seed: int = 0,
+        per_view: bool = False,
         cameras: Callable[[Tree, Camera, Array], Camera] | None = None,
         exposure: Callable[[Tree], Any] | None = None,
         weights: Any = None,
@@ -107,7 +110,9 @@ class ViewResiduals(Residuals):
         self.views = checked_views(views)
         check_functions(scene, cameras, exposure, target)
         self._scene, self._cameras, self._exposure, self._target = scene, cameras, exposure, target
-        self._weights = checked_weights(weights, len(self.views))
+        if not isinstance(per_view, bool):
+            raise InputError(f"per_view is {quoted(per_view)}; expected True or False")
+        self._weights, self._per_view = checked_weights(weights, len(self.views)), per_view
         self._batch, self._window = checked_draws(batch, window, self.views)
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise InputError(f"seed is {quoted(seed)}; expected a whole number, at least 0")
@@ -212,7 +217,7 @@ class ViewResiduals(Residuals):
                     raise InputError(f"cameras gave {quoted(camera)}; expected an rts.Camera")
             if "window" in data:
                 camera = camera.replace(projection=matmul(data["window"], camera.projection), aspect=None)
-            parts = self._scene(parameters)
+            parts = self._scene(parameters, data["view"]) if self._per_view else self._scene(parameters)
             if self._exposure is not None:
                 parts = exposed(parts, self._exposure(parameters), data["view"], len(self.views))
             return parts, camera

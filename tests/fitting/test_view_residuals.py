@@ -5,6 +5,7 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, box, quick, to_numpy
 
 import rts
+from rts.arrays.engines import engine_of, namespace
 from rts.errors import FileWarning, InputError, InputWarning
 
 pytestmark = pytest.mark.fitting
@@ -36,11 +37,35 @@ def views(images=IMAGES, **options):
     return [rts.View(camera, image, name=f"{i}.png", **options) for i, (camera, image) in pairs]
 
 
+TURNS = np.float32([0.0, 0.4, -0.3, 0.8, 0.1])
+
+
+def turned(parameters, number, turns=TURNS):
+    """A box that a pose moves, turned in each view by an angle of its own."""
+    xp = namespace(parameters["pose"])
+    angle = xp.take(engine_of(parameters["pose"]).constant(turns, parameters["pose"]), xp.asarray(number)[None])
+    return part({"pose": xp.concat([parameters["pose"][:2], parameters["pose"][2:3] + angle, parameters["pose"][3:]])})
+
+
 def moved(target):
     return arrays(target, {"pose": np.array([0.1, -0.05, 0.08, 0.03, 0.02, -0.04])})
 
 
 # ------------------------------------------------------------------------------------------------------- terms
+
+
+@targets
+def test_scenes_may_differ_from_view_to_view(target):
+    p = moved(target)
+    residuals = rts.ViewResiduals(turned, views(), per_view=True)
+    for number, turn in enumerate(TURNS):
+        alone = rts.ImageResiduals(lambda q: turned(q, 0, [turn]), CAMERAS[number], SIZE, IMAGES[number])  # noqa: B023
+        found = residuals.of(residuals.load((number, None)))
+        np.testing.assert_allclose(to_numpy(found(p)), to_numpy(alone(p)), atol=1e-6)
+    images = [rts.render(turned(STILL, i), camera, SIZE) for i, camera in enumerate(CAMERAS)]
+    residuals = rts.ViewResiduals(turned, views(images), per_view=True)
+    fit = rts.fit(residuals, p, method="lm", steps=8)
+    np.testing.assert_allclose(to_numpy(fit.parameters["pose"]), STILL["pose"], atol=2e-3)
 
 
 @targets
@@ -299,6 +324,7 @@ def test_inverted_masks_are_warned_of_once():
         ({"weights": [0] * 5}, "not all zero"),
         ({"unreadable": "ignore"}, "unreadable is 'ignore'"),
         ({"memory": -1}, "memory is -1"),
+        ({"per_view": 1}, "per_view is 1"),
         ({"supersample": 0}, "supersample is 0"),
         ({"loss": "square"}, "square"),
     ],
