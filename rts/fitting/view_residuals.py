@@ -41,14 +41,14 @@ class ViewResiduals(Residuals):
     are needed, and kept within a bound of memory. With jax, pictures of one size share a compiled program.
 
     Args:
-        scene: parameters → part or parts, in the world of the views' cameras. With `per_view`, `scene(parameters, view)`.
+        scene: parameters → part or parts, in the world of the views' cameras. See `per_view`.
         views: the views, such as `rts.load_views` gives; at least one.
         batch: the number of views that count at a step: all are shuffled, taken one batch after the other, and
             shuffled again. None for all views at every step, as Levenberg–Marquardt needs them.
         window: (height, width) of the part of each picture that counts at a step, at random places; None for all of it.
         seed: of the shuffles and places. The same seed and step give the same.
-        per_view: True where each view shows a scene of its own, such as a robot with other joints: `scene` also gets the
-            view's number, an integer array that may be traced.
+        per_view: True where each view shows a scene of its own, such as a robot with other joints: it is
+            `scene(parameters, view)`, of the view's number, an integer array that may be traced.
         cameras: `cameras(parameters, camera, view)` → camera, to fit cameras: from the view's own `camera` and the
             view's number, an integer array that may be traced. None for the views' own cameras. For example
             `lambda p, camera, i: camera.within(rts.rigid(p["poses"][i]))`, where the world moves before the camera.
