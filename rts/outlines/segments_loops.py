@@ -186,16 +186,27 @@ def beyond(ties, count):
 
 
 @compiled
-def _meeting(start, ahead, end, back, meeting):
-    """Fill `meeting` with where lines from `start` along `ahead` and to `end` along `back` meet; True if between."""
+def _row(table, n):
+    """A row of a table (N, 2) as two numbers."""
+    return table[n, 0], table[n, 1]
+
+
+@compiled
+def _minus(a, b):
+    """The difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1]
+
+
+@compiled
+def _meeting(start, ahead, end, back):
+    """Where lines from `start` along `ahead` and to `end` along `back` meet, and True if that is between."""
     turn = ahead[0] * back[1] - ahead[1] * back[0]
     if not abs(turn) > STRAIGHT * np.hypot(ahead[0], ahead[1]) * np.hypot(back[0], back[1]):
-        meeting[0], meeting[1] = start[0], start[1]
-        return False
+        return start, False
     t = ((end[0] - start[0]) * back[1] - (end[1] - start[1]) * back[0]) / turn
-    meeting[0], meeting[1] = start[0] + t * ahead[0], start[1] + t * ahead[1]
+    meeting = start[0] + t * ahead[0], start[1] + t * ahead[1]
     there = (end[0] - meeting[0]) * back[0] + (end[1] - meeting[1]) * back[1]
-    return t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
+    return meeting, t * np.hypot(ahead[0], ahead[1]) > CLOSE and there > CLOSE * np.hypot(back[0], back[1])
 
 
 @compiled
@@ -205,11 +216,11 @@ def _angle(a, b):
 
 
 @compiled
-def _inward(tangent, side, way):
-    """Fill `way` with a direction, turned into a square from one of its sides."""
+def _inward(tangent, side):
+    """A direction, turned into a square from one of its sides."""
     into = (tangent[1], -tangent[0], -tangent[1], tangent[0])[side]
     sign = 1.0 if into >= 0 else -1.0
-    way[0], way[1] = sign * tangent[0], sign * tangent[1]
+    return sign * tangent[0], sign * tangent[1]
 
 
 @compiled
@@ -241,46 +252,43 @@ def corners(first, last, origin, ties, square_sides, around, place, tangent, tri
         corner: to fill.
         pull: to fill.
     """
-    sharp, curve, way = np.empty(2), np.empty(2), np.empty(2)
     for s in range(first, last):
-        start, end = place[ties[s, 0]], place[ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0]]
-        for a in range(2):
-            corner[s, a] = (start[a] + end[a]) / 2
+        start, end = _row(place, ties[s, 0]), _row(place, ties[s, 1] if ties[s, 1] >= 0 else ties[s, 0])
+        x, y = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
         alone, on, back = 0.0, 0.0, 0.0
         tip = ties[s, 1] >= 0 and square_sides[s, 0] == square_sides[s, 1]
         if tip:
             a, b = ties[s, 0], ties[s, 1]
-            _inward(tangent[a], square_sides[s, 0], way)
-            _inward(tangent[b], square_sides[s, 1], sharp)
-            tip = _meeting(start, way, end, -sharp, curve) and _within(curve, origin, s)
+            way, other = _inward(_row(tangent, a), square_sides[s, 0]), _inward(_row(tangent, b), square_sides[s, 1])
+            curve, between = _meeting(start, way, end, (-other[0], -other[1]))
+            tip = between and _within(curve, origin, s)
             share = 1.0 if triangle[a] >= 0 and triangle[a] == triangle[b] else 2 / 3
-            for i in range(2):
-                corner[s, i] += share * (curve[i] - corner[s, i]) if tip else 0.0
+            if tip:
+                x, y = x + share * (curve[0] - x), y + share * (curve[1] - y)
         if around[s, 1] >= 0 and around[s, 2] >= 0:
-            before, after = place[around[s, 1]], place[around[s, 2]]
-            if not tip and _meeting(start, end - before, end, after - start, curve) and _within(curve, origin, s):
-                for i in range(2):
-                    corner[s, i] += 2 / 3 * (curve[i] - corner[s, i])
-            ahead, behind = start - before, after - end
-            if _meeting(start, ahead, end, behind, sharp) and _within(sharp, origin, s):
+            before, after = _row(place, around[s, 1]), _row(place, around[s, 2])
+            curve, between = _meeting(start, _minus(end, before), end, _minus(after, start))
+            if not tip and between and _within(curve, origin, s):
+                x, y = x + 2 / 3 * (curve[0] - x), y + 2 / 3 * (curve[1] - y)
+            ahead, behind = _minus(start, before), _minus(after, end)
+            sharp, between = _meeting(start, ahead, end, behind)
+            if between and _within(sharp, origin, s):
                 beside = 0.0
                 if around[s, 0] >= 0:
-                    beside += _angle(before - place[around[s, 0]], ahead)
+                    beside += _angle(_minus(before, _row(place, around[s, 0])), ahead)
                 if around[s, 3] >= 0:
-                    beside += _angle(behind, place[around[s, 3]] - after)
+                    beside += _angle(behind, _minus(_row(place, around[s, 3]), after))
                 alone = min(max(1 - beside / max(_angle(ahead, behind), 1e-6), 0.0), 1.0)
-            for i in range(2):
-                corner[s, i] += alone * (sharp[i] - corner[s, i]) if alone > 0 else 0.0
             if alone > 0:
-                on = np.hypot(corner[s, 0] - start[0], corner[s, 1] - start[1]) / np.hypot(ahead[0], ahead[1])
-                back = np.hypot(corner[s, 0] - end[0], corner[s, 1] - end[1]) / np.hypot(behind[0], behind[1])
-        chord_x, chord_y = end[0] - start[0], end[1] - start[1]
-        share = (corner[s, 0] - start[0]) * chord_x + (corner[s, 1] - start[1]) * chord_y
-        share = min(max(share / max(chord_x * chord_x + chord_y * chord_y, 1e-12), 0.0), 1.0)
+                x, y = x + alone * (sharp[0] - x), y + alone * (sharp[1] - y)
+                on = np.hypot(x - start[0], y - start[1]) / np.hypot(ahead[0], ahead[1])
+                back = np.hypot(x - end[0], y - end[1]) / np.hypot(behind[0], behind[1])
+        chord = _minus(end, start)
+        share = (x - start[0]) * chord[0] + (y - start[1]) * chord[1]
+        share = min(max(share / max(chord[0] * chord[0] + chord[1] * chord[1], 1e-12), 0.0), 1.0)
         # The corner of two straight lines moves as both of them say; a point of a curve as the ends of its chord do.
         lines = alone if on < 2 and back < 2 else 0.0
         pull[s, 0], pull[s, 3] = -lines * on / 2, -lines * back / 2
         pull[s, 1] = (1 - lines) * (1 - share) + lines * (1 + on) / 2
         pull[s, 2] = (1 - lines) * share + lines * (1 + back) / 2
-        corner[s, 0] -= origin[s, 1] + 0.5
-        corner[s, 1] -= origin[s, 0] + 0.5
+        corner[s, 0], corner[s, 1] = x - (origin[s, 1] + 0.5), y - (origin[s, 0] + 0.5)

@@ -94,12 +94,10 @@ def _box(a, b, c, seen, height, width, box):
     """
     area = (seen[b, 0] - seen[a, 0]) * (seen[c, 1] - seen[a, 1])
     area -= (seen[c, 0] - seen[a, 0]) * (seen[b, 1] - seen[a, 1])
-    if np.isnan(area):
-        box[0], box[1], box[2], box[3] = 0.0, width, 0.0, height
-        return area
     for axis in range(2):
-        box[2 * axis] = min(seen[a, axis], seen[b, axis], seen[c, axis]) - SLACK
-        box[2 * axis + 1] = max(seen[a, axis], seen[b, axis], seen[c, axis]) + SLACK
+        low, high = min(seen[a, axis], seen[b, axis], seen[c, axis]), max(seen[a, axis], seen[b, axis], seen[c, axis])
+        box[2 * axis] = 0.0 if np.isnan(area) else low - SLACK
+        box[2 * axis + 1] = (width if axis == 0 else height) if np.isnan(area) else high + SLACK
     return area
 
 
@@ -204,21 +202,12 @@ def spans_of(
                     continue
                 _on_line(t, corners, sign, clip, cut, vertices, faces, axis, n + 0.5, line)
                 least, most = _inside(line, box[2 * axis] - 1.0, box[2 * axis + 1] + 1.0)
-                gaps = table[n, low], table[n, high]
-                count = _add(t, gaps, least, most, gap[:, 1 - axis], line, corners, names, spans, count)
-
-
-@compiled
-def _add(t, gaps, least, most, centres, line, corners, names, spans, count):
-    """Add the spans of a triangle on some gaps of a line, where it is seen from `least` to `most`; returns `count`."""
-    for g in range(gaps[0], gaps[1]):
-        start, end = least - 0.5 - centres[g], most - 0.5 - centres[g]
-        if min(end, 1.0) - max(start, 0.0) <= TINY:
-            continue
-        names[count, 0], names[count, 1] = g, t
-        _fill(spans[count], start, end, line, corners, centres[g] + 0.5)
-        count += 1
-    return count
+                for g in range(table[n, low], table[n, high]):
+                    start, end = least - 0.5 - gap[g, 1 - axis], most - 0.5 - gap[g, 1 - axis]
+                    if min(end, 1.0) - max(start, 0.0) > TINY:
+                        names[count, 0], names[count, 1] = g, t
+                        _fill(spans, count, start, end, line, corners, gap[g, 1 - axis] + 0.5)
+                        count += 1
 
 
 @compiled
@@ -266,21 +255,19 @@ def _inside(line, low, high):
         elif d < 0:
             high = min(high, -c / d)
         elif c < 0:
-            return 0.0, -1.0
+            high = -np.inf
     # An edge along the line, but for rounding, meets it farther away than integers reach.
     return (low, high) if low < high else (0.0, -1.0)
 
 
 @compiled
-def _fill(span, start, end, line, corners, origin):
-    """Fill in a span: its ends along a gap that begins at `origin` of a line, and its depth's coefficients."""
-    span[0], span[1], span[2:] = start, end, 0.0
+def _fill(spans, n, start, end, line, corners, origin):
+    """Fill in span n: its ends along a gap that begins at `origin` of a line, and its depth's coefficients."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         at = line[k, 0] + line[k, 1] * origin
-        span[2] += at * corners[k, 3]
-        span[3] += line[k, 1] * corners[k, 3]
-        span[4] += at
-        span[5] += line[k, 1]
+        a, b, c, d = a + at * corners[k, 3], b + line[k, 1] * corners[k, 3], c + at, d + line[k, 1]
+    spans[n, 0], spans[n, 1], spans[n, 2], spans[n, 3], spans[n, 4], spans[n, 5] = start, end, a, b, c, d
 
 
 @loop
@@ -310,10 +297,10 @@ def depth_at(spans, i, place):
 
 
 @compiled
-def _nearest(spans, place, beyond):
-    """The nearest of a gap's spans that covers `place`, and goes on after it; −1 for none."""
+def _nearest(spans, begin, stop, place, beyond):
+    """The nearest of a gap's spans, `begin` to `stop`, that covers `place`, and goes on after it; −1 for none."""
     best = NOTHING
-    for i in range(len(spans)):
+    for i in range(begin, stop):
         if spans[i, 0] <= place + beyond and spans[i, 1] > place + beyond:
             if best < 0 or depth_at(spans, i, place) < depth_at(spans, best, place):
                 best = i
@@ -321,20 +308,20 @@ def _nearest(spans, place, beyond):
 
 
 @compiled
-def _next_start(spans, place):
+def _next_start(spans, begin, stop, place):
     """The least start of a span of a gap at or after a place; infinite if there is none."""
     best = np.inf
-    for i in range(len(spans)):
+    for i in range(begin, stop):
         if spans[i, 1] > place + TOUCH and spans[i, 0] < best:
             best = spans[i, 0]
     return max(best, place)
 
 
 @compiled
-def _overtaken(spans, x, place):
+def _overtaken(spans, begin, stop, x, place):
     """Where the span x ends, or another comes before it, after `place`; and which one does, or −9."""
     best, by = spans[x, 1], -9
-    for i in range(len(spans)):
+    for i in range(begin, stop):
         low, high = max(place, spans[i, 0]), min(spans[x, 1], spans[i, 1])
         if i == x or high - low <= TINY:
             continue
@@ -356,120 +343,115 @@ def _overtaken(spans, x, place):
 
 
 @compiled
-def _fronts(spans, triangles, parts, ends, end_depth, pieces, starts):
+def _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts):
     """The fronts along a gap: which span is the nearest, and from which place on. Returns their number.
 
     Args:
-        spans: (N, 6), those of the gap; see `spans_of`.
-        triangles: (N,) int32.
-        parts: (N,) int32.
-        ends: (2, 2) int32, part and triangle of the samples at both centres; −1 where nothing is seen.
-        end_depth: (2,) their depths.
-        pieces: (2 N + 4,) int32 or more, to fill: spans, NOTHING, FIRST or SECOND.
+        g: the gap.
+        begin: its first span.
+        stop: the span after its last.
+        spans: see `breaks`.
+        names: see `breaks`.
+        parts: see `breaks`.
+        ends: see `breaks`.
+        end_depth: see `breaks`.
+        pieces: (2 N + 4,) int64 or more for its N spans, to fill: spans, NOTHING, FIRST or SECOND.
         starts: (2 N + 4,) float64 or more, to fill: where they begin.
     """
-    room, n, place, x = 2 * len(spans) + 3, 0, 0.0, NOTHING
+    room, n, place, until, x = 2 * (stop - begin) + 3, 0, 0.0, 1.0, NOTHING
     for k in range(2):
-        _agree(spans, ends[k, 0] >= 0, end_depth[k], k)
-    if ends[0, 0] >= 0:
+        _agree(spans, begin, stop, ends[g, k, 0] >= 0, end_depth[g, k], k)
+    if ends[g, 0, 0] >= 0:
         x = FIRST
-        for i in range(len(spans)):
-            if parts[i] == ends[0, 0] and triangles[i] == ends[0, 1] and spans[i, 0] <= TOUCH:
+        for i in range(begin, stop):
+            if parts[i] == ends[g, 0, 0] and names[i, 1] == ends[g, 0, 1] and spans[i, 0] <= TOUCH:
                 x = i
-    while n < room:
+    while n < room and place < until:
         pieces[n], starts[n] = x, place
-        n += 1
+        n, by, beyond = n + 1, -9, TOUCH
         if x == NOTHING:
-            place = _next_start(spans, place)
-            if not place < 1 - TOUCH:
-                break
-            x = _nearest(spans, place, TOUCH)
+            place = _next_start(spans, begin, stop, place)
         elif x == FIRST:
-            x = _nearest(spans, 0.0, TINY)
+            beyond = TINY
         else:
-            place, by = _overtaken(spans, x, place)
-            if place >= (1 - TOUCH if by < 0 else 1.0):
-                break
-            x = by if by >= 0 else _nearest(spans, place, TOUCH)
+            place, by = _overtaken(spans, begin, stop, x, place)
+        until = 1 - TOUCH if by < 0 else 1.0
+        x = by if by >= 0 else _nearest(spans, begin, stop, place, beyond)
     # The sample at the second centre has the last word.
-    x, last_part = pieces[n - 1], ends[1, 0]
-    known = x >= 0 and last_part == parts[x] and ends[1, 1] == triangles[x]
+    x, last_part = pieces[n - 1], ends[g, 1, 0]
+    known = x >= 0 and last_part == parts[x] and ends[g, 1, 1] == names[x, 1]
     if not known and not (x == NOTHING and last_part < 0):
         pieces[n], starts[n] = (SECOND if last_part >= 0 else NOTHING), 1.0
         n += 1
         # The line runs along an edge that both samples are on: nothing ends there, nor lies before it.
-        if pieces[0] == FIRST and last_part == ends[0, 0] and _all_of(pieces[:n], parts, last_part):
+        if pieces[0] == FIRST and last_part == ends[g, 0, 0] and _all_of(pieces, n, parts, last_part):
             n = 1
     return n
 
 
 @compiled
-def _all_of(pieces, parts, part):
-    """True if no piece of front is another part's."""
-    for x in pieces:
-        if x >= 0 and parts[x] != part:
-            return False
-    return True
+def _all_of(pieces, count, parts, part):
+    """True if none of some pieces of front is another part's."""
+    found = True
+    for n in range(count):
+        found &= pieces[n] < 0 or parts[pieces[n]] == part
+    return found
 
 
 @compiled
-def _agree(spans, seen, depth, centre):
+def _agree(spans, begin, stop, seen, depth, centre):
     """Empty the spans that reach over a centre before what is seen there: they touch the line with an edge alone."""
-    for i in range(len(spans)):
+    for i in range(begin, stop):
         if spans[i, 0] < centre - TOUCH and spans[i, 1] > centre + TOUCH:
             if not seen or depth_at(spans, i, centre) < depth - ALIKE * abs(depth):
                 spans[i, 0], spans[i, 1] = 9.0, 9.0
 
 
 @compiled
-def _goes_on(spans, parts, x, place, way):
+def _goes_on(spans, begin, stop, parts, x, place, way):
     """True if a surface that ends (way 1) or starts (way 0) at a place with the span x goes on there with another."""
-    for i in range(len(spans)):
+    found, z = False, depth_at(spans, x, place)
+    for i in range(begin, stop):
         if i != x and parts[i] == parts[x] and abs(spans[i, 1 - way] - place) <= TOUCH:
-            if abs(depth_at(spans, i, place) - depth_at(spans, x, place)) <= ALIKE * abs(depth_at(spans, x, place)):
-                return True
-    return False
+            found |= abs(depth_at(spans, i, place) - z) <= ALIKE * abs(z)
+    return found
 
 
 @compiled
-def _kind(spans, triangles, parts, ends, depth, a, b, place):
+def _kind(before, behind, one_triangle, nearer, seamless, stops, starts):
     """How a front changes at a place: 0 or 1, the surface before or behind it ends; 2, they cross; 3, not at all.
 
     Args:
-        spans: (N, 6), see `_fronts`.
-        triangles: (N,).
-        parts: (N,).
-        ends: (2, 2).
-        depth: (2,), of the samples at both centres.
-        a: the piece of front before the place.
-        b: the piece behind.
-        place: the place.
+        before: the part before the place, or −1.
+        behind: the part behind, or −1.
+        one_triangle: True if the triangle before is that behind.
+        nearer: 0 if the surface before is nearer, 1 if that behind is; −1 if they meet.
+        seamless: True if one part's span ends, where another one of it starts.
+        stops: True if the surface before ends there, and goes on with no other span.
+        starts: True if that behind starts there, and comes from no other.
     """
-    before, behind = _part(parts, ends, a), _part(parts, ends, b)
+    kind = 3
     if before < 0 or behind < 0:
-        return 3 if before == behind else (1 if before < 0 else 0)
-    t, s = triangles[a] if a >= 0 else ends[0, 1], triangles[b] if b >= 0 else ends[1, 1]
-    if before == behind and t == s:
-        return 3
-    za, zb = depth_at(spans, a, place) if a >= 0 else depth[0], depth_at(spans, b, place) if b >= 0 else depth[1]
-    if abs(za - zb) > ALIKE * max(abs(za), abs(zb)):
-        return 0 if za < zb else 1
-    # What is seen at a centre goes on beyond it.
-    stops, starts = a >= 0 and spans[a, 1] <= place + TOUCH, b >= 0 and spans[b, 0] >= place - TOUCH
-    if before == behind and (a < 0 or stops) and (b < 0 or starts):
-        return 3
-    stops = stops and not _goes_on(spans, parts, a, place, 1)
-    starts = starts and not _goes_on(spans, parts, b, place, 0)
-    if stops != starts:
-        return 0 if stops else 1
-    if not stops:
-        return 2
-    return 3 if before == behind else 0
+        if before != behind:
+            kind = 1 if before < 0 else 0
+    elif before != behind or not (one_triangle or (nearer < 0 and seamless)):
+        if nearer >= 0:
+            kind = nearer
+        elif stops != starts:
+            kind = 0 if stops else 1
+        elif not stops:
+            kind = 2
+        elif before != behind:
+            kind = 0
+    return kind
 
 
 @loop
 def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, rows, counts, whole, numbers):
     """Fill in the breaks along gaps, in order.
+
+    The helpers take these arrays whole, with a gap's number and range of spans: a view of an array costs as much as a
+    span, since threads count its references in turns.
 
     Args:
         first: the first gap.
@@ -490,74 +472,70 @@ def breaks(first, last, begins, spans, names, parts, ends, end_depth, inner, row
     most = 4
     for g in range(first, last):
         most = max(most, 2 * (begins[g + 1] - begins[g]) + 4)
-    pieces, starts, at = np.empty(most, np.int32), np.empty(most), 2 * begins[first] + 4 * first
+    pieces, starts, at = np.empty(most, np.int64), np.empty(most), 2 * begins[first] + 4 * first
     for g in range(first, last):
-        a, b = begins[g], begins[g + 1]
-        covers, triangles, of, end, depth = spans[a:b], names[a:b, 1], parts[a:b], ends[g], end_depth[g]
-        n = _fronts(covers, triangles, of, end, depth, pieces, starts)
-        known = covers, triangles, of, end, depth, pieces[:n], starts[:n]
-        rows[g], counts[g] = at, _breaks(known, whole[at:], numbers[at:])
-        _inner(known, counts[g], inner, whole[at:], numbers[at:])
-        whole[at : at + counts[g], 0] = g
-        at += counts[g]
+        begin, stop = begins[g], begins[g + 1]
+        n = _fronts(g, begin, stop, spans, names, parts, ends, end_depth, pieces, starts)
+        rows[g], count, a = at, 0, 0
+        for m in range(1, n):
+            # A piece that is too short to count belongs to what comes after it.
+            if m + 1 < n and starts[m + 1] - starts[m] < SHORT:
+                continue
+            x, y, place, row = pieces[a], pieces[m], starts[m], at + count
+            a = m
+            before, behind = _part(g, parts, ends, x), _part(g, parts, ends, y)
+            t, s = names[x, 1] if x >= 0 else ends[g, 0, 1], names[y, 1] if y >= 0 else ends[g, 1, 1]
+            z = depth_at(spans, x, place) if x >= 0 else end_depth[g, 0]
+            deep = depth_at(spans, y, place) if y >= 0 else end_depth[g, 1]
+            nearer = -1 if abs(z - deep) <= ALIKE * max(abs(z), abs(deep)) else (0 if z < deep else 1)
+            # What is seen at a centre goes on beyond it.
+            stops, begun = x >= 0 and spans[x, 1] <= place + TOUCH, y >= 0 and spans[y, 0] >= place - TOUCH
+            seamless = before == behind and (x < 0 or stops) and (y < 0 or begun)
+            if nearer < 0:
+                stops = stops and not _goes_on(spans, begin, stop, parts, x, place, 1)
+                begun = begun and not _goes_on(spans, begin, stop, parts, y, place, 0)
+            kind = _kind(before, behind, t == s, nearer, seamless, stops, begun)
+            if kind == 3:
+                continue
+            whole[row, 0], whole[row, 1], whole[row, 2], whole[row, 3] = g, kind, before, behind
+            whole[row, 4], whole[row, 5], whole[row, 8], whole[row, 9] = t, s, count == 0, 0
+            numbers[row, 0] = place
+            numbers[row, 1] = min(max(place - LAST, spans[x, 0], 0.0), place) if x >= 0 else place
+            numbers[row, 2] = max(min(place + LAST, spans[y, 1], 1.0), place) if y >= 0 else place
+            count += 1
+        if count > 0:
+            whole[at + count - 1, 9] = 1
+        _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers)
+        counts[g] = count
+        at += count
 
 
 @compiled
-def _breaks(gap, whole, numbers):
-    """Fill in the breaks between the fronts of a gap, but for the samples that tell colours; returns their number."""
-    spans, triangles, parts, ends, depth, pieces, starts = gap
-    count, a = 0, 0
-    for n in range(1, len(pieces)):
-        # A piece that is too short to count belongs to what comes after it.
-        if n + 1 < len(pieces) and starts[n + 1] - starts[n] < SHORT:
-            continue
-        x, y, place = pieces[a], pieces[n], starts[n]
-        kind = _kind(spans, triangles, parts, ends, depth, x, y, place)
-        a = n
-        if kind == 3:
-            continue
-        whole[count, 1], whole[count, 2], whole[count, 3] = kind, _part(parts, ends, x), _part(parts, ends, y)
-        whole[count, 4] = triangles[x] if x >= 0 else ends[0, 1]
-        whole[count, 5] = triangles[y] if y >= 0 else ends[1, 1]
-        whole[count, 8], whole[count, 9] = count == 0, 0
-        numbers[count, 0] = place
-        numbers[count, 1] = min(max(place - LAST, spans[x, 0], 0.0), place) if x >= 0 else place
-        numbers[count, 2] = max(min(place + LAST, spans[y, 1], 1.0), place) if y >= 0 else place
-        count += 1
-    if count > 0:
-        whole[count - 1, 9] = 1
-    return count
-
-
-@compiled
-def _inner(gap, count, inner, whole, numbers):
-    """Fill in the samples that tell colours of the breaks of a gap; see `breaks`."""
-    _, triangles, parts, _, _, pieces, starts = gap
-    for b in range(count):
-        before = numbers[b - 1, 0] if b > 0 else 0.0
-        after = numbers[b + 1, 0] if b + 1 < count else 1.0
+def _inner(at, count, pieces, starts, n, names, parts, inner, whole, numbers):
+    """Fill in the samples that tell colours of the breaks of a gap, from the row `at`; see `breaks`."""
+    for b in range(at, at + count):
+        before = numbers[b - 1, 0] if b > at else 0.0
+        after = numbers[b + 1, 0] if b + 1 < at + count else 1.0
         for side in range(2):
             end = numbers[b, 1 + side]
             length = end - before if side == 0 else after - end
             inward = end - min(inner, length / 2) if side == 0 else end + min(inner, length / 2)
             numbers[b, 3 + side], whole[b, 6 + side] = end, whole[b, 4 + side]
-            found = _piece(pieces, starts, inward)
+            found = _piece(pieces, starts, n, inward)
             if found >= 0 and parts[found] == whole[b, 2 + side] and abs(inward - end) > TINY:
-                numbers[b, 3 + side], whole[b, 6 + side] = inward, triangles[found]
+                numbers[b, 3 + side], whole[b, 6 + side] = inward, names[found, 1]
 
 
 @compiled
-def _part(parts, ends, x):
-    """The part of a piece of front."""
-    if x >= 0:
-        return parts[x]
-    return ends[0, 0] if x == FIRST else (ends[1, 0] if x == SECOND else np.int32(-1))
+def _part(g, parts, ends, x):
+    """The part of a piece of front of a gap."""
+    return parts[x] if x >= 0 else (ends[g, 0, 0] if x == FIRST else (ends[g, 1, 0] if x == SECOND else np.int32(-1)))
 
 
 @compiled
-def _piece(pieces, starts, place):
+def _piece(pieces, starts, count, place):
     """The piece of front at a place of a gap."""
     n = 0
-    while n + 1 < len(pieces) and starts[n + 1] <= place:
+    while n + 1 < count and starts[n + 1] <= place:
         n += 1
     return pieces[n]

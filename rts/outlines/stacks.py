@@ -74,7 +74,7 @@ def _gaps_to_search(layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 def _changes(
     gaps: Gaps, layers: Fronts, opaque: np.ndarray, sheets: Sequence[Sheets]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The changes of stacks along gaps; see `stacks_of_spans_loops.changes`."""
+    """The changes of stacks along gaps; see `stacks_loops.changes`."""
     from rts.outlines import stacks_loops as loops
 
     gap, count, most = gaps.gap, len(gaps.gap), len(layers.part)

@@ -3,6 +3,10 @@
 A *run* is a surface along a gap: spans that follow one another, end to start. A sheet that turns away ends there, as
 the back does that it turns into. The stack at a place is the runs there, front to back. It changes where a run starts
 or ends, and where two runs pass through one another.
+
+Each gap works on tables of its own, copied from those of all spans: `own` (n, 8), the six columns of
+`spans_loops.spans_of`, then where a run starts and ends; and `of` (n, 7), integers. To pass an array on, threads count
+its references in turns, so that helpers take few, and none that is shared in their inmost loops.
 """
 
 from __future__ import annotations
@@ -18,97 +22,102 @@ CLOSE = 1e-5
 SAME = 1e-4
 """Share of the depth by which a sample at a centre may differ from the run that it lies on."""
 
+LOW, HIGH = 6, 7
+"""Columns of `own`: where a run starts, in the row of its first span, and where it ends, in that of its last."""
+
+PART, TRIANGLE, OPAQUE, AFTER, BEFORE, LIVE, INSIDE = range(7)
+"""Columns of `of`: part and triangle of a span; 1 if the part lets no light through; the spans that it goes on with, or
+−1; 1 if its run is real; 1 if the run is, or has been, in the stack."""
+
 
 @compiled
-def _alike(spans, i, j, place):
+def _alike(own, i, j, place):
     """True if two spans have about one depth at a place."""
-    z = depth_at(spans, i, place)
-    return abs(depth_at(spans, j, place) - z) <= ALIKE * abs(z)
+    z = depth_at(own, i, place)
+    return abs(depth_at(own, j, place) - z) <= ALIKE * abs(z)
 
 
 @compiled
-def _link(index, spans, parts, low, high, after, before):
-    """Fill `after` and `before` (n,), in the order of `index`: the span that each one goes on with, or −1."""
-    n = len(index)
-    after[:n], before[:n] = -1, -1
+def _link(own, of, n):
+    """Fill in the columns AFTER and BEFORE of n spans."""
     for i in range(n):
         for j in range(n):
-            if i == j or before[j] >= 0 or parts[index[i]] != parts[index[j]] or not high[j] > high[i]:
+            if i == j or of[j, BEFORE] >= 0 or of[i, PART] != of[j, PART] or not own[j, HIGH] > own[i, HIGH]:
                 continue
-            if abs(low[j] - high[i]) <= TOUCH and _alike(spans, index[i], index[j], high[i]):
-                after[i], before[j] = j, i
+            if abs(own[j, LOW] - own[i, HIGH]) <= TOUCH and _alike(own, i, j, own[i, HIGH]):
+                of[i, AFTER], of[j, BEFORE] = j, i
                 break
 
 
 @compiled
 def _listed(part, z, seen, depth, g, k):
     """1 if the samples at a centre hold one of a part at a depth; −1 if they hide it; else 0."""
+    # Behind all that is listed, where the list is full.
+    found = -1 if z > depth[g, k, seen.shape[2] - 1] else 0
     for layer in range(seen.shape[2]):
         if seen[g, k, layer] < 0:
-            return 0
+            found = 0
+            break
         if seen[g, k, layer] == part and abs(depth[g, k, layer] - z) <= SAME * abs(z):
-            return 1
-    # Behind all that is listed, where the list is full.
-    return -1 if z > depth[g, k, seen.shape[2] - 1] else 0
+            found = 1
+            break
+    return found
 
 
 @compiled
 def _hides(opaque, z, seen, depth, g, k):
     """True if a sample at a centre hides what lies at a depth."""
+    found = False
     for layer in range(seen.shape[2]):
-        if seen[g, k, layer] >= 0 and opaque[seen[g, k, layer]] and depth[g, k, layer] < z:
-            return True
-    return False
+        found |= seen[g, k, layer] >= 0 and opaque[seen[g, k, layer]] and depth[g, k, layer] < z
+    return found
 
 
 @compiled
-def _settle(head, tail, index, spans, parts, opaque, seen, depth, g, after, low, high):
+def _settle(head, tail, own, of, opaque, seen, depth, g):
     """Move the ends of a run that lie at a centre to the side that the samples there say; True if the run is real.
 
     A run that covers a centre with no sample there touches the line with an edge alone.
     """
-    part = parts[index[head]]
+    real = True
     for k in range(2):
         centre = float(k)
-        start, end = low[head], high[tail]
-        if start > centre + CLOSE or end < centre - CLOSE:
+        start, end = own[head, LOW], own[tail, HIGH]
+        if not real or start > centre + CLOSE or end < centre - CLOSE:
             continue
         i = head
-        while high[i] < centre and after[i] >= 0:
-            i = after[i]
-        z = depth_at(spans, index[i], centre)
-        found = _listed(part, z, seen, depth, g, k)
+        while own[i, HIGH] < centre and of[i, AFTER] >= 0:
+            i = of[i, AFTER]
+        z = depth_at(own, i, centre)
+        found = _listed(of[head, PART], z, seen, depth, g, k)
         if start < centre - CLOSE and end > centre + CLOSE:
-            if found == 0 and not _hides(opaque, z, seen, depth, g, k):
-                return False
+            real = found != 0 or _hides(opaque, z, seen, depth, g, k)
             continue
         if abs(start - centre) <= CLOSE:
             if k == 0:
-                low[head] = -1.0 if found != 0 else max(start, TINY)
+                own[head, LOW] = -1.0 if found != 0 else max(start, TINY)
             else:
-                low[head] = min(start, 1 - TINY) if found != 0 else 2.0
+                own[head, LOW] = min(start, 1 - TINY) if found != 0 else 2.0
         if abs(end - centre) <= CLOSE:
             if k == 0:
-                high[tail] = max(end, TINY) if found != 0 else -1.0
+                own[tail, HIGH] = max(end, TINY) if found != 0 else -1.0
             else:
-                high[tail] = 2.0 if found != 0 else min(end, 1 - TINY)
-    return True
+                own[tail, HIGH] = 2.0 if found != 0 else min(end, 1 - TINY)
+    return real
 
 
 @compiled
-def _before(spans, i, j, place, until):
+def _before(own, i, j, place, until):
     """True if a span lies before another at a place; if they meet there, farther on."""
-    a, b = depth_at(spans, i, place), depth_at(spans, j, place)
-    if abs(a - b) > ALIKE * abs(a):
-        return a < b
-    return depth_at(spans, i, until) < depth_at(spans, j, until)
+    a, b = depth_at(own, i, place), depth_at(own, j, place)
+    return a < b if abs(a - b) > ALIKE * abs(a) else depth_at(own, i, until) < depth_at(own, j, until)
 
 
 @compiled
-def _insert(stack, count, i, index, spans, place, until):
+def _insert(stack, count, i, own, place, until):
     """Insert a span into a stack by depth; returns its index."""
     at = count
-    while at > 0 and _before(spans, index[i], index[stack[at - 1]], place, until):
+    while at > 0 and _before(own, i, stack[at - 1], place, until):
         stack[at] = stack[at - 1]
         at -= 1
     stack[at] = i
@@ -123,65 +132,97 @@ def _remove(stack, count, at):
 
 
 @compiled
-def _seen(stack, at, most, index, parts, opaque):
+def _seen(stack, at, most, of):
     """True if an entry of a stack is among the first, and nothing opaque is before it."""
-    if at >= most:
-        return False
+    found = at < most
     for m in range(at):
-        if opaque[parts[index[stack[m]]]]:
-            return False
-    return True
+        found &= of[stack[m], OPAQUE] == 0
+    return found
 
 
 @compiled
-def _partner(i, index, parts, place, ends, neighbour):
+def _partner(i, n, own, of, place, end, link):
     """Another run of the same part that ends (or starts) where one does: a sheet turns away there; or −1.
 
     Their depths differ where triangles in between are seen from the side.
 
     Args:
         i: the span with which the run ends.
-        index: the gap's spans.
-        parts: (N,).
-        place: where it ends.
-        ends: (n,), where spans end (or start).
-        neighbour: (n,), what they go on with there, or −1.
+        n: the number of the gap's spans.
+        own: their table.
+        of: and the integers.
+        place: where the run ends.
+        end: HIGH (or LOW).
+        link: AFTER (or BEFORE).
     """
-    for j in range(len(index)):
-        if j != i and neighbour[j] < 0 and parts[index[j]] == parts[index[i]] and abs(ends[j] - place) <= TOUCH:
-            return j
-    return -1
+    found = -1
+    for j in range(n):
+        if j != i and of[j, link] < 0 and of[j, PART] == of[i, PART] and abs(own[j, end] - place) <= TOUCH:
+            found = j
+            break
+    return found
 
 
 @compiled
-def _meeting(spans, i, j, low, high):
+def _meeting(own, i, j, low, high):
     """Where two spans have one depth, between two places at which their order differs."""
-    wide = (spans[i, 4] + spans[i, 5] * low) * (spans[j, 4] + spans[j, 5] * low)
-    far = (spans[i, 4] + spans[i, 5] * high) * (spans[j, 4] + spans[j, 5] * high)
-    before = max(depth_at(spans, j, low) - depth_at(spans, i, low), 0.0) * wide
-    after = min(depth_at(spans, j, high) - depth_at(spans, i, high), 0.0) * far
+    wide = (own[i, 4] + own[i, 5] * low) * (own[j, 4] + own[j, 5] * low)
+    far = (own[i, 4] + own[i, 5] * high) * (own[j, 4] + own[j, 5] * high)
+    before = max(depth_at(own, j, low) - depth_at(own, i, low), 0.0) * wide
+    after = min(depth_at(own, j, high) - depth_at(own, i, high), 0.0) * far
     return low + (high - low) * before / (before - after) if before - after > 0 else low
 
 
 @compiled
-def _next_meeting(stack, count, index, spans, place, until):
+def _next_meeting(stack, count, own, place, until):
     """The next place at which two neighbours in a stack pass through one another, and the first's index; or −1."""
     best, at = np.inf, -1
     for m in range(count - 1):
-        i, j = index[stack[m]], index[stack[m + 1]]
-        z = depth_at(spans, i, until)
-        if depth_at(spans, j, until) < z - MARGIN * abs(z):
-            there = _meeting(spans, i, j, place, until)
+        i, j = stack[m], stack[m + 1]
+        z = depth_at(own, i, until)
+        if depth_at(own, j, until) < z - MARGIN * abs(z):
+            there = _meeting(own, i, j, place, until)
             if there < best:
                 best, at = there, m
     return best, at
 
 
 @compiled
-def _record(e, kind, at, partner, place, stack, count, scene, result):
+def _next_ending(stack, count, own, of, place):
+    """The first run in a stack that ends at a place, or `count`; other runs go on with their next spans there."""
+    found = count
+    for m in range(count):
+        i = stack[m]
+        while own[i, HIGH] <= place and of[i, AFTER] >= 0:
+            i = of[i, AFTER]
+        stack[m] = i
+        found = m if own[i, HIGH] <= place and found == count else found
+    return found
+
+
+@compiled
+def _next_starting(i, n, own, of, place):
+    """The first run from the span i on that starts at a place, and is not in the stack yet; n if there is none."""
+    while i < n:
+        waits = of[i, LIVE] == 1 and of[i, INSIDE] == 0 and of[i, BEFORE] < 0
+        if waits and own[i, LOW] <= place < own[i, HIGH]:
+            break
+        i += 1
+    return i
+
+
+@compiled
+def _index(stack, count, i):
+    """The place of a span in a stack; −1 if it is not there."""
+    found = -1
+    for m in range(count):
+        found = m if stack[m] == i else found
+    return found
+
+
+@compiled
+def _record(e, kind, at, partner, place, stack, count, own, of, whole, place_of, samples, places, sides):
     """Fill in a change of the stack, but for the samples of what ends there; see `changes`."""
-    index, spans, names, parts, opaque = scene
-    whole, place_of, samples, places, sides = result
     most, entries = sides.shape[2], samples.shape[1] - 2
     whole[e, 1], place_of[e] = kind, place
     samples[e], sides[e] = -1, -1
@@ -191,10 +232,10 @@ def _record(e, kind, at, partner, place, stack, count, scene, result):
         i = stack[m]
         if n == entries:
             break
-        samples[e, 2 + n, 0], samples[e, 2 + n, 1] = parts[index[i]], names[index[i], 1]
-        places[e, 2 + n] = min(max(place, spans[index[i], 0]), spans[index[i], 1])
+        samples[e, 2 + n, 0], samples[e, 2 + n, 1] = of[i, PART], of[i, TRIANGLE]
+        places[e, 2 + n] = min(max(place, own[i, 0]), own[i, 1])
         n += 1
-        if opaque[parts[index[i]]] and not (kind < 2 and (m == at or m == partner)) and m > (at if kind == 2 else -1):
+        if of[i, OPAQUE] == 1 and not (kind < 2 and (m == at or m == partner)) and m > (at if kind == 2 else -1):
             break
     for side in range(2):
         k, whole[e, 2 + side] = 0, -1
@@ -208,165 +249,89 @@ def _record(e, kind, at, partner, place, stack, count, scene, result):
                 break
             sides[e, side, k] = here
             k += 1
-            if opaque[samples[e, 2 + here, 0]]:
+            if of[stack[here], OPAQUE] == 1:
                 break
     # The surface that changes, and what is behind it: parts before and behind the break.
     if kind == 2:
-        whole[e, 2], whole[e, 3] = parts[index[stack[at]]], parts[index[stack[at + 1]]]
+        whole[e, 2], whole[e, 3] = of[stack[at], PART], of[stack[at + 1], PART]
     else:
-        whole[e, 2 + kind] = parts[index[stack[at]]]
+        whole[e, 2 + kind] = of[stack[at], PART]
         k = sides[e, 1 - kind, at] if at < most else -1
         whole[e, 3 - kind] = samples[e, 2 + k, 0] if k >= 0 else -1
 
 
 @compiled
-def _complete(base, f, found, g, enders, index, spans, names, parts, after, before, inner, result):
+def _complete(base, f, found, g, enders, own, of, inner, whole, place_of, samples, places):
     """Fill in the samples of what ends at a change: the last ones, and those that tell colours."""
-    whole, place_of, samples, places, sides = result
     e, kind = base + f, whole[base + f, 1]
     whole[e, 0], whole[e, 4], whole[e, 5] = g, f == 0, f == found - 1
     place = place_of[e]
-    if kind == 2:
-        for side in range(2):
-            i = index[enders[f, side]]
-            samples[e, side, 0], samples[e, side, 1], places[e, side] = parts[i], names[i, 1], place
-        return
     for n in range(2):
         i = enders[f, n]
+        if kind == 2:
+            samples[e, n, 0], samples[e, n, 1], places[e, n] = of[i, PART], of[i, TRIANGLE], place
+            continue
         if i < 0:
             continue
-        x = index[i]
+        x = i
         if kind == 0:
-            end = min(max(place - LAST, spans[x, 0], 0.0), place)
+            end = min(max(place - LAST, own[x, 0], 0.0), place)
             beside = place_of[e - 1] if f > 0 else 0.0
             inward = end - min(inner, max(end - beside, 0.0) / 2)
-            while spans[index[i], 0] > inward and before[i] >= 0:
-                i = before[i]
-            inward = max(inward, min(spans[index[i], 0], end))
+            while own[i, 0] > inward and of[i, BEFORE] >= 0:
+                i = of[i, BEFORE]
+            inward = max(inward, min(own[i, 0], end))
         else:
-            end = max(min(place + LAST, spans[x, 1], 1.0), place)
+            end = max(min(place + LAST, own[x, 1], 1.0), place)
             beside = place_of[e + 1] if f + 1 < found else 1.0
             inward = end + min(inner, max(beside - end, 0.0) / 2)
-            while spans[index[i], 1] < inward and after[i] >= 0:
-                i = after[i]
-            inward = min(inward, max(spans[index[i], 1], end))
+            while own[i, 1] < inward and of[i, AFTER] >= 0:
+                i = of[i, AFTER]
+            inward = min(inward, max(own[i, 1], end))
         if n == 0:
-            samples[e, kind, 0], samples[e, kind, 1], places[e, kind] = parts[x], names[x, 1], end
+            samples[e, kind, 0], samples[e, kind, 1], places[e, kind] = of[x, PART], of[x, TRIANGLE], end
         for k in range(2, samples.shape[1]):
-            if samples[e, k, 0] == parts[x] and samples[e, k, 1] == names[x, 1]:
-                samples[e, k, 1], places[e, k] = names[index[i], 1], inward
+            if samples[e, k, 0] == of[x, PART] and samples[e, k, 1] == of[x, TRIANGLE]:
+                samples[e, k, 1], places[e, k] = of[i, TRIANGLE], inward
                 break
 
 
 @compiled
-def _note(kind, at, partner, place, stack, count, scene, found, base, enders, result):
-    """Count a change of the stack, if it is seen, and fill it in if there is room in `enders`; returns the number."""
-    index, _, _, parts, opaque = scene
-    if not _seen(stack, at, result[4].shape[2], index, parts, opaque):
-        return found
-    if found < len(enders):
-        _record(base + found, kind, at, partner, place, stack, count, scene, result)
-        other = at + 1 if kind == 2 else partner
-        enders[found, 0], enders[found, 1] = stack[at], stack[other] if other >= 0 else -1
-    return found + 1
-
-
-@compiled
-def _cross(place, until, stack, count, scene, found, base, enders, result):
-    """Record runs that pass through one another between two places; returns the number of changes."""
-    index, spans = scene[0], scene[1]
-    for _ in range(count * count):
-        there, m = _next_meeting(stack, count, index, spans, place, until)
-        if m < 0:
-            break
-        place = max(place, there)
-        found = _note(2, m, -1, place, stack, count, scene, found, base, enders, result)
-        stack[m], stack[m + 1] = stack[m + 1], stack[m]
-    return found
-
-
-@compiled
-def _end(place, stack, count, scene, runs, found, base, enders, result):
-    """Take out runs that end, or go on with another span; returns the stack's height and the number of changes."""
-    low, high, after, before, live, inside = runs
-    index, parts, m = scene[0], scene[3], 0
-    while m < count:
-        i = stack[m]
-        while high[i] <= place and after[i] >= 0:
-            i = after[i]
-        stack[m] = i
-        if high[i] > place:
-            m += 1
+def _fill_runs(g, n, own, of, opaque, seen, depth, knots):
+    """Fill in the runs of a gap of n spans, and where spans start and end, in order; returns the number of places."""
+    _link(own, of, n)
+    for i in range(n):
+        if of[i, BEFORE] >= 0:
             continue
-        other, partner = _partner(i, index, parts, place, high, after), -1
-        for k in range(count):
-            partner = k if k != m and other >= 0 and stack[k] == other else partner
-        front = m if partner < 0 else min(m, partner)
-        partner = max(m, partner) if partner >= 0 else partner
-        found = _note(0, front, partner, place, stack, count, scene, found, base, enders, result)
-        if partner >= 0:
-            _remove(stack, count, partner)
-            count -= 1
-        _remove(stack, count, front)
-        count, m = count - 1, 0
-    return count, found
-
-
-@compiled
-def _start(place, farther, stack, count, scene, runs, found, base, enders, result):
-    """Put in the runs that start at a place; returns the stack's height and the number of changes."""
-    low, high, after, before, live, inside = runs
-    index, spans, parts = scene[0], scene[1], scene[3]
-    for i in range(len(index)):
-        if not live[i] or inside[i] or before[i] >= 0 or low[i] > place or high[i] <= place:
-            continue
-        front = _insert(stack, count, i, index, spans, low[i], min(farther, high[i]))
-        inside[i], count = True, count + 1
-        other, partner = _partner(i, index, parts, low[i], low, before), -1
-        if other >= 0 and live[other] and not inside[other]:
-            partner = _insert(stack, count, other, index, spans, low[i], min(farther, high[other]))
-            inside[other], count = True, count + 1
-            front, partner = (front, partner) if partner > front else (partner, front + 1)
-        found = _note(1, front, partner, place, stack, count, scene, found, base, enders, result)
-    return count, found
-
-
-@compiled
-def _fill_runs(g, scene, seen, depth, runs, knots):
-    """Fill in the runs of a gap, and the places where spans start and end, in order; returns the number of places."""
-    index, spans, _, parts, opaque = scene
-    low, high, after, before, live, inside = runs
-    for i in range(len(index)):
-        low[i], high[i], live[i], inside[i] = spans[index[i], 0], spans[index[i], 1], False, False
-    _link(index, spans, parts, low, high, after, before)
-    for i in range(len(index)):
-        if before[i] >= 0:
-            continue
-        tail, start, j = i, low[i], i
-        while after[tail] >= 0:
-            tail = after[tail]
-        real = high[tail] - start >= SHORT
-        real = real and _settle(i, tail, index, spans, parts, opaque, seen, depth, g, after, low, high)
+        tail, j = i, i
+        while of[tail, AFTER] >= 0:
+            tail = of[tail, AFTER]
+        real = own[tail, HIGH] - own[i, LOW] >= SHORT and _settle(i, tail, own, of, opaque, seen, depth, g)
         while j >= 0:
-            live[j] = real
-            j = after[j]
+            of[j, LIVE] = real
+            j = of[j, AFTER]
     count = 0
-    for i in range(len(index)):
-        for place in (low[i], high[i]):
-            if live[i] and 0 < place < 1:
-                knots[count], count = place, count + 1
+    for i in range(n):
+        for end in (LOW, HIGH):
+            if of[i, LIVE] == 1 and 0 < own[i, end] < 1:
+                at = count
+                while at > 0 and knots[at - 1] > own[i, end]:
+                    knots[at] = knots[at - 1]
+                    at -= 1
+                knots[at], count = own[i, end], count + 1
     knots[count] = 1.0
-    knots[: count + 1] = np.sort(knots[: count + 1])
     return count + 1
 
 
 @compiled
 def _next_knot(knots, k, known):
     """The first of sorted knots that is greater than number k; the one after it if there is none."""
+    found = knots[k + 1]
     for m in range(k + 1, known):
         if knots[m] > knots[k]:
-            return knots[m]
-    return knots[k + 1]
+            found = knots[m]
+            break
+    return found
 
 
 @loop
@@ -400,28 +365,77 @@ def changes(
         places: (E, 2 + K + 1) to fill: places of these samples.
         sides: (E, 2, K) int32 to fill: the stacks before and behind, as indices in that stack, or −1.
     """
-    result = whole, place_of, samples, places, sides
+    longest, most_changes = 0, 0
     for g in range(first, last):
-        index = np.arange(begins[g], begins[g + 1])
-        n, scene = len(index), (index, spans, names, parts, opaque)
-        low, high, after, before = np.empty(n), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
-        live, inside = np.empty(n, np.bool_), np.empty(n, np.bool_)
-        runs, stack, knots = (low, high, after, before, live, inside), np.empty(n + 1, np.int32), np.empty(2 * n + 1)
-        enders = np.empty((counts[g] if fill else 0, 2), np.int32)
-        known, count, found, place = _fill_runs(g, scene, seen, depth, runs, knots), 0, 0, 0.0
+        longest, most_changes = max(longest, begins[g + 1] - begins[g]), max(most_changes, counts[g])
+    own, of = np.empty((longest, 8)), np.empty((longest, 7), np.int64)
+    stack, knots = np.empty(longest + 1, np.int64), np.empty(2 * longest + 1)
+    enders, most = np.empty((most_changes, 2), np.int64), sides.shape[2]
+    for g in range(first, last):
+        n, base = begins[g + 1] - begins[g], at[g]
         for i in range(n):
-            if live[i] and low[i] <= 0 < high[i]:
-                _insert(stack, count, i, index, spans, 0.0, min(knots[0], high[i]))
-                inside[i], count = True, count + 1
+            x = begins[g] + i
+            for c in range(6):
+                own[i, c] = spans[x, c]
+            own[i, LOW], own[i, HIGH] = spans[x, 0], spans[x, 1]
+            of[i, PART], of[i, TRIANGLE], of[i, OPAQUE] = parts[x], names[x, 1], opaque[parts[x]]
+            of[i, AFTER], of[i, BEFORE], of[i, LIVE], of[i, INSIDE] = -1, -1, 0, 0
+        known, count, found, place = _fill_runs(g, n, own, of, opaque, seen, depth, knots), 0, 0, 0.0
+        for i in range(n):
+            if of[i, LIVE] == 1 and own[i, LOW] <= 0 < own[i, HIGH]:
+                _insert(stack, count, i, own, 0.0, min(knots[0], own[i, HIGH]))
+                of[i, INSIDE], count = 1, count + 1
         for k in range(known):
-            found = _cross(place, knots[k], stack, count, scene, found, at[g], enders, result)
+            for _ in range(count * count):  # Runs that pass through one another before the next knot.
+                there, m = _next_meeting(stack, count, own, place, knots[k])
+                if m < 0:
+                    break
+                place = max(place, there)
+                if _seen(stack, m, most, of):
+                    if fill:
+                        enders[found, 0], enders[found, 1] = stack[m], stack[m + 1]
+                        e = base + found
+                        _record(e, 2, m, -1, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                    found += 1
+                stack[m], stack[m + 1] = stack[m + 1], stack[m]
             place = knots[k]
-            if k + 1 < known and place < 1 and (k == 0 or place > knots[k - 1]):
-                count, found = _end(place, stack, count, scene, runs, found, at[g], enders, result)
-                farther = _next_knot(knots, k, known)
-                count, found = _start(place, farther, stack, count, scene, runs, found, at[g], enders, result)
+            if k + 1 == known or place >= 1 or (k > 0 and place <= knots[k - 1]):
+                continue
+            m = _next_ending(stack, count, own, of, place)
+            while m < count:
+                other = _partner(stack[m], n, own, of, place, HIGH, AFTER)
+                partner = _index(stack, count, other) if other >= 0 else -1
+                m, partner = (partner, m) if 0 <= partner < m else (m, partner)
+                if _seen(stack, m, most, of):
+                    if fill:
+                        enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
+                        e = base + found
+                        _record(e, 0, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                    found += 1
+                for x in (partner, m):
+                    if x >= 0:
+                        _remove(stack, count, x)
+                        count -= 1
+                m = _next_ending(stack, count, own, of, place)
+            farther, i = _next_knot(knots, k, known), _next_starting(0, n, own, of, place)
+            while i < n:
+                low, partner = own[i, LOW], -1
+                m = _insert(stack, count, i, own, low, min(farther, own[i, HIGH]))
+                of[i, INSIDE], count = 1, count + 1
+                other = _partner(i, n, own, of, low, LOW, BEFORE)
+                if other >= 0 and of[other, LIVE] == 1 and of[other, INSIDE] == 0:
+                    partner = _insert(stack, count, other, own, low, min(farther, own[other, HIGH]))
+                    of[other, INSIDE], count = 1, count + 1
+                    m, partner = (m, partner) if partner > m else (partner, m + 1)
+                if _seen(stack, m, most, of):
+                    if fill:
+                        enders[found, 0], enders[found, 1] = stack[m], stack[partner] if partner >= 0 else -1
+                        e = base + found
+                        _record(e, 1, m, partner, place, stack, count, own, of, whole, place_of, samples, places, sides)
+                    found += 1
+                i = _next_starting(i + 1, n, own, of, place)
         if not fill:
             counts[g] = found
             continue
         for f in range(found):
-            _complete(at[g], f, found, g, enders, index, spans, names, parts, after, before, inner, result)
+            _complete(base, f, found, g, enders, own, of, inner, whole, place_of, samples, places)

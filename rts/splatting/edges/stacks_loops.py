@@ -12,92 +12,133 @@ from rts.compiling.loops import compiled, loop
 
 
 @compiled
-def _weigh(rgba, row, y, x, through, behind):
-    """Fill `through` (K,) and `behind` (K, C) of a cell; returns the number of layers that light reaches."""
-    light, count, alpha = 1.0, 0, rgba.shape[1] - 1
-    while count < len(row) and row[count, y, x] >= 0 and light > 0:
-        through[count] = light
-        light *= 1 - rgba[row[count, y, x], alpha]
-        count += 1
-    for k in range(count - 1, -1, -1):
-        for c in range(alpha + 1):
-            if k == count - 1:
-                behind[k, c] = 0.0
-            else:
-                n = row[k + 1, y, x]
-                behind[k, c] = rgba[n, c] + (1 - rgba[n, alpha]) * behind[k + 1, c]
+def _weigh(rgba, row, y, x, through):
+    """Fill `through` (K,), the light that passes to each layer of a cell; returns the number of layers it reaches."""
+    light, count = 1.0, 0
+    for k in range(len(row)):
+        n = row[k, y, x]
+        if n >= 0 and light > 0:
+            through[k] = light
+            light *= 1 - rgba[n, rgba.shape[1] - 1]
+            count += 1
     return count
 
 
 @compiled
-def _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change):
-    """Fill `change` (C,): by how much a composite changes along an axis as its layer k alone shifts.
-
-    The layer's slope is the mean of the differences of its colour from and to the next cells, if joined.
-    """
-    n, dy, dx, alpha = row[k, y, x], axis, 1 - axis, rgba.shape[1] - 1
-    after, before = n, n
-    if joined[axis, y, x] and row[k, y + dy, x + dx] >= 0:
-        after = row[k, y + dy, x + dx]
-    if y - dy >= 0 and x - dx >= 0 and joined[axis, y - dy, x - dx] and row[k, y - dy, x - dx] >= 0:
-        before = row[k, y - dy, x - dx]
-    opacity = (rgba[after, alpha] - rgba[before, alpha]) / 2
+def _stack(rgba, row, y, x, count, behind):
+    """Fill `behind` (K, C), the composite behind each of the first layers of a cell."""
+    alpha = rgba.shape[1] - 1
     for c in range(alpha + 1):
-        change[c] = through[k] * ((rgba[after, c] - rgba[before, c]) / 2 - opacity * behind[k, c])
+        back = 0.0
+        for k in range(count - 1, -1, -1):
+            n, behind[k, c] = row[k, y, x], back
+            back = rgba[n, c] + (1 - rgba[n, alpha]) * back
+
+
+@compiled
+def _beside(row, joined, k, y, x, axis):
+    """The samples of layer k in the cells before and after a cell along an axis; its own where they are not joined."""
+    dy, dx, n = axis, 1 - axis, row[k, y, x]
+    before = row[k, y - dy, x - dx] if y >= dy and x >= dx and joined[axis, y - dy, x - dx] else n
+    after = row[k, y + dy, x + dx] if joined[axis, y, x] else n
+    return before if before >= 0 else n, after if after >= 0 else n
+
+
+@compiled
+def _change(rgba, behind, k, light, before, after, c):
+    """By how much channel c of a composite changes from cell to cell as a layer alone shifts.
+
+    The layer's slope is the mean of the differences of its colour from and to the next cells.
+
+    Args:
+        rgba: (N, C).
+        behind: (K, C), the composites behind layers.
+        k: the layer.
+        light: what passes to the layer.
+        before: its sample in the cell before, see `_beside`.
+        after: its sample in the cell after.
+        c: the channel.
+    """
+    alpha = rgba.shape[1] - 1
+    opacity = rgba[after, alpha] - rgba[before, alpha]
+    return 0.5 * light * ((rgba[after, c] - rgba[before, c]) - opacity * behind[k, c])
 
 
 @loop
 def cells(first, last, positions, rgba, row, joined, out):
     """Fill lines `first` to `last` of `out` (H, W, 2 C): composites, and what moves along their slopes."""
-    (most, _, width), at, count = row.shape, np.empty(2, np.int64), rgba.shape[1]
-    through, behind, change = np.empty(most), np.empty((most, count)), np.empty(count)
-    for i in range(first * width, last * width):
-        y, x = i // width, i % width
-        at[0], at[1], out[y, x] = x, y, 0.0
-        for k in range(_weigh(rgba, row, y, x, through, behind)):
-            n = row[k, y, x]
-            for c in range(count):
-                out[y, x, c] += through[k] * rgba[n, c]
-            for axis in range(2):
-                moved = positions[n, axis] - (at[axis] + 0.5)
-                _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change)
+    (most, _, width), count = row.shape, rgba.shape[1]
+    through, behind = np.empty(most), np.empty((most, count))
+    for y in range(first, last):
+        for x in range(width):
+            out[y, x] = 0.0
+            layers = _weigh(rgba, row, y, x, through)
+            _stack(rgba, row, y, x, layers, behind)
+            for k in range(layers):
+                n = row[k, y, x]
+                left, right = _beside(row, joined, k, y, x, 0)
+                up, down = _beside(row, joined, k, y, x, 1)
+                across, along = positions[n, 0] - (x + 0.5), positions[n, 1] - (y + 0.5)
                 for c in range(count):
-                    out[y, x, count + c] -= change[c] * moved
+                    out[y, x, c] += through[k] * rgba[n, c]
+                    out[y, x, count + c] -= (
+                        _change(rgba, behind, k, through[k], left, right, c) * across
+                        + _change(rgba, behind, k, through[k], up, down, c) * along
+                    )
 
 
 @loop
 def push_cells(first, last, rgba, row, joined, t_positions, t_rgba, out):
     """Fill lines of `out` (H, W, 2 C) with the derivative of `cells` along tangents; empty ones are zeros."""
     (most, _, width), count = row.shape, rgba.shape[1]
-    through, behind, change = np.empty(most), np.empty((most, count)), np.empty(count)
-    colors, axes = count if len(t_rgba) else 0, 2 if len(t_positions) else 0
-    for i in range(first * width, last * width):
-        y, x = i // width, i % width
-        out[y, x] = 0.0
-        for k in range(_weigh(rgba, row, y, x, through, behind)):
-            n = row[k, y, x]
-            for c in range(colors):
-                out[y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, count - 1] * behind[k, c])
-            for axis in range(axes):
-                _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change)
+    through, behind = np.empty(most), np.empty((most, count))
+    colored, moved = len(t_rgba) > 0, len(t_positions) > 0
+    for y in range(first, last):
+        for x in range(width):
+            out[y, x] = 0.0
+            layers = _weigh(rgba, row, y, x, through)
+            _stack(rgba, row, y, x, layers, behind)
+            for k in range(layers):
+                n = row[k, y, x]
+                if colored:
+                    for c in range(count):
+                        out[y, x, c] += through[k] * (t_rgba[n, c] - t_rgba[n, count - 1] * behind[k, c])
+                if not moved:
+                    continue
+                left, right = _beside(row, joined, k, y, x, 0)
+                up, down = _beside(row, joined, k, y, x, 1)
                 for c in range(count):
-                    out[y, x, count + c] -= change[c] * t_positions[n, axis]
+                    out[y, x, count + c] -= (
+                        _change(rgba, behind, k, through[k], left, right, c) * t_positions[n, 0]
+                        + _change(rgba, behind, k, through[k], up, down, c) * t_positions[n, 1]
+                    )
 
 
 @loop
 def pull_cells(rgba, row, joined, g, g_positions, g_rgba):
     """Add to gradients of samples those of `cells`; empty ones are not wanted."""
     (most, height, width), count = row.shape, rgba.shape[1]
-    through, behind, change = np.empty(most), np.empty((most, count)), np.empty(count)
-    colors, axes = count if len(g_rgba) else 0, 2 if len(g_positions) else 0
-    for i in range(height * width):
-        y, x = i // width, i % width
-        for k in range(_weigh(rgba, row, y, x, through, behind)):
-            n = row[k, y, x]
-            for c in range(colors):
-                g_rgba[n, c] += through[k] * g[y, x, c]
-                g_rgba[n, count - 1] -= through[k] * behind[k, c] * g[y, x, c]
-            for axis in range(axes):
-                _fill_change(rgba, row, joined, k, y, x, axis, through, behind, change)
+    through, behind = np.empty(most), np.empty((most, count))
+    colored, moved = len(g_rgba) > 0, len(g_positions) > 0
+    for y in range(height):
+        for x in range(width):
+            layers = _weigh(rgba, row, y, x, through)
+            _stack(rgba, row, y, x, layers, behind)
+            for k in range(layers):
+                n = row[k, y, x]
+                if colored:
+                    hidden = 0.0
+                    for c in range(count):
+                        g_rgba[n, c] += through[k] * g[y, x, c]
+                        hidden += behind[k, c] * g[y, x, c]
+                    g_rgba[n, count - 1] -= through[k] * hidden
+                if not moved:
+                    continue
+                left, right = _beside(row, joined, k, y, x, 0)
+                up, down = _beside(row, joined, k, y, x, 1)
+                across, along = 0.0, 0.0
                 for c in range(count):
-                    g_positions[n, axis] -= change[c] * g[y, x, count + c]
+                    across += _change(rgba, behind, k, through[k], left, right, c) * g[y, x, count + c]
+                    along += _change(rgba, behind, k, through[k], up, down, c) * g[y, x, count + c]
+                g_positions[n, 0] -= across
+                g_positions[n, 1] -= along

@@ -50,38 +50,33 @@ def _right_of_bottom(start, end, low, high):
 
 
 @compiled
-def _next_side(b, side, k, near_ends):
+def _next_side(side, k, is_first, is_last):
     """The side of a break, 0 or 1, that a square's corner is next to; −1 if another break lies between, or no gap."""
-    if k == (0, 1, 3, 0)[side] and near_ends[b, 0]:
-        return 0
-    return 1 if k == (1, 2, 2, 3)[side] and near_ends[b, 1] else -1
+    begins, stops = is_first and k == (0, 1, 3, 0)[side], is_last and k == (1, 2, 2, 3)[side]
+    return 0 if begins else (1 if stops else -1)
 
 
 @compiled
-def _point(place, gap, b, square, s, out):
-    """Fill `out` with a break's position from the first corner's centre of a segment's square, within it."""
-    along = gap[b, 2]
-    x = gap[b, 1] - square[s, 1] + (place[b] if along == 1 else 0.0)
-    y = gap[b, 0] - square[s, 0] + (0.0 if along == 1 else place[b])
-    out[0], out[1] = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
+def _point(place, x, y, along):
+    """A break's position in the square of a segment, given its place in a gap that starts at (x, y) there."""
+    x, y = (x + place, y + 0.0) if along == 1 else (x + 0.0, y + place)
+    return min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
 
 
 @compiled
-def _add_flux(flux, pull, i, lone, t, first, second, dx, dy):
-    """Add a straight piece (dx, dy), with weights of both jumps, to the `flux` (2, 4, 2) of a cell; see below.
+def _add_flux(flux, s, k, pull, i, lone, t, first, second, dx, dy):
+    """Add a straight piece (dx, dy) of a segment, with weights of both jumps, to the flux in its cell k; see below.
 
     The piece lies at t between start and corner (i = 0), or between corner and end.
     """
-    if first == 0 and second == 0:
-        return
     for m in range(4):
-        rate = (1 - t) * (m == 1) + t * pull[m] if i == 0 else (1 - t) * pull[m] + t * (m == 2)
+        rate = (1 - t) * (m == 1) + t * pull[s, m] if i == 0 else (1 - t) * pull[s, m] + t * (m == 2)
         if lone:
             rate = 1.0 if m == 1 else 0.0
-        flux[0, m, 0] += rate * first * dy
-        flux[0, m, 1] -= rate * first * dx
-        flux[1, m, 0] += rate * second * dy
-        flux[1, m, 1] -= rate * second * dx
+        flux[s, k, 0, m, 0] += rate * first * dy
+        flux[s, k, 0, m, 1] -= rate * first * dx
+        flux[s, k, 1, m, 0] += rate * second * dy
+        flux[s, k, 1, m, 1] -= rate * second * dx
 
 
 @loop
@@ -112,22 +107,27 @@ def weigh_segments(
             that pull.
     """
     cuts, area = np.empty(4), np.empty(4)
+    flux[first:last] = 0.0
     for s in range(first, last):
         if ties[s, 0] == ties[s, 1]:
-            path[s], share[s], cell_side[s], flux[s] = 0.0, 0.0, -1, 0.0
+            path[s], share[s], cell_side[s] = 0.0, 0.0, -1
             continue
         lone = ties[s, 1] < 0
         side0 = square_sides[s, 0]
         side1 = (side0 + 2) % 4 if lone else square_sides[s, 1]
-        _point(place, gap, ties[s, 0], square, s, path[s, 0])
+        b = ties[s, 0]
+        start_x, start_y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
+        path[s, 0, 0], path[s, 0, 1] = _point(place[b], start_x, start_y, gap[b, 2])
         if lone:
             along = gap[ties[s, 0], 2]
             path[s, 2, 0] = path[s, 0, 0] if along == 1 else 1 - path[s, 0, 0]
             path[s, 2, 1] = 1 - path[s, 0, 1] if along == 1 else path[s, 0, 1]
-            path[s, 1] = (path[s, 0] + path[s, 2]) / 2
         else:
-            _point(place, gap, ties[s, 1], square, s, path[s, 2])
-            path[s, 1] = corner[s]
+            b = ties[s, 1]
+            start_x, start_y = gap[b, 1] - square[s, 1], gap[b, 0] - square[s, 0]
+            path[s, 2, 0], path[s, 2, 1] = _point(place[b], start_x, start_y, gap[b, 2])
+        for a in range(2):
+            path[s, 1, a] = (path[s, 0, a] + path[s, 2, a]) / 2 if lone else corner[s, a]
         # Clockwise, sides 0 and 1 lead along their gaps; what lies before a start is on the right of the way.
         sign0 = 1.0 if side0 < 2 else -1.0
         sign1 = sign0 if lone else (1.0 if side1 >= 2 else -1.0)
@@ -135,7 +135,6 @@ def weigh_segments(
         length = chord_x * chord_x + chord_y * chord_y
         turn = (path[s, 1, 0] - path[s, 0, 0]) * chord_x + (path[s, 1, 1] - path[s, 0, 1]) * chord_y
         turn = turn / length if length > 0 else 0.0
-        flux[s] = 0.0
         start, end = _place(path[s, 0, 0], path[s, 0, 1], side0), _place(path[s, 2, 0], path[s, 2, 1], side1)
         area[0] = area[3] = 0.5 * _right_of_bottom(start, end, 2.5, 3.0)
         area[1] = area[2] = 0.5 * _right_of_bottom(start, end, 2.0, 2.5)
@@ -160,7 +159,9 @@ def weigh_segments(
                     height = min(max(py - (0.5 if south else 0.0), 0.0), 0.5) if (px >= 0.5) == east else 0.0
                     area[k] -= height * dx
                     of_cell = (right if east else 1 - right) * (below if south else 1 - below) * counts
-                    _add_flux(flux[s, k], pull[s], i, lone, t, of_cell * (1 - u) * sign0, of_cell * u * sign1, dx, dy)
+                    if of_cell > 0:
+                        of_jumps = of_cell * (1 - u) * sign0, of_cell * u * sign1
+                        _add_flux(flux, s, k, pull, i, lone, t, *of_jumps, dx, dy)
         for k in range(4):
             # Clockwise, corner k begins side k: it lies on the right of the way between the end and the start.
             after, until = side0 >= k, side1 >= k
@@ -169,8 +170,8 @@ def weigh_segments(
             beside = (area[k] - (0.25 if on_right else 0.0)) / 2 if counts else 0.0
             share[s, k, 0], share[s, k, 1] = sign0 * beside, sign1 * beside
             first, second = int((sign0 > 0) != on_right), int((sign1 > 0) != on_right)
-            at_start = _next_side(ties[s, 0], side0, k, near_ends)
-            at_end = -1 if lone else _next_side(ties[s, 1], side1, k, near_ends)
+            at_start = _next_side(side0, k, near_ends[ties[s, 0], 0], near_ends[ties[s, 0], 1])
+            at_end = -1 if lone else _next_side(side1, k, near_ends[ties[s, 1], 0], near_ends[ties[s, 1], 1])
             known = (at_start == first or at_end == second) and at_start != 1 - first and at_end != 1 - second
             known = known and seen[ties[s, 0], first] and seen[ties[s, 0] if lone else ties[s, 1], second]
             cell_side[s, k, 0], cell_side[s, k, 1] = (first, second) if known else (-1, -1)
@@ -366,23 +367,25 @@ def motions(positions, rows, points, moves, out):
 
 
 @compiled
-def _fill_rates(s, ties, beyond, flux, motion, rate):
-    """Fill `rate` (2,): the flux through a segment in one cell, for each of its two jumps."""
+def _rates(s, k, ties, beyond, flux, motion):
+    """The flux through a segment in its cell k, for each of its two jumps."""
+    first, second = 0.0, 0.0
     for m in range(4):
         b = _last(s, ties, m, beyond)
         if b >= 0:
-            rate[0] += flux[0, m, 0] * motion[b, 0] + flux[0, m, 1] * motion[b, 1]
-            rate[1] += flux[1, m, 0] * motion[b, 0] + flux[1, m, 1] * motion[b, 1]
+            first += flux[s, k, 0, m, 0] * motion[b, 0] + flux[s, k, 0, m, 1] * motion[b, 1]
+            second += flux[s, k, 1, m, 0] * motion[b, 0] + flux[s, k, 1, m, 1] * motion[b, 1]
+    return first, second
 
 
 @compiled
-def _pull_rates(s, ties, beyond, flux, rate, g_motion):
-    """Add to gradients of motions those of `_fill_rates`; `rate` (2,) are those of the rates."""
+def _pull_rates(s, k, ties, beyond, flux, first, second, g_motion):
+    """Add to gradients of motions those of `_rates`, given those of the two rates."""
     for m in range(4):
         b = _last(s, ties, m, beyond)
         if b >= 0:
-            g_motion[b, 0] += rate[0] * flux[0, m, 0] + rate[1] * flux[1, m, 0]
-            g_motion[b, 1] += rate[0] * flux[0, m, 1] + rate[1] * flux[1, m, 1]
+            g_motion[b, 0] += first * flux[s, k, 0, m, 0] + second * flux[s, k, 1, m, 0]
+            g_motion[b, 1] += first * flux[s, k, 0, m, 1] + second * flux[s, k, 1, m, 1]
 
 
 @loop
@@ -404,17 +407,16 @@ def add_segments(square, ties, beyond, share, cell_side, flux, row, shown, rgba,
         motion: (B, 2) motions of breaks, or their tangents; empty for zeros.
         out: (H, W, C).
     """
-    channels, rate = out.shape[2], np.empty(2)
     for s in range(len(square)):
         start = ties[s, 0]
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
-            known, rate[:] = cell_side[s, k, 0] >= 0, 0.0
+            known, first, second = cell_side[s, k, 0] >= 0, 0.0, 0.0
             if len(motion):
-                _fill_rates(s, ties, beyond, flux[s, k], motion, rate)
-            for c in range(channels):
-                value = rate[0] * steady[start, c] + rate[1] * steady[end, c]
+                first, second = _rates(s, k, ties, beyond, flux, motion)
+            for c in range(out.shape[2]):
+                value = first * steady[start, c] + second * steady[end, c]
                 if len(jump):
                     value += share[s, k, 0] * jump[start, c] + share[s, k, 1] * jump[end, c]
                 if len(jump) and known:
@@ -428,16 +430,15 @@ def add_segments(square, ties, beyond, share, cell_side, flux, row, shown, rgba,
 @loop
 def pull_segments(square, ties, beyond, share, cell_side, flux, row, shown, steady, g, g_rgba, g_jump, g_motion):
     """Add to gradients of colours, jumps (B, C) and motions (B, 2) those of `add_segments`; empty ones: not wanted."""
-    channels, rate = g.shape[2], np.empty(2)
     for s in range(len(square)):
         start = ties[s, 0]
         end = ties[s, 1] if ties[s, 1] >= 0 else start
         for k in range(4):
             y, x = square[s, 0] + (k >= 2), square[s, 1] + (k == 1 or k == 2)
-            known, rate[:] = cell_side[s, k, 0] >= 0, 0.0
-            for c in range(channels):
-                rate[0] += g[y, x, c] * steady[start, c]
-                rate[1] += g[y, x, c] * steady[end, c]
+            known, first, second = cell_side[s, k, 0] >= 0, 0.0, 0.0
+            for c in range(g.shape[2]):
+                first += g[y, x, c] * steady[start, c]
+                second += g[y, x, c] * steady[end, c]
                 if len(g_jump):
                     g_jump[start, c] += share[s, k, 0] * g[y, x, c]
                     g_jump[end, c] += share[s, k, 1] * g[y, x, c]
@@ -446,8 +447,8 @@ def pull_segments(square, ties, beyond, share, cell_side, flux, row, shown, stea
                     _add_to(g_rgba, shown[start, cell_side[s, k, 0]], c, one)
                     _add_to(g_rgba, shown[end, cell_side[s, k, 1]], c, other)
                     _add_to(g_rgba, row[y, x], c, -one - other)
-            if len(g_motion) and (rate[0] != 0 or rate[1] != 0):
-                _pull_rates(s, ties, beyond, flux[s, k], rate, g_motion)
+            if len(g_motion) and (first != 0 or second != 0):
+                _pull_rates(s, k, ties, beyond, flux, first, second, g_motion)
 
 
 @loop
