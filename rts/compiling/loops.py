@@ -2,6 +2,11 @@
 
 Compiled loops are kept on disk; helpers are not, since a helper loaded from disk is not inlined. If compilation takes
 long, a message on the terminal says so.
+
+numba counts references to arrays, one thread after the other: in a loop that is nothing but helpers and views, this can
+be most of the time. A helper that is called for each item counts none if it takes few arrays, has one `return`, no
+`break`, and uses all of them to its end. Views (`a[i]`, `a[b:e]`) and tuples of arrays are counted wherever they are
+made; whole arrays with indices, numbers, and tuples of numbers are not.
 """
 
 from __future__ import annotations
