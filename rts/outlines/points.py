@@ -274,7 +274,7 @@ class Points:
 def at_centres(cells: Cells, samples: Sequence[Samples]) -> Fronts:
     """Surfaces seen at centres (K, H, W), from the cells of a scene on the host; `samples` are those of its parts."""
     owners = np.repeat(np.arange(len(samples), dtype=np.int32), [one.ids.shape[-2] for one in samples])
-    part = np.append(owners, np.int32(-1))[cells.row]
+    part = np.append(owners, np.int32(-1)).take(cells.row)
     triangle = np.full(part.shape, -1, np.int32) if cells.triangle is None else cells.triangle
     assert cells.depth is not None
     return Fronts(part, triangle, cells.depth.astype(np.float64))

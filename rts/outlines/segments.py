@@ -42,7 +42,7 @@ def joined(breaks: Breaks, layered: bool = False) -> Segments:
     # By squares; in each of them clockwise, part by part if outlines may cross.
     group = square * (1 + breaks.parts.max(initial=0)) + ends[:, 3] if layered else square
     order = np.lexsort((along, group))
-    square, ends = square[order], ends[order]
+    square, ends = square.take(order), ends.take(order, 0)
     begins = np.append(np.flatnonzero(np.diff(group[order], prepend=-1)), len(square))
     partner = np.full(len(square), -1, np.int32)
     loops.join(begins, ends, breaks.place, breaks.tangent, partner)

@@ -68,8 +68,8 @@ def _breaks_in(
     parallel(spans_loops.breaks, count, *known, work=600 * count)
     # There is more room than they fill.
     found = np.repeat(rows - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
-    whole = whole[found]
-    return gap[whole[:, 0]], whole, numbers[found]
+    whole = whole.take(found, 0)
+    return gap.take(whole[:, 0], 0), whole, numbers.take(found, 0)
 
 
 def spans_on(gaps: Gaps, sheets: Sequence[Sheets]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
