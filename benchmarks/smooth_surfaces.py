@@ -4,8 +4,8 @@ Newell's teapot of Bézier patches, and cages of subdivision, in the benchmarks'
 gradient in the control points and a step of Adam, with torch; the triangles are made anew in each. *ms*: of the
 processor, all threads together. *Outline*: by how many pixels the outline is off, on average along it, of samples 8 × 8
 a pixel of the triangles that are used, against those 64 times as fine. *Gradient*: the relative difference (L2) to the
-gradient with triangles 64 times as fine. *Memory*: what three iterations need beyond what the process holds. Contenders
-take turns in one run:
+gradient with those, whose samples stay on them. *Memory*: what three iterations need beyond what the process holds.
+Contenders take turns in one run:
 
     python -m benchmarks.smooth_surfaces -o out/smooth
     python -m benchmarks.smooth_surfaces --quick --only teapot       # 256², fewer turns
@@ -257,7 +257,7 @@ def outline(mask: np.ndarray) -> float:
 def measure(name: str, size: tuple[int, int], rounds: int) -> list[dict[str, Any]]:
     """Rows of the results of a scene."""
     scene = SCENES[name]()
-    reference = patches(REFINED, scene, TOLERANCES[-2] / FINER)
+    reference = patches(AS_FOUND, scene, TOLERANCES[-2] / FINER)  # Its outlines are those of triangles, so exact.
     contenders = [patches(kind, scene, t) for kind in (REFINED, AS_FOUND) for t in TOLERANCES]
     contenders += [mesh(MESH, scene, rate) for rate in scene.rates]
     rate = rate_of_a_pixel(scene, size)
