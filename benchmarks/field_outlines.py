@@ -279,7 +279,7 @@ class WithoutPairs(rts.Isosurface):
 
 
 def times(rounds: int) -> Iterator[list[str]]:
-    """Lines: shader, milliseconds of a step of Adam on a torus of 128³ values, 256², with and without pairs."""
+    """Lines: shader, CPU milliseconds of a step of Adam on a torus of 128³ values, 256², with and without pairs."""
     axis = np.linspace(-1, 1, 128, dtype=np.float32)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     start = torch.tensor(np.hypot(np.hypot(x, z) - 0.55, y) - 0.25)
@@ -300,7 +300,7 @@ def times(rounds: int) -> Iterator[list[str]]:
     bounds = ((-1, -1, -1), (1, 1, 1))
     for shader in ("silhouette", "lambert"):
         ways = {"with": rts.Isosurface(bounds), "without": WithoutPairs(bounds)}
-        ms = {n: x["ms"] for n, x in in_turn({n: steps(s, shader) for n, s in ways.items()}, rounds).items()}
+        ms = {n: x["cpu"] for n, x in in_turn({n: steps(s, shader) for n, s in ways.items()}, rounds).items()}
         yield [shader, f"{ms['with']:.1f}", f"{ms['without']:.1f}", f"{ms['with'] / ms['without']:.3f}"]
 
 
@@ -312,7 +312,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/field_outlines.md"))
     args = parser.parse_args()
     if args.time:
-        print(table(["shader", "ms with pairs", "without", "ratio"], times(args.time)))
+        print(table(["shader", "CPU ms with pairs", "without", "ratio"], times(args.time)))
         return
     lines = []
     for line in rows(args.fields, args.ways, {}):

@@ -3,9 +3,10 @@
 A bunny of 5,000 faces, 96² pixels, one view. Its mask is an image of 4 × 4 samples a pixel, of which a part is set to
 zero, as if something stood in front: columns at a side, a bar across, or a corner. A start is turned and shifted by up
 to 0.15 along each axis (radians, and halves of the object's size). Errors are those of the vertices, root mean square,
-in shares of the size, after Levenberg–Marquardt with `rts.pyramid`. Steps count those of all stages.
+in shares of the size: median, largest, and how many starts end beyond 2 %, after Levenberg–Marquardt with
+`rts.pyramid`. Steps count those of all stages.
 
-    python -m benchmarks.hidden_masks              # a minute
+    python -m benchmarks.hidden_masks              # four minutes of the processor
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ F_SCALE = 0.1
 OFFSET = 0.15
 SHARE = 0.15
 """What part of the silhouette is hidden."""
-PLACES = ("nowhere", "side", "bar", "corner")
+PLACES = {"nowhere": "nowhere", "side": "a side, cut straight", "bar": "a bar across the middle", "corner": "a corner"}
 
 
 def hidden(mask: np.ndarray, place: str) -> np.ndarray:
@@ -60,7 +61,7 @@ def main() -> None:
     view = camera()
     whole = supersampled([part], view, SIZE, 4)[..., 3].astype(np.float32)
     rows = []
-    for place in PLACES:
+    for place, title in PLACES.items():
         mask, cells = hidden(whole, place), []
         for loss in LOSSES:
             residuals = rts.ImageResiduals(
@@ -74,8 +75,11 @@ def main() -> None:
                 off = vertices @ moved[:3, :3].T + moved[:3, 3] - vertices
                 errors.append(np.sqrt((off**2).sum(1).mean()) / 2)
                 steps.append(found.steps)
-            cells.append(f"{statistics.median(errors):.2%} ({max(errors):.2%}), {statistics.median(steps):.0f}")
-        rows.append([place, *cells])
+            astray = sum(e > 0.02 for e in errors)
+            cells.append(
+                f"{statistics.median(errors):.2%} ({max(errors):.2%}; {astray}), {statistics.median(steps):.0f}"
+            )
+        rows.append([title, *cells])
     print(table(["hidden", *LOSSES], rows))
 
 

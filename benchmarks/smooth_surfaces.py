@@ -1,10 +1,11 @@
 """Smooth surfaces fitted through their control points, beside the same shape as a mesh whose vertices they move.
 
 Newell's teapot of Bézier patches, and cages of subdivision, in the benchmarks' camera. An iteration is render, loss,
-gradient in the control points and a step of Adam, with torch and K = 2; the triangles are made anew in each. *Outline*:
-by how many pixels the outline is off, on average along it, of samples 8 × 8 a pixel of the triangles that are used,
-against those 64 times as fine. *Gradient*: the relative difference (L2) to the gradient with triangles 64 times as
-fine. *Memory*: what three iterations need beyond what the process holds. Contenders take turns in one run:
+gradient in the control points and a step of Adam, with torch; the triangles are made anew in each. *ms*: of the
+processor, all threads together. *Outline*: by how many pixels the outline is off, on average along it, of samples 8 × 8
+a pixel of the triangles that are used, against those 64 times as fine. *Gradient*: the relative difference (L2) to the
+gradient with those, whose samples stay on them. *Memory*: what three iterations need beyond what the process holds.
+Contenders take turns in one run:
 
     python -m benchmarks.smooth_surfaces -o out/smooth
     python -m benchmarks.smooth_surfaces --quick --only teapot       # 256², fewer turns
@@ -44,7 +45,7 @@ BUDGET = 20.0
 """Seconds of timed calls after which a contender has had enough turns."""
 MOST_FACETS = 6_000_000
 """Beyond this there is no mesh with a facet a pixel."""
-COLUMNS = {"ms": ("ms", ".1f"), "gradient": ("gradient", ".2g"), "MiB": ("memory", ".0f")}
+COLUMNS = {"ms": ("cpu", ".1f"), "gradient": ("gradient", ".2g"), "MiB": ("memory", ".0f")}
 REFINED, AS_FOUND, MESH, PIXEL = "refined", "as found", "mesh", "mesh, a facet a pixel"
 
 
@@ -256,7 +257,7 @@ def outline(mask: np.ndarray) -> float:
 def measure(name: str, size: tuple[int, int], rounds: int) -> list[dict[str, Any]]:
     """Rows of the results of a scene."""
     scene = SCENES[name]()
-    reference = patches(REFINED, scene, TOLERANCES[-2] / FINER)
+    reference = patches(AS_FOUND, scene, TOLERANCES[-2] / FINER)  # Its outlines are those of triangles, so exact.
     contenders = [patches(kind, scene, t) for kind in (REFINED, AS_FOUND) for t in TOLERANCES]
     contenders += [mesh(MESH, scene, rate) for rate in scene.rates]
     rate = rate_of_a_pixel(scene, size)

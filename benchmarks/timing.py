@@ -17,10 +17,11 @@ CONSECUTIVE = 3
 """Calls timed in a turn, after one that is not: in a loop a method finds its own data in the caches, not others'."""
 
 
-def milliseconds(times: list[float]) -> dict:
-    """Median and quartiles, of some times in seconds."""
+def milliseconds(times: list[float], processor: list[float]) -> dict:
+    """Median and quartiles of some times in seconds; and the median of those of the processor, all threads together."""
     low, _, high = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else times * 3
-    return {"ms": 1e3 * statistics.median(times), "low": 1e3 * low, "high": 1e3 * high, "calls": len(times)}
+    found = {"ms": 1e3 * statistics.median(times), "low": 1e3 * low, "high": 1e3 * high, "calls": len(times)}
+    return found | {"cpu": 1e3 * statistics.median(processor)}
 
 
 def in_turn(
@@ -40,6 +41,7 @@ def in_turn(
         budget: seconds after which a function, once it had two turns, has no more.
     """
     times: dict[str, list[float]] = {name: [] for name in functions}
+    processor: dict[str, list[float]] = {name: [] for name in functions}
     order, shuffle = list(functions), random.Random(0).shuffle
     for n in range(rounds + WARM_UP):
         shuffle(order)
@@ -50,8 +52,9 @@ def in_turn(
             if n < WARM_UP:
                 continue
             for _ in range(CONSECUTIVE):
-                start = time.perf_counter()
+                start, begun = time.perf_counter(), time.process_time()
                 functions[name]()
                 times[name].append(time.perf_counter() - start)
+                processor[name].append(time.process_time() - begun)
         done()
-    return {name: milliseconds(t) for name, t in times.items()}
+    return {name: milliseconds(t, processor[name]) for name, t in times.items()}

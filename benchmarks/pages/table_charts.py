@@ -46,15 +46,15 @@ def draw_samplers(found: dict[str, Any]) -> Any:
 
 
 def smooth() -> dict[str, Any]:
-    """Milliseconds of a shaded iteration and the gradient's error, at 256², of the page of smooth surfaces."""
-    found = {}
-    for name, title in (("teapot", "teapot: Bézier patches"), ("rook", "rook: subdivision with creases")):
-        columns, lines = written("smooth-surfaces", f"{name}, 256²", keys=2)
-        ms, off = columns.index("lambert, ms"), columns.index("lambert, gradient")
+    """Milliseconds of an iteration and the gradient's error, at 256², of the page of smooth surfaces."""
+    found: dict[str, Any] = {}
+    columns, lines = written("smooth-surfaces", "teapot, 256²", keys=2)
+    for shader in ("silhouette", "lambert"):
+        ms, off = columns.index(f"{shader}, ms"), columns.index(f"{shader}, gradient")
         for line, cells in lines.items():
             kind = line.split(" | ")[0]
             point = [number(cells[ms]), number(cells[off])]
-            found.setdefault(title, {}).setdefault(kind, []).append(point)
+            found.setdefault(f"teapot, {shader}", {}).setdefault(kind, []).append(point)
     return found
 
 
@@ -64,7 +64,7 @@ def draw_smooth(found: dict[str, Any]) -> Any:
              "mesh": "mesh of the same control points", "mesh, a facet a pixel": "mesh, a facet a pixel"}  # fmt: skip
     figure, two = panels(2, 11, 4.3)
     for axes, (title, kinds) in zip(two, found.items(), strict=True):
-        axes.set(xscale="log", yscale="log", title=title, xlabel="a shaded iteration at 256², ms")
+        axes.set(xscale="log", yscale="log", title=title, xlabel="an iteration at 256², ms of the processor")
         axes.grid(color="#e5e7eb")
         for kind, points in kinds.items():
             color, marker = KINDS[kind]

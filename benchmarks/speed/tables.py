@@ -95,7 +95,7 @@ def lm(rows: list[dict]) -> str:
     header = ["mesh, side", "engine", "unknowns", *rows[0]["times"], "step / gradient", "by the Jacobian / gradient"]
     lines = []
     for row in rows:
-        gradient, step, jacobian = (t["ms"] for t in row["times"].values())
+        gradient, step, jacobian = (t["cpu"] for t in row["times"].values())
         ratios = (f"{step / gradient:.2f}", f"{jacobian / gradient:.2f}")
         about = [f"{row['mesh']}, {row['side']}²", row["engine"], str(row["unknowns"])]
         lines.append([*about, *map(number, (gradient, step, jacobian)), *ratios])
@@ -126,8 +126,8 @@ SECTIONS = {
     ),
     "lm": (
         "Levenberg–Marquardt",
-        "A step that is accepted: a solution, and loss and normal equations at the trial; milliseconds. *step*: by "
-        "`ImageResiduals`.",
+        "A step that is accepted: a solution, and loss and normal equations at the trial; milliseconds of the "
+        "processor, all threads together. *step*: by `ImageResiduals`.",
         lm,
     ),
 }

@@ -1,6 +1,7 @@
 """Several views of one scene: a loop of `rts.render` against `rts.render_views`, in turns.
 
 Eight views of a mesh: images alone with NumPy, torch and jax; gradients in vertices or in the pose with torch and jax.
+Times are those of the processor.
 
     python -m benchmarks.speed.views
 """
@@ -121,10 +122,10 @@ def main() -> None:
             part = part_of(kept_mesh(name, args.output / "meshes"), shader)
             for kind in args.kinds:
                 calls = {str(t): call_of(kind, part, args.side, t) for t in (False, True)}
-                loop, views = (x["ms"] for x in in_turn(calls, args.rounds).values())
+                loop, views = (x["cpu"] for x in in_turn(calls, args.rounds).values())
                 lines.append((f"{name}, {shader}", kind, f"{loop:.1f}", f"{views:.1f}", f"{loop / views:.2f}"))
                 print(*lines[-1], sep=" | ", flush=True)
-    print(table(("scene", "what", "loop [ms]", "views [ms]", "ratio"), lines))
+    print(table(("scene", "what", "loop [CPU ms]", "views [CPU ms]", "ratio"), lines))
 
 
 if __name__ == "__main__":
