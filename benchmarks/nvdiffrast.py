@@ -1,14 +1,13 @@
 """nvdiffrast's interface on rts beside its own antialiasing, and beside rts used directly.
 
 The experiments are those of nvdiffrast's samples, written anew: a cube with unknown corners and colours in images of
-few pixels, and the pose of a cube whose sides have colours of their own. Four methods: `rts_nvdiffrast`, with one and
-with 3 × 3 samples a pixel; its rasterization with nvdiffrast's analytic antialiasing (`analytic_antialias`); and
-`rts.render` with one sample a pixel. Each method makes its own targets. Fits that results/nvdiffrast.json has are not
-repeated.
+few pixels, and the pose of a cube whose sides have colours of their own. Three methods: `rts_nvdiffrast`; its
+rasterization with nvdiffrast's analytic antialiasing (`analytic_antialias`); and `rts.render` with one sample a pixel.
+Each method makes its own targets. Fits that results/nvdiffrast.json has are not repeated.
 
     python -m benchmarks.nvdiffrast
     python -m benchmarks.nvdiffrast --only pose --seeds 20
-    python -m benchmarks.nvdiffrast --only cube --sizes 4 --methods twice --seeds 2
+    python -m benchmarks.nvdiffrast --only cube --sizes 4 --methods rts_nvdiffrast --seeds 2
 """
 
 from __future__ import annotations
@@ -55,17 +54,17 @@ def clip(vertices: torch.Tensor, modelview: torch.Tensor) -> torch.Tensor:
     return (torch.cat([vertices, torch.ones_like(vertices[:, :1])], dim=1) @ (PROJECTION @ modelview).T)[None]
 
 
-def by_module(samples: int = 1, faces: torch.Tensor = FACES, twice: bool = False) -> Render:
-    """`rts_nvdiffrast`; with `twice`, `antialias` cannot take off the share of u and v, since it does not see them."""
+def by_module(faces: torch.Tensor = FACES) -> Render:
+    """`rts_nvdiffrast`."""
     import rts_nvdiffrast.torch as dr
 
-    context = dr.RasterizeCudaContext(samples=samples)
+    context = dr.RasterizeCudaContext()
 
     def render(vertices, colors, rows, modelview, size):
         pos = clip(vertices, modelview)
         rast, _ = dr.rasterize(context, pos, faces, (size, size))
         color, _ = dr.interpolate(colors, rast, rows)
-        return dr.antialias(color, rast.detach() if twice else rast, pos, faces)[0]
+        return dr.antialias(color, rast, pos, faces)[0]
 
     return render
 
@@ -105,11 +104,9 @@ def by_rts(samples: int = 1, splatter: str = "auto", faces: torch.Tensor = FACES
 
 METHODS: dict[str, Callable[[], Render]] = {
     "rts_nvdiffrast": by_module,
-    "rts_nvdiffrast, 3 × 3": lambda: by_module(3),
     "analytic": by_pairs,
     "rts": by_rts,
 }
-ALL = {**METHODS, "twice": lambda: by_module(twice=True)}
 
 
 def modelview(rotation: torch.Tensor, shift: tuple[float, float, float] = (0, 0, 0)) -> torch.Tensor:
@@ -211,9 +208,9 @@ def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
     Shares of pixels are in percent. Differences are means over pixels where two images differ by 0.001 in a channel.
     """
     rng, colors = np.random.default_rng(1), torch.tensor(np.random.default_rng(0).uniform(0.1, 1, (24, 3))).float()
-    compared = ("rts_nvdiffrast", "rts_nvdiffrast, 3 × 3", "analytic", "none")
+    compared = ("rts_nvdiffrast", "analytic", "none")
     sums, corners = dict.fromkeys(("pixels", "apart", *compared), 0.0), torch.tensor(CORNERS)
-    methods = {name: METHODS[name]() for name in compared[:3]} | {"truth": by_rts(16, "none")}
+    methods = {name: METHODS[name]() for name in compared[:2]} | {"truth": by_rts(16, "none")}
     for _ in range(count):
         view = modelview(torch.tensor(Rotation.random(random_state=rng).as_matrix(), dtype=torch.float32))
         images = {name: render(corners, colors, SIDES, view, size) for name, render in methods.items()}
@@ -279,7 +276,7 @@ def keep(kind: str, name: str, value: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=("outlines", "cube", "pose"), nargs="+", default=("outlines", "cube", "pose"))
-    parser.add_argument("--methods", choices=ALL, nargs="+", default=tuple(METHODS))
+    parser.add_argument("--methods", choices=METHODS, nargs="+", default=tuple(METHODS))
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--seeds", type=int, default=3)
     given = parser.parse_args()
@@ -291,11 +288,11 @@ def main() -> None:
         for size, method in product(given.sizes if "cube" in given.only else (), given.methods):
             name = f"{method} {size} {seed}"
             if name not in kept()["cube"]:
-                keep("cube", name, cube(ALL[method](), size, seed, STEPS))
+                keep("cube", name, cube(METHODS[method](), size, seed, STEPS))
         for method in given.methods if "pose" in given.only else ():
             name = f"{method} {seed}"
             if name not in kept()["pose"]:
-                keep("pose", name, pose(ALL[method](), seed, POSE_STEPS, POSE_SIZE))
+                keep("pose", name, pose(METHODS[method](), seed, POSE_STEPS, POSE_SIZE))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ from rts.plugin_api.loops import compiled, loop
 
 MOST_STEPS = 1000
 """Triangles, at most, on the way from one pixel to the next; beyond them the surface counts as one."""
+REACH = 1 + 1e-4
+"""Length of a walk within which an edge counts: one that passes through the next centre may end either pixel."""
 JOINED, BEYOND = -1.0, 2.0
 """In place of the length of a walk: the sheet joins both centres, or goes on behind the next one."""
 
@@ -72,7 +74,7 @@ def _walk(corners, tri, beyond, start, goal, x, y, axis, way, end):
         end: (2,) int32 to fill with the vertices of the edge where the sheet ends, or turns away.
 
     Returns:
-        Length of the way to this edge, below 1; or `JOINED`, or `BEYOND`.
+        Length of the way to this edge, below `REACH`; or `JOINED`, or `BEYOND`.
     """
     t, entered, at = 0.0, -1, start
     for _ in range(MOST_STEPS):
@@ -90,7 +92,7 @@ def _walk(corners, tri, beyond, start, goal, x, y, axis, way, end):
                 there = max(value / det / fall, t)
                 if there < nearest:
                     nearest, through = there, k
-        if through < 0 or nearest >= 1:
+        if through < 0 or nearest >= REACH:
             return BEYOND
         t, next_ = nearest, beyond[at, through]
         i, j, k = face[(through + 1) % 3], face[(through + 2) % 3], face[through]
