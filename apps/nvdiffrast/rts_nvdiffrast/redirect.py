@@ -101,7 +101,16 @@ class _Event:
 
 
 class _Nothing(contextlib.nullcontext):
-    """`torch.cuda.device`, which changes nothing."""
+    """`torch.cuda.device` or `torch.cuda.stream`, which change nothing."""
+
+
+class _Stream(contextlib.nullcontext):
+    """A stream of `torch.cuda`, in which nothing is ever left to do."""
+
+    def synchronize(self, *_: Any) -> None:
+        pass
+
+    wait_stream = wait_event = record_event = synchronize
 
 
 class _Generator(torch.Generator):
@@ -152,7 +161,10 @@ def _names(pretend: bool) -> list[tuple[Any, dict[str, Any]]]:
     of_tensors |= {"cuda": _itself, "pin_memory": _itself, "device": property(_numbered_device)}
     of_cuda: dict[str, Any] = dict.fromkeys(IGNORED.split(), lambda *_, **__: None) | {
         "Event": _Event,
+        "Stream": lambda *_, **__: _Stream(),
+        "current_stream": lambda device=None: _Stream(),
         "device": _Nothing,
+        "stream": _Nothing,
         "current_device": lambda: 0,
         "get_device_name": lambda device=None: "CPU (rts_nvdiffrast)",
         "mem_get_info": lambda device=None: (memory, memory),
@@ -204,6 +216,8 @@ def redirected(pretend: bool = False) -> Iterator[None]:
     Args:
         pretend: whether `torch.cuda.is_available()` is true.
     """
+    # The first optimizer has torch import modules that read its names, which must be torch's own then.
+    torch.optim.SGD([torch.zeros(1)], lr=1.0)
     modules = _modules()
     before = {name: sys.modules.pop(name) for name in modules if name in sys.modules}
     sys.modules.update(modules)

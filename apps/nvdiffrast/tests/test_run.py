@@ -30,6 +30,7 @@ colors = torch.ones([3, 1]).to("cuda", non_blocking=True).to(0).pin_memory().to(
 net = torch.nn.Linear(1, 1).cuda().to(device)
 start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
 torch.save(tri, "tri.pt")
+torch.optim.Adam([pos]).zero_grad()
 with torch.cuda.device(0):
     assert torch.equal(torch.load("tri.pt", map_location="cuda"), tri)
 assert torch.zeros(2, device=torch.cuda.current_device()).device.type == "cpu"
@@ -83,6 +84,12 @@ assert total >= free > 1 << 20
 x = torch.zeros(2, device="cuda")
 assert "cuda:%d" % x.device.index == "cuda:0" and torch.ones(2, device=x.device).device == x.device
 assert torch.device("cuda").type == "cuda" and isinstance(torch.device("cuda", 0), torch.device)
+""",
+    "streams": """
+stream = torch.cuda.Stream()
+stream.wait_stream(torch.cuda.current_stream())
+with torch.cuda.stream(stream):
+    torch.cuda.current_stream().synchronize()
 """,
     "modules of layers": """
 net = torch.nn.Sequential(torch.nn.Linear(2, 2, device="cuda"), torch.nn.ReLU()).cuda().to("cuda", torch.float64)
