@@ -13,9 +13,9 @@ from rts.plugin_api.loops import compiled, loop
 MOST_STEPS = 1000
 """Triangles, at most, on the way from one pixel to the next; beyond them the surface counts as one."""
 REACH = 1 + 1e-4
-"""Length of a walk within which an edge counts: one that passes through the next centre may end either pixel."""
-JOINED, BEYOND = -1.0, 2.0
-"""In place of the length of a walk: the sheet joins both centres, or goes on behind the next one."""
+"""Length of a way within which an edge counts: one that passes through the next centre may end either pixel."""
+JOINED, BEYOND = -np.inf, np.inf
+"""In place of the depth at a walk's end: the sheet joins both centres, or goes on behind the next one."""
 
 
 @loop
@@ -27,9 +27,8 @@ def neighbours(tri, order):
     found = np.full((len(tri), 3), -1, np.int32)
     first = 0
     while first < len(order):
-        a, b = _ends(tri, order[first])
-        last = first + 1
-        while last < len(order) and _ends(tri, order[last]) == (a, b):
+        ends, last = _ends(tri, order[first]), first + 1
+        while last < len(order) and _ends(tri, order[last]) == ends:
             last += 1
         if last - first == 2:
             one, other = order[first], order[first + 1]
@@ -45,16 +44,30 @@ def _ends(tri, edge):
 
 
 @compiled
-def _det(p, q, r):
-    """The determinant of three corners, without z."""
-    return p[0] * (q[1] * r[3] - q[3] * r[1]) - p[1] * (q[0] * r[3] - q[3] * r[0]) + p[3] * (q[0] * r[1] - q[1] * r[0])
+def _crossing(corners, i, j, place, axis):
+    """Where the edge between two corners crosses a way along an axis, at a `place` across it.
+
+    Returns:
+        The place along the way, and z/w; NaN where the edge does not cross the way, or behind the eye.
+    """
+    p, q, across = corners[i], corners[j], 1 - axis
+    a, b = p[across] - place * p[3], q[across] - place * q[3]
+    if (a > 0) == (b > 0):
+        return np.nan, np.nan
+    s = a / (a - b)
+    w = p[3] + s * (q[3] - p[3])
+    if w <= 0:
+        return np.nan, np.nan
+    return (p[axis] + s * (q[axis] - p[axis])) / w, (p[2] + s * (q[2] - p[2])) / w
 
 
 @compiled
-def _edge(p, q, x, y, axis):
-    """The value at (x, y) of the line through two corners, and its slope along an axis of the image."""
-    a, b = p[1] * q[3] - p[3] * q[1], p[3] * q[0] - p[0] * q[3]
-    return a * x + b * y + p[0] * q[1] - p[1] * q[0], a if axis == 0 else b
+def _turns(corners, i, j, far, axis, way):
+    """True if a triangle with a `far` corner does not lie ahead of its edge, on a way along an axis."""
+    p, q, r = corners[i], corners[j], corners[far]
+    a, b, c = p[1] * q[3] - p[3] * q[1], p[3] * q[0] - p[0] * q[3], p[0] * q[1] - p[1] * q[0]
+    ahead = way * (a if axis == 0 else b)
+    return (a * r[0] + b * r[1] + c * r[3]) * ahead <= 0
 
 
 @compiled
@@ -74,49 +87,34 @@ def _walk(corners, tri, beyond, start, goal, x, y, axis, way, end):
         end: (2,) int32 to fill with the vertices of the edge where the sheet ends, or turns away.
 
     Returns:
-        Length of the way to this edge, below `REACH`; or `JOINED`, or `BEYOND`.
+        z/w at this edge; or `JOINED`, or `BEYOND`.
     """
-    t, entered, at = 0.0, -1, start
+    begin, place = (x, y) if axis == 0 else (y, x)
+    at, through, length, depth = start, -1, 0.0, 0.0
+    for k in range(3):  # The way leaves the first triangle by one of two edges, the one farther ahead.
+        there, z = _crossing(corners, tri[at, (k + 1) % 3], tri[at, (k + 2) % 3], place, axis)
+        if through < 0 or way * (there - begin) > length:
+            if there == there:
+                through, length, depth = k, way * (there - begin), z
     for _ in range(MOST_STEPS):
-        face = tri[at]
-        det = _det(corners[face[0]], corners[face[1]], corners[face[2]])
-        if det == 0:
+        if through < 0:
             return JOINED
-        nearest, through = BEYOND, -1
-        for k in range(3):
-            if beyond[at, k] == entered and entered >= 0:
-                continue
-            value, slope = _edge(corners[face[(k + 1) % 3]], corners[face[(k + 2) % 3]], x, y, axis)
-            fall = -way * slope / det
-            if fall > 0:
-                there = max(value / det / fall, t)
-                if there < nearest:
-                    nearest, through = there, k
-        if through < 0 or nearest >= REACH:
+        if not length < REACH:
             return BEYOND
-        t, next_ = nearest, beyond[at, through]
-        i, j, k = face[(through + 1) % 3], face[(through + 2) % 3], face[through]
-        turns = next_ < 0
-        if not turns:
-            other = tri[next_]
-            far = other[0] + other[1] + other[2] - i - j
-            turns = _det(corners[i], corners[j], corners[k]) * _det(corners[i], corners[j], corners[far]) >= 0
-        if turns:
+        i, j, next_ = tri[at, (through + 1) % 3], tri[at, (through + 2) % 3], beyond[at, through]
+        far = -1 if next_ < 0 else tri[next_, 0] + tri[next_, 1] + tri[next_, 2] - i - j
+        if far < 0 or _turns(corners, i, j, far, axis, way):
             end[0], end[1] = i, j
-            return t
+            return depth
         if next_ == goal:
             return JOINED
-        entered, at = at, next_
+        at, through = next_, -1
+        for k in range(3):  # It leaves others by the other edge that it crosses.
+            if tri[at, k] != far:
+                there, z = _crossing(corners, tri[at, (k + 1) % 3], tri[at, (k + 2) % 3], place, axis)
+                if there == there:
+                    through, length, depth = k, way * (there - begin), z
     return JOINED
-
-
-@compiled
-def _depth(corners, ends, place, axis):
-    """z/w where the edge between two corners crosses a way along an axis, at a place across it."""
-    p, q, across = corners[ends[0]], corners[ends[1]], 1 - axis
-    a, b = p[across] - place * p[3], q[across] - place * q[3]
-    s = a / (a - b) if a != b else 0.5
-    return (p[2] + s * (q[2] - p[2])) / (p[3] + s * (q[3] - p[3]))
 
 
 @loop
@@ -160,17 +158,14 @@ def find(first, last, corners, tri, beyond, shown, begins, found):
                 pixel, next_pixel = line * width + x, (line + axis) * width + next_x
                 at, n = n, n + 1
                 found[at, 2] = -1
-                length = other = BEYOND
+                depth = other = BEYOND
                 if here >= 0:
-                    length = _walk(own, tri, beyond, here, there, x + 0.5, y + 0.5, axis, 1, end)
-                if there >= 0 and length != JOINED:
+                    depth = _walk(own, tri, beyond, here, there, x + 0.5, y + 0.5, axis, 1, end)
+                if there >= 0 and depth != JOINED:
                     other = _walk(own, tri, beyond, there, here, next_x + 0.5, next_y + 0.5, axis, -1, other_end)
-                if length == JOINED or other == JOINED or (length == BEYOND and other == BEYOND):
+                if depth == JOINED or other == JOINED or (depth == BEYOND and other == BEYOND):
                     continue
-                ends = length != BEYOND
-                if ends and other != BEYOND:  # Of two surfaces that end, the nearer one.
-                    across = y + 0.5 if axis == 0 else x + 0.5
-                    ends = _depth(own, end, across, axis) <= _depth(own, other_end, across, axis)
+                ends = depth <= other  # Of two surfaces that end, the nearer one.
                 edge = end if ends else other_end
                 found[at, 0], found[at, 1] = (pixel, next_pixel) if ends else (next_pixel, pixel)
                 found[at, 2], found[at, 3], found[at, 4] = axis, edge[0], edge[1]
