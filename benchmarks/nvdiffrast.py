@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 
 import rts
@@ -28,7 +29,10 @@ from benchmarks import analytic_antialias
 from benchmarks.report import table
 
 FILE = Path(__file__).parent / "results/nvdiffrast.json"
+PARTS = ("outlines", "gradients", "cube", "pose")
 SIZES, STEPS, POSE_STEPS, POSE_SIZE = (4, 8, 16), 1000, 1000, 64
+POSES = 6
+"""Poses in which gradients are compared."""
 CLOSE = 1.0
 """Degrees within which a pose counts as found."""
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32) - 0.5
@@ -225,6 +229,58 @@ def outlines(size: int = 128, count: int = 20) -> dict[str, float]:
     return sums
 
 
+def gradient(shape: trimesh.Trimesh, colored: bool, seed: int, size: int = 128, fine: int = 8) -> float:
+    """Percent by which the gradient of a loss in a pose is off differences of images of `fine`² samples a pixel.
+
+    The loss is the squared distance from the image of another pose, of a mask, or of normals as colours.
+    """
+    import rts_nvdiffrast.torch as dr
+
+    context, rng = dr.RasterizeCudaContext(), np.random.default_rng(seed)
+    points, faces = torch.tensor(np.array(shape.vertices)).float(), torch.tensor(np.array(shape.faces)).int()
+    normals = torch.tensor(np.array(shape.vertex_normals)).float()
+    colors = 0.5 + 0.5 * normals if colored else torch.ones(len(points), 1)
+
+    def image(pose, by):
+        pos = clip(points, rts.rigid(pose).float())
+        rast, _ = dr.rasterize(context, pos, faces, (by * size, by * size))
+        color, _ = dr.interpolate(colors, rast, faces)
+        if by == 1:
+            return dr.antialias(color, rast, pos, faces)[0].double()
+        return color[0].reshape(size, by, size, by, -1).mean((1, 3)).double()
+
+    turn, shift = Rotation.random(random_state=rng).as_rotvec(), rng.uniform(-0.2, 0.2, 3) - [0, 0, 3.5]
+    pose = torch.tensor(np.concatenate([turn, shift]), requires_grad=True)
+    with torch.no_grad():
+        target = image(pose + torch.tensor(rng.normal(0, 0.05, 6)), fine)
+        here, steps = image(pose, fine), 0.01 * torch.eye(6).double()
+        changes = torch.stack([image(pose + e, fine) - image(pose - e, fine) for e in steps]) / 0.02
+    truth = (2 * (here - target) * changes).flatten(1).sum(dim=1)
+    (image(pose, 1) - target).square().sum().backward()
+    assert pose.grad is not None
+    return 100 * ((pose.grad - truth).norm() / truth.norm()).item()
+
+
+SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
+    "sphere of 1,280 faces": lambda: trimesh.creation.icosphere(3),
+    "box": lambda: trimesh.creation.box((1.0, 1.2, 0.8)),
+    "capsule": lambda: trimesh.creation.capsule(0.8, 0.4),
+    "torus": lambda: trimesh.creation.torus(0.8, 0.3),
+}
+
+
+def gradient_table(results: dict) -> str:
+    """Medians and largest of the percents, by shape."""
+    rows = []
+    for name in SHAPES:
+        cells = []
+        for kind in ("mask", "colours"):
+            found = [v for k, v in results["gradient"].items() if k.startswith(f"{name}, {kind} ")]
+            cells.append(f"{statistics.median(found):.1f} % ({max(found):.1f} %)")
+        rows.append([name, *cells])
+    return table(["", "mask", "normals as colours"], rows)
+
+
 def cube_table(results: dict) -> str:
     """Means over seeds, and the number of them."""
     rows = []
@@ -275,7 +331,7 @@ def keep(kind: str, name: str, value: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("outlines", "cube", "pose"), nargs="+", default=("outlines", "cube", "pose"))
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS)
     parser.add_argument("--methods", choices=METHODS, nargs="+", default=tuple(METHODS))
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--seeds", type=int, default=3)
@@ -284,6 +340,9 @@ def main() -> None:
     if "outlines" in given.only:
         for name, value in outlines().items():
             keep("outlines", name, value)
+    for (name, shape), colored, seed in product(SHAPES.items(), (False, True), range(POSES)):
+        if "gradients" in given.only:
+            keep("gradient", f"{name}, {'colours' if colored else 'mask'} {seed}", gradient(shape(), colored, seed))
     for seed in range(given.seeds):
         for size, method in product(given.sizes if "cube" in given.only else (), given.methods):
             name = f"{method} {size} {seed}"
