@@ -142,9 +142,9 @@ def _modules() -> dict[str, ModuleType]:
     """Our modules, where scripts import nvdiffrast's."""
     package: Any = ModuleType("nvdiffrast")
     package.torch, package.__path__, package.__version__ = rts_nvdiffrast.torch, [], "0.4.0"
-    return {"nvdiffrast": package, "nvdiffrast.torch": rts_nvdiffrast.torch} | {
-        name: _Missing(name) for name in MISSING
-    }
+    modules: dict[str, ModuleType] = {"nvdiffrast": package, "nvdiffrast.torch": rts_nvdiffrast.torch}
+    modules.update((name, _Missing(name)) for name in MISSING)
+    return modules
 
 
 def _names(pretend: bool) -> list[tuple[Any, dict[str, Any]]]:
