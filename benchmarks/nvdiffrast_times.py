@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+import trimesh
 
 from benchmarks import nvdiffrast as fits
 
@@ -82,7 +83,22 @@ def iterations() -> dict[str, Callable[[int], None]]:
         mask = dr.antialias((rast[..., 3:] > 0).float(), rast, pos, fine)
         (mask.mean() + depth.mean()).backward()
 
+    def antialiased(views: int) -> Callable[[int], None]:
+        """`antialias` alone of a sphere of 1,280 faces in images of 256 × 256 pixels, forwards and backwards."""
+        sphere = trimesh.creation.icosphere(3)
+        vertices, faces = torch.tensor(np.array(sphere.vertices)).float(), torch.tensor(np.array(sphere.faces)).int()
+        pos = torch.cat([turned(vertices, view) for view in range(views)]).requires_grad_()
+        rast, _ = dr.rasterize(context, pos, faces, (256, 256))
+        rast, color = rast.detach(), torch.rand((views, 256, 256, 3), requires_grad=True)
+
+        def step(number):
+            dr.antialias(color, rast, pos, faces).square().mean().backward()
+
+        return step
+
     return {
+        "antialias alone, sphere of 1,280 faces, 256²": antialiased(1),
+        "antialias alone, 16 views of it": antialiased(16),
         "cube, 16²": small(16),
         "cube, 256²": small(256),
         "sphere with a texture of 512 × 1024 and mipmaps, 512²": textured,

@@ -70,8 +70,20 @@ _MOVED = {
 """Module → names that moved there from `rts`, separated by spaces."""
 
 
+_GONE = {
+    "Fit": "rts.fit returns rts.results.Fit",
+    "RowCameras": "rts.Camera.stack makes one record of several cameras",
+    "Sampled": "it is the type of what rts.sample returns",
+    "Tuned": "it is the type of what rts.tune returns",
+    "transforms": "rts.Camera.look_at, .perspective and .orthographic make cameras, rts.rigid the matrix of a pose",
+}
+"""Names of earlier versions that are no names of `rts` any more → what there is instead."""
+
+
 def __getattr__(name: str):
     """The built-in surface or function of this name, imported through its entry point on first use."""
+    if name in _GONE:
+        raise AttributeError(f"rts.{name} is gone since 0.2: {_GONE[name]}")
     for place, names in _MOVED.items():
         if name in names.split():
             errors.warn_deprecated(f"rts.{name}", f"{place}.{name}", until="0.4")

@@ -69,6 +69,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "hand-seeds": hand_seeds,
     "defects": defects,
     "nvdiffrast-cube": lambda: nvdiffrast.cube_table(kept("nvdiffrast")),
+    "nvdiffrast-gradients": lambda: nvdiffrast.gradient_table(kept("nvdiffrast")),
     "nvdiffrast-pose": lambda: nvdiffrast.pose_table(kept("nvdiffrast")),
     "nvdiffrast-outlines": lambda: nvdiffrast.outline_table(kept("nvdiffrast")),
     "nvdiffrast-time": lambda: nvdiffrast.time_table(kept("nvdiffrast")),

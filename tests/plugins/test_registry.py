@@ -1,6 +1,8 @@
 """Plugins by name: what is found, what is loaded, and what the errors say."""
 
 import json
+import operator
+import re
 import subprocess
 import sys
 import tomllib
@@ -214,6 +216,15 @@ def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(instal
         with pytest.raises(AttributeError, match=f"^module 'rts' has no attribute '{name}'.*{hint}"):
             getattr(rts, name)
     assert not hasattr(rts, "qqq") and not hasattr(rts, "Toy")
+
+
+def test_names_of_earlier_versions_tell_what_there_is_instead():
+    with pytest.raises(AttributeError, match="^rts.transforms is gone since 0.2: rts.Camera.look_at, .perspective"):
+        rts.transforms  # noqa: B018
+    for name, instead in rts._GONE.items():
+        assert not hasattr(rts, name)
+        for path in re.findall(r"rts\.([\w.]*\w)", instead):
+            assert operator.attrgetter(path)(rts) is not None
 
 
 def test_a_surface_that_cannot_be_loaded_is_an_attribute_error_too(monkeypatch):

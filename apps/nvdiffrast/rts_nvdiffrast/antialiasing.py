@@ -1,21 +1,19 @@
-"""`antialias`: outlines as area averages, which move with their surface.
+"""`antialias`: pairs of pixels blended across outlines, by the areas on both sides of them.
 
-nvdiffrast blends pairs of pixels across edges that it finds by triangles' corners, and differentiates the weights. Here
-the geometry is drawn again, and the splatter `edges` finds its outlines. A pixel at an outline is the area average of
-the colours beside it. Each sample has the colour of one of the 3 × 3 shaded pixels around it.
+As in nvdiffrast (Laine et al. 2020), two neighbouring pixels on both sides of a silhouette edge take a share of each
+other's colour, and the shares move with the edge. Two things are finer. Edges are found by walks over triangles from
+centre to centre, so that triangles may be smaller than pixels. A share is the area of the pixel beyond a straight
+line, not a length.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
-
 import numpy as np
 import torch
 
-import rts
 from rts import InputError
 from rts.plugin_api.operations import take
+from rts.plugin_api.threads import parallel, read_only
 from rts_nvdiffrast.checks import (
     check_corners,
     check_devices,
@@ -25,17 +23,10 @@ from rts_nvdiffrast.checks import (
     check_triangles,
     described,
 )
-from rts_nvdiffrast.rasterizing import DRAWN, SAMPLES, Drawn
-from rts_nvdiffrast.triangles import Image, Topology, images
+from rts_nvdiffrast.triangles import Topology
 
-NEAR = 1e-6
-"""Difference of z/w that counts as much as a distance of one pixel, so that rounding does not choose among pixels."""
-PEELED = 3
-"""The fewest samples along each side of a pixel of a layer behind the front."""
-CALIBRATION = (1 + 2 * math.exp(-2)) / (8 * math.exp(-2))
-"""The factor with which splats of 0.5 cells that move a ramp of colour have its true derivative."""
-AROUND = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
-"""Steps (x, y) to the pixels that may colour a sample, the sample's own first."""
+LEVEL = 1e-2
+"""The least slope of a line against its way, so that nothing is divided by 0."""
 
 
 def antialias(
@@ -48,21 +39,16 @@ def antialias(
 ) -> torch.Tensor:
     """Antialias outlines, with a derivative in positions; any number of channels.
 
-    **Motion counts once.** The derivative of this image in `pos` is complete: it has outlines, creases and colours that
-    move with their surface. If `color` depends on u and v of `rast`, these carry the motion of colours, too. So the
-    share of u and v in the derivative of *this* image is taken off `rast` again. Gradients of other images that come
-    from the same `rast` keep theirs, and so do attributes, textures and other calls of `antialias`. An image that is
-    antialiased twice, one call after the other, has its outlines counted twice. The share is found by going backwards
-    from this image to `rast`; so shading runs backwards twice. Where `pos` has no gradient, nothing is taken off.
+    The derivative in `pos` is that of outlines alone. Colours that move with their surface have theirs by way of u and
+    v of `rast`, as in nvdiffrast.
 
     Args:
         color: (B, H, W, C), shaded at the pixels of `rast`; float32 or float64.
-        rast: (B, H, W, 4), the first result of `rasterize`, which also tells how many samples its context wants: the
-            very tensor that `interpolate` got. With a copy, a slice or `rast.detach()` motion counts twice.
+        rast: (B, H, W, 4), the first result of `rasterize`; only the numbers of triangles are read.
         pos: as in `rasterize`.
         tri: as in `rasterize`.
         topology_hash: the result of `antialias_construct_topology_hash` for `tri`; None to look for one.
-        pos_gradient_boost: factor on the derivative in `pos`, of outlines and of colours that move.
+        pos_gradient_boost: factor on the derivative in `pos`.
 
     Returns:
         (B, H, W, C). Pixels away from outlines are those of `color`.
@@ -85,25 +71,12 @@ def antialias(
     elif not isinstance(topology_hash, Topology) or len(topology_hash.faces) != len(tri):
         given = described(topology_hash) if not isinstance(topology_hash, Topology) else "is of other triangles"
         raise InputError(f"topology_hash {given}; expected what antialias_construct_topology_hash gave for tri")
-    drawn = getattr(rast, DRAWN, None) or Drawn(SAMPLES, _shown_ranges(rast), 0)
-    if pos.ndim == 3:
-        drawn = drawn._replace(ranges=None)
-    elif drawn.ranges is None:
-        drawn = drawn._replace(ranges=np.tile([[0, len(tri)]], (len(rast), 1)))
-    moving = pos.detach() + pos_gradient_boost * (pos - pos.detach())
-    every = images(moving, topology_hash, drawn.ranges)
-    value = torch.stack([_image(color[b], rast[b].detach(), image, drawn) for b, image in enumerate(every)])
-    if pos.requires_grad and rast.requires_grad:
-        value = _WithoutMotion.apply(value, rast)
-    return value
-
-
-def _shown_ranges(rast: torch.Tensor) -> np.ndarray:
-    """Ranges (B, 2) of triangles, for each image from the lowest to the highest that it shows."""
-    numbers = rast[..., 3].detach().flatten(1).long()
-    last = numbers.amax(dim=1)
-    first = torch.where(numbers > 0, numbers, last[:, None]).amin(dim=1)
-    return torch.stack([(first - 1).clamp_min(0), (last - first + 1) * (last > 0)], dim=1).cpu().numpy()
+    moving = pos if pos_gradient_boost == 1 else pos.detach() + pos_gradient_boost * (pos - pos.detach())
+    near, far, lines = _outlines(rast, moving, topology_hash)
+    beyond, short = (x.to(color.dtype)[:, None] for x in _areas(lines))
+    flat = color.reshape(-1, color.shape[-1])
+    jump = take(flat, near) - take(flat, far)
+    return flat.index_add(0, far, beyond * jump).index_add(0, near, -short * jump).reshape(color.shape)
 
 
 def antialias_construct_topology_hash(tri: torch.Tensor) -> Topology:
@@ -118,128 +91,64 @@ def antialias_construct_topology_hash(tri: torch.Tensor) -> Topology:
     return Topology.of(check_triangles(tri))
 
 
-class _WithoutMotion(torch.autograd.Function):
-    """An image itself, whose gradient takes its own share off that of `rast`, which it gets by way of colours."""
+def _outlines(
+    rast: torch.Tensor, pos: torch.Tensor, topology: Topology
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Outlines between the centres of neighbouring pixels.
 
-    @staticmethod
-    def forward(ctx: Any, value: torch.Tensor, rast: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(value, rast)
-        return value.view_as(value)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        value, rast = ctx.saved_tensors
-        with torch.enable_grad():
-            (share,) = torch.autograd.grad(value, rast, g, retain_graph=True, allow_unused=True)
-        return g, None if share is None else -share
-
-
-class _Shaded(NamedTuple):
-    """Colours of one image's pixels, and the triangles that they show.
-
-    Attributes:
-        triangle: (H, W) int64, −1 for none.
-        depth: (H, W), z/w.
-        image: the geometry.
+    Returns:
+        The pixels (M,) whose surface ends, and those (M,) behind, as flat indices; and lines (3, M), differentiable in
+        `pos`: the a, b and c of a s + b r + c = 0, where s and r are pixels from the first centre towards the second,
+        and across this way.
     """
-
-    triangle: torch.Tensor
-    depth: torch.Tensor
-    image: Image
-
-    def pixels(self, position: torch.Tensor, triangle: torch.Tensor, camera: rts.Camera) -> torch.Tensor:
-        """The pixels (N,), as flat indices, that colour samples at some positions (N, 3), of triangles (N,).
-
-        Of the 3 × 3 pixels around a sample those that show its triangle come first, then those that are nearest in
-        depth, then those that are nearest in the image.
-        """
-        height, width = self.triangle.shape
-        at = camera.project(position, (height, width))[:, :2]
-        limit = torch.tensor([width - 1, height - 1]).to(at.device)
-        own = torch.minimum(at.floor().long().clamp_min(0), limit)
-        chosen = own[:, 1] * width + own[:, 0]
-        rest = (self.triangle.reshape(-1)[chosen] != triangle).nonzero()[:, 0]
-        if not len(rest):
-            return chosen
-        steps = torch.tensor(AROUND).to(at.device)
-        near = own[rest, None] + steps
-        inside = ((near >= 0) & (near <= limit)).all(dim=2)
-        near = torch.minimum(near.clamp_min(0), limit)
-        index = near[..., 1] * width + near[..., 0]
-        shown = self.triangle.reshape(-1)[index]
-        depth = self.image.seen.normalized_depth(position[rest])
-        score = (self.depth.reshape(-1)[index] - depth[:, None]).abs().to(at.dtype)
-        score = score + NEAR * (near + 0.5 - at[rest, None]).square().sum(dim=2)
-        score = torch.where(shown == triangle[rest, None], score - 10, score)
-        score = torch.where(inside & (shown >= 0), score, torch.full_like(score, torch.inf))
-        best = score.argmin(dim=1, keepdim=True)
-        return chosen.index_put((rest,), index.gather(1, best)[:, 0])
+    size, device = (rast.shape[1], rast.shape[2]), rast.device
+    found = torch.from_numpy(_found(rast, pos, topology)).to(device).T.long()
+    near, far, column, first, second = found
+    image = near // (size[0] * size[1]) * pos.shape[1] if pos.ndim == 3 else 0
+    ends = take(pos.reshape(-1, 4), torch.cat([first + image, second + image]))
+    x, y, _, w = (ends if device.type == "mps" else ends.double()).T.reshape(4, 2, -1)
+    x = (x + w) * (size[1] / 2) - (near % size[1] + 0.5) * w
+    y = (y + w) * (size[0] / 2) - (near // size[1] % size[0] + 0.5) * w
+    down = column > 0
+    s, r = torch.where(down, y, x) * (far - near).sign(), torch.where(down, x, y)
+    lines = r[0] * w[1] - w[0] * r[1], w[0] * s[1] - s[0] * w[1], s[0] * r[1] - r[0] * s[1]
+    return near, far, torch.stack(lines)
 
 
-class _Colors(rts.Shader):
-    """A shader that takes colours (H, W, C) from the pixels of `shaded`."""
+def _found(rast: torch.Tensor, pos: torch.Tensor, topology: Topology) -> np.ndarray:
+    """(M, 5) int32 of outlines, on the host: see `outlines_loops.find`."""
+    from rts_nvdiffrast import outlines_loops as loops
 
-    opaque = True
-    reads = ("triangle",)
-
-    def __init__(self, shaded: _Shaded, colors: torch.Tensor):
-        self.shaded, self.colors, self.channels = shaded, colors.flatten(0, 1), colors.shape[-1]
-
-    def __call__(self, theta: Any, gbuffer: Any, camera: rts.Camera) -> torch.Tensor:
-        """See `rts.Shader`."""
-        position = gbuffer["position"].detach()
-        pixel = self.shaded.pixels(position, gbuffer["triangle"][:, 0].detach().round().long(), camera)
-        rgb = take(self.colors, pixel)
-        return torch.cat([rgb, torch.ones_like(rgb[:, :1])], dim=1)
-
-
-def _image(color: torch.Tensor, rast: torch.Tensor, image: Image, drawn: Drawn) -> torch.Tensor:
-    """An image (H, W, C) with antialiased outlines, differentiable in colours and in positions."""
-    shaded = _Shaded(rast[..., 3].long() - 1, rast[..., 2], image)
-    vertices, camera = image.seen.vertices, image.seen.camera
-    if not image.surface.face_count:
-        return color + 0 * vertices.sum()
-    background = _background(color, shaded.triangle < 0)
-    part = rts.Part(image.surface, {"vertices": vertices}, _Colors(shaded, color))
-    if drawn.layer:
-        still = part.replace(shader=_Colors(shaded, color.detach()))
-        return _peeled(part, still, camera, background, drawn)
-    size, samples = (color.shape[0], color.shape[1]), drawn.samples
-    sampled = rts.sample(part, camera, size, sampler="raster", splatter="edges", supersample=samples)
-    return _over(rts.render_samples(sampled, part, camera, splatter="edges"), background)
+    shown = read_only(rast[..., 3].detach().cpu().numpy(), np.int32)
+    count, height, width = shown.shape
+    corners = pos.detach().cpu().numpy().astype(np.float64).reshape(-1, pos.shape[-2], 4)
+    corners[..., 0] = (corners[..., 0] + corners[..., 3]) * (width / 2)
+    corners[..., 1] = (corners[..., 1] + corners[..., 3]) * (height / 2)
+    begins = np.zeros(count * height + 1, np.int64)
+    parallel(loops.count, count * height, shown, begins[1:], work=2 * shown.size)
+    begins = begins.cumsum()
+    found = np.empty((begins[-1], 5), np.int32)
+    mesh = read_only(corners), read_only(topology.faces), read_only(topology.beyond)
+    parallel(loops.find, count * height, *mesh, shown, read_only(begins), found, work=100 * len(found))
+    return found[found[:, 2] >= 0]
 
 
-def _peeled(
-    part: rts.Part, still: rts.Part, camera: rts.Camera, background: torch.Tensor, drawn: Drawn
-) -> torch.Tensor:
-    """The image (H, W, C) of a layer behind the front, whose outlines are not found: means of samples, and splats.
+def _areas(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Areas (M,), of the pixel behind on the near side of each of some `lines`, and of the near one beyond it.
 
-    The value, and the derivative in colours, are means of samples in each pixel. The derivative in positions is that of
-    the same samples splatted, with the colours of `still`, which are constants.
+    A slanted line crosses ways along x and along y. Weights of both, which are the more unequal the less it is slanted,
+    have the sum 1 and count it once. Slopes are constants.
     """
-    more, first = max(PEELED, drawn.samples), drawn.layer
-    options = {"sampler": "raster", "splatter": None, "supersample": more, "layers": first + 2}
-    sampled = rts.sample(part, camera, (background.shape[0], background.shape[1]), **options)
-    sampled = sampled.replace(row=sampled.row[first:], depth=sampled.depth[first:])
-    value = _over(rts.render_samples(sampled, part, camera, splatter="none"), background)
-    motion = _over(rts.render_samples(sampled, still, camera, splatter="multi"), background.detach())
-    return value + CALIBRATION * (motion - motion.detach()).nan_to_num()  # Infinite colours do not move.
+    a, b, c = lines
+    slope, at = (b / a).detach().abs().clamp(LEVEL, 1 / LEVEL), -c / a
+    weight = 1 / (1 + slope**4)
+    return weight * _beside(at - 1, slope), weight * _beside(-at, slope)
 
 
-def _over(image: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-    """An image (H, W, C + 1) composited over a background (H, W, C)."""
-    return image[..., :-1] + (1 - image[..., -1:]) * background
+def _beside(at: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:
+    """The share of the unit square around 0 beside lines x = at + slope · y, on the side of small x."""
 
+    def integral(x: torch.Tensor) -> torch.Tensor:
+        return torch.where(x < 1, x.clamp_min(0).square() / 2, x - 0.5)
 
-def _background(color: torch.Tensor, empty: torch.Tensor) -> torch.Tensor:
-    """Colours (H, W, C) behind everything: of `empty` pixels their own, of others the mean of empty ones beside them.
-
-    Pixels without empty ones beside them keep their own.
-    """
-    weight = empty.to(color.dtype)[..., None]
-    sums = torch.cat([color * weight, weight], dim=2).permute(2, 0, 1)
-    sums = torch.nn.functional.avg_pool2d(sums[None], 3, stride=1, padding=1)[0].permute(1, 2, 0)
-    beside = sums[..., -1:] > 0
-    mean = sums[..., :-1] / torch.where(beside, sums[..., -1:], torch.ones_like(sums[..., -1:]))
-    return torch.where(beside & ~empty[..., None], mean, color)
+    return (integral(at + 0.5 + slope / 2) - integral(at + 0.5 - slope / 2)) / slope

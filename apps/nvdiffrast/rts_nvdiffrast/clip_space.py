@@ -28,19 +28,12 @@ class Seen(NamedTuple):
     Attributes:
         vertices: (V, 3), in the space of the camera; differentiable in clip space.
         camera: the camera, at the origin.
-        slope: a and b of z/w = a + b / depth; None for z/w = depth − `AWAY`.
         behind: (V,) bool, vertices whose triangles are left out; None for none.
     """
 
     vertices: torch.Tensor
     camera: Camera
-    slope: tuple[float, float] | None
     behind: np.ndarray | None
-
-    def normalized_depth(self, vertices: torch.Tensor) -> torch.Tensor:
-        """Clip z/w (N,) of points (N, 3) in the space of the camera."""
-        depth = -vertices[:, 2]
-        return depth - AWAY if self.slope is None else self.slope[0] + self.slope[1] / depth
 
 
 def seen(pos: torch.Tensor, tri: np.ndarray) -> Seen:
@@ -50,12 +43,12 @@ def seen(pos: torch.Tensor, tri: np.ndarray) -> Seen:
     projection = np.eye(4)
     if slope is not None:
         projection[2:] = [0, 0, -slope[0], slope[1]], [0, 0, -1, 0]
-        return Seen(torch.stack([pos[:, 0], -pos[:, 1], -pos[:, 3]], dim=1), _camera(projection), slope, None)
+        return Seen(torch.stack([pos[:, 0], -pos[:, 1], -pos[:, 3]], dim=1), _camera(projection), None)
     projection[2] = 0, 0, -1, -AWAY
     behind = (pos[:, 3] <= 0).detach()
     x, y, z, w = torch.where(behind[:, None], torch.ones_like(pos), pos).unbind(dim=1)
     vertices = torch.stack([x / w, -y / w, -z / w - AWAY], dim=1)
-    return Seen(vertices, _camera(projection), None, behind.cpu().numpy() if len(w) and bool(behind.any()) else None)
+    return Seen(vertices, _camera(projection), behind.cpu().numpy() if len(w) and bool(behind.any()) else None)
 
 
 def _camera(projection: np.ndarray) -> Camera:

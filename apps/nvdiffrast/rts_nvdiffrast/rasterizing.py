@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,27 +15,8 @@ from rts_nvdiffrast.checks import check_corners, check_devices, check_finite, ch
 from rts_nvdiffrast.interpolation import scattered
 from rts_nvdiffrast.triangles import Image, Topology, images
 
-SAMPLES = 1
-"""Samples along each side of a pixel, unless a context says otherwise."""
-
-DRAWN = "rts_drawn"
-"""The attribute of `rast` that has its `Drawn`."""
 LEVELS = 0, 1, 2, 3
 _level = [1]
-
-
-class Drawn(NamedTuple):
-    """Facts about a call of `rasterize` that `antialias` is not told by its arguments.
-
-    Attributes:
-        samples: number of samples along each side of a pixel.
-        ranges: (B, 2) ranges of triangles; None in instanced mode.
-        layer: the layer of surfaces, 0 for the front.
-    """
-
-    samples: int
-    ranges: np.ndarray | None
-    layer: int
 
 
 class RasterizeCudaContext:
@@ -43,17 +24,10 @@ class RasterizeCudaContext:
 
     Args:
         device: accepted and ignored: tensors stay on the device that they are on.
-        samples: number of samples along each side of a pixel that `antialias` takes, from 1 to 16. More find what is
-            thinner than a pixel, and take longer.
-
-    Raises:
-        InputError: another number of samples.
     """
 
-    def __init__(self, device: Any = None, *, samples: int = SAMPLES):
-        if not isinstance(samples, int) or not 1 <= samples <= 16:
-            raise InputError(f"samples is {samples!r}; expected an integer from 1 to 16")
-        self.samples = samples
+    def __init__(self, device: Any = None):
+        """Take nothing."""
 
     def set_context(self) -> None:
         """Do nothing: there is no OpenGL context."""
@@ -69,11 +43,10 @@ class RasterizeGLContext(RasterizeCudaContext):
         output_db: accepted and ignored: image-space derivatives are always there.
         mode: accepted and ignored.
         device: accepted and ignored.
-        samples: as in `RasterizeCudaContext`.
     """
 
-    def __init__(self, output_db: bool = True, mode: str = "automatic", device: Any = None, *, samples: int = SAMPLES):
-        super().__init__(device, samples=samples)
+    def __init__(self, output_db: bool = True, mode: str = "automatic", device: Any = None):
+        super().__init__(device)
 
 
 def rasterize(
@@ -148,8 +121,8 @@ class DepthPeeler:
 class _Geometry:
     """Checked arguments of `rasterize`."""
 
-    def __init__(self, glctx: Any, pos: torch.Tensor, tri: torch.Tensor, size: Any, ranges: np.ndarray | None):
-        self.pos, self.tri, self.size, self.ranges, self.samples = pos, tri, size, ranges, glctx.samples
+    def __init__(self, pos: torch.Tensor, tri: torch.Tensor, size: Any, ranges: np.ndarray | None):
+        self.pos, self.tri, self.size, self.ranges = pos, tri, size, ranges
         self.images = list(images(pos.detach(), Topology.of(tri), ranges))
 
 
@@ -168,7 +141,7 @@ def _checked(glctx: Any, pos: Any, tri: Any, resolution: Any, ranges: Any) -> _G
         height = width = 0
     if height < 1 or width < 1:
         raise InputError(f"resolution is {resolution!r}; expected (height, width), two positive integers")
-    return _Geometry(glctx, pos, tri, (height, width), _ranges(ranges, len(tri)) if pos.ndim == 2 else None)
+    return _Geometry(pos, tri, (height, width), _ranges(ranges, len(tri)) if pos.ndim == 2 else None)
 
 
 def _ranges(ranges: Any, count: int) -> np.ndarray:
@@ -194,7 +167,6 @@ def _layer(given: _Geometry, layer: int, grad_db: bool) -> tuple[torch.Tensor, t
     uv, db, depth = _barycentrics(corners, pixels % width, pixels // width % height, given.size)
     values = torch.cat([uv, depth[:, None], triangle[:, None].to(uv.dtype) + 1], dim=1)
     rast, rast_db = (scattered(x, pixels, shown.shape) for x in (values, db if grad_db else db.detach()))
-    setattr(rast, DRAWN, Drawn(given.samples, given.ranges, layer))
     return rast, rast_db
 
 

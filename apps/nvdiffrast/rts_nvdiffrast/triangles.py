@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -24,10 +25,23 @@ class Topology:
     def __init__(self, faces: np.ndarray):
         self.faces = faces
 
-    @classmethod
-    def of(cls, tri: torch.Tensor) -> Topology:
-        """The topology of `tri` (T, 3)."""
-        return cls(np.array(tri.detach().cpu().numpy(), np.int32))
+    @staticmethod
+    def of(tri: torch.Tensor) -> Topology:
+        """The topology of `tri` (T, 3); of the last few tables it is kept."""
+        return _topology(tri.detach().cpu().numpy().astype(np.int32, copy=False).tobytes())
+
+    @functools.cached_property
+    def beyond(self) -> np.ndarray:
+        """(T, 3) int32: the triangle beyond the edge opposite each corner; −1 for none, or several."""
+        from rts_nvdiffrast.outlines_loops import neighbours
+
+        edges = np.sort(self.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
+        return neighbours(self.faces, np.lexsort((edges[:, 1], edges[:, 0])))
+
+
+@functools.lru_cache(maxsize=8)
+def _topology(table: bytes) -> Topology:
+    return Topology(np.frombuffer(table, np.int32).reshape(-1, 3))
 
 
 class Triangles(TriangleSurface):
@@ -58,13 +72,11 @@ class Triangles(TriangleSurface):
         return Proxy(np.ascontiguousarray(inputs, np.float32), faces, self._ids[:, None])
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
-        """Positions, and "triangle" (N, 1), the number of the triangle as a float."""
+        """Positions."""
         vertices: Any = theta["vertices"]
         faces = torch.as_tensor(self.topology.faces, device=vertices.device)
         corners = faces[samples.ids[:, 0].long()]
-        gbuffer = GBuffer(position=interpolate(vertices, corners, 0, samples.params))
-        gbuffer.defer("triangle", lambda: samples.ids.to(vertices.dtype))
-        return gbuffer
+        return GBuffer(position=interpolate(vertices, corners, 0, samples.params))
 
 
 class Image(NamedTuple):

@@ -192,11 +192,6 @@ class TestArguments:
             dr.rasterize(**(given | changes))
         assert "\n" not in str(error.value)
 
-    @pytest.mark.parametrize("samples", [0, 17, 2.5])
-    def test_samples_are_a_few(self, samples):
-        with pytest.raises(rts.InputError, match="expected an integer from 1 to 16"):
-            dr.RasterizeCudaContext(samples=samples)
-
     def test_levels_of_messages(self):
         before = dr.get_log_level()
         dr.set_log_level(3)
