@@ -15,11 +15,11 @@ from rts_robot.robot import Robot
 from rts_robot.starts import find_starts
 from rts_robot.uncertainty import covariance_of
 
-COARSE = (rts.Stage(1 / 8, 2, 2.0),)
-FINE = (rts.Stage(1 / 4, 1, 0.7), rts.Stage())
-"""Stages of a fit: those of each start, and those of the best."""
-STEPS = 30
-"""The most steps of a stage."""
+COARSE, MIDDLE, FULL = rts.Stage(1 / 8, 2, 2.0), rts.Stage(1 / 4), rts.Stage()
+"""Stages of a fit: that of each start, and those of the best."""
+LIMITS = {COARSE: (3e-3, 20), MIDDLE: (1e-3, 20), FULL: (1e-5, 8)}
+"""Of each stage the least gain of a step, as a share of the loss, which is mostly that of wrong pixels; and the most
+steps. Further ones moved the camera by less than a tenth of its standard deviation."""
 AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes of OpenCV from those of `rts`, and back."""
 
@@ -61,8 +61,8 @@ class Calibration(NamedTuple):
         x, y, z = self.camera_to_base[:3, 3]
         turn, shift = np.degrees(self.deviations[:3]).max(), 1e3 * self.deviations[3:].max()
         return (
-            f"camera at ({x:.4f}, {y:.4f}, {z:.4f}) m; standard deviations up to {shift:.2g} mm and {turn:.2g} degrees; "
-            f"IoU {self.ious.min():.3f} to {self.ious.max():.3f} in {len(self.ious)} views"
+            f"camera at ({x:.4f}, {y:.4f}, {z:.4f}) m; standard deviations up to {shift:.2g} mm and {turn:.2g} degrees"
+            f"; IoU {self.ious.min():.3f} to {self.ious.max():.3f} in {len(self.ious)} views"
         )
 
 
@@ -117,7 +117,7 @@ def calibrate(
     best = min(range(len(fits)), key=lambda n: fits[n].loss)
     view = problems[best].view_at(fits[best].parameters)
     problem = _Problem(robot, masks, values, intrinsics, view, offsets, robust)
-    fit = problem.fitted(FINE, progress)
+    fit = problem.fitted(FULL, progress, problem.fitted(MIDDLE, progress).parameters)
     view = problem.view_at(fit.parameters)
     found = fit.parameters["offsets"].numpy().astype(np.float64) if offsets else np.zeros(0)
     moved = values + found @ problem.chosen
@@ -182,8 +182,8 @@ class _Problem:
         values = torch.as_tensor(self._values[number], dtype=offsets.dtype)
         return self._robot.parts(values + offsets @ torch.as_tensor(self.chosen, dtype=offsets.dtype)), moved
 
-    def fitted(self, schedule: Sequence[rts.Stage], progress: bool | None) -> rts.results.Fit:
-        """The fit of the parameters, from zero on."""
+    def fitted(self, stage: rts.Stage, progress: bool | None, start: Any = None) -> rts.results.Fit:
+        """The fit of the parameters, from `start` or zero on."""
 
         def scenes(parameters: Any) -> tuple[list[list[rts.Part]], list[rts.Camera]]:
             views = [self.scene(parameters, number) for number in range(len(self._masks))]
@@ -191,7 +191,9 @@ class _Problem:
 
         cameras = [self.camera] * len(self._masks)
         residuals = rts.ImageResiduals(scenes, cameras, self.size, self._masks, layers=1, loss=self._loss)
-        return rts.fit(residuals, self._start, method="lm", steps=STEPS, schedule=schedule, progress=progress)
+        tolerance, steps = LIMITS[stage]
+        options: Any = {"schedule": [stage], "steps": steps, "tolerance": tolerance, "progress": progress}
+        return rts.fit(residuals, start or self._start, method="lm", **options)
 
     def view_at(self, parameters: Any) -> np.ndarray:
         """Camera-from-base (4, 4), camera axes of OpenCV."""

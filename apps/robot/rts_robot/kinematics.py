@@ -72,7 +72,9 @@ class Kinematics:
             missing = [name for name in self.names if name not in values]
             if unknown or missing:
                 problem = f"unknown: {', '.join(map(str, unknown))}" if unknown else f"missing: {', '.join(missing)}"
-                raise rts.InputError(f"values of joints are {problem}; expected one for each of {', '.join(self.names)}")
+                raise rts.InputError(
+                    f"values of joints are {problem}; expected one for each of {', '.join(self.names)}"
+                )
             numbers = [values[name] for name in self.names]
             like = exemplar(numbers)
             numbers = constants(numbers, engine_of(numbers), like)

@@ -92,7 +92,8 @@ def load_urdf(path: Any, packages: Any = None) -> Robot:
     logger = logging.getLogger("yourdfpy")
     before, logger.level = logger.level, logging.CRITICAL  # Errors are raised here, in one line.
     try:
-        read = yourdfpy.URDF.load(str(path), filename_handler=files.found)
+        with np.errstate(invalid="ignore"):  # An axis of length zero is refused below.
+            read = yourdfpy.URDF.load(str(path), filename_handler=files.found)
     except rts.InputError:
         raise
     except Exception as error:
@@ -175,7 +176,11 @@ def _joint(path: Path, joint: Any, links: list[str], names: list[str]) -> Joint:
             f"{path}: the joint {joint.name} mimics {mimic.joint}, which is no joint that moves by itself"
         )
     limit = joint.limit
-    ends = [end if end is not None else side * np.inf for end, side in ((limit.lower, -1), (limit.upper, 1))] if limit else None
+    ends = (
+        [end if end is not None else side * np.inf for end, side in ((limit.lower, -1), (limit.upper, 1))]
+        if limit
+        else None
+    )
     limits = (-np.inf, np.inf) if ends is None or joint.type == "continuous" else (ends[0], ends[1])
     if mimic is None:
         return Joint(joint.name, joint.type, *place, origin, axis, names.index(joint.name), limits=limits)
@@ -188,6 +193,7 @@ def _joint(path: Path, joint: Any, links: list[str], names: list[str]) -> Joint:
 def _meshes(read: yourdfpy.URDF, links: list[str]) -> list[LinkMesh]:
     """The visual meshes of each link as one, in the frame of the link."""
     scene: Any = read.scene
+    painted = {link.name: _paint(read, link) for link in read.robot.links}
     by_link: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
     for node in scene.graph.nodes_geometry:
         link = scene.graph.transforms.parents[node]
@@ -196,7 +202,7 @@ def _meshes(read: yourdfpy.URDF, links: list[str]) -> list[LinkMesh]:
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             continue
         vertices = trimesh.transform_points(mesh.vertices, matrix)
-        by_link.setdefault(links.index(link), []).append((vertices, mesh.faces, _colors(mesh)))
+        by_link.setdefault(links.index(link), []).append((vertices, mesh.faces, _colors(mesh, painted[link])))
     meshes = []
     for link, pieces in sorted(by_link.items()):
         vertices, faces, colors = zip(*pieces, strict=True)
@@ -213,13 +219,23 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.float32(mesh.vertices), np.int32(mesh.faces)
 
 
-def _colors(mesh: Any) -> np.ndarray:
-    """Colours (V, 3) of vertices, linear."""
+def _paint(read: Any, link: Any) -> tuple[float, ...]:
+    """The colour that a URDF gives to the meshes of a link that have none of their own: its first, else grey."""
+    by_name = {material.name: material for material in read.robot.materials}
+    for visual in link.visuals:
+        for material in (visual.material, by_name.get(getattr(visual.material, "name", None))):
+            if material is not None and material.color is not None:
+                return tuple(material.color.rgba[:3])
+    return GREY
+
+
+def _colors(mesh: Any, paint: tuple[float, ...]) -> np.ndarray:
+    """Colours (V, 3) of vertices, linear; `paint` where the mesh has none."""
     try:
         encoded = np.asarray(mesh.visual.to_color().vertex_colors, np.float64)[..., :3] / 255
     except Exception:  # A texture whose picture is missing, say: trimesh has no kind of error for it.
         encoded = np.zeros(0)
     if not mesh.visual.defined or encoded.shape not in ((3,), (len(mesh.vertices), 3)):
-        encoded = np.array(GREY)
+        encoded = np.array(paint)
     linear = np.where(encoded > 0.04045, ((encoded + 0.055) / 1.055) ** 2.4, encoded / 12.92)
     return np.float32(np.broadcast_to(linear, (len(mesh.vertices), 3)))

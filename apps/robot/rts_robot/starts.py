@@ -6,19 +6,18 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-import rts
 from rts_robot.robot import Robot
 
-POINTS, CELLS = 3000, 64
+POINTS, CELLS = 2000, 64
 """Points of the surface, and cells along the longer side of a coarse mask."""
-FIRST, KEPT, CHILDREN, ROUNDS = 2000, 24, 8, 10
+FIRST, KEPT, CHILDREN, ROUNDS = 1500, 20, 8, 10
 """Orientations tried at first; poses that are kept in each round, and poses tried beside each."""
 TURN, GROWTH = 0.3, 0.06
 """Standard deviations of these in the first round: radians, and shares of the distance. The last round has a tenth."""
 COVERED = 0.2
 """Least share of a cell that the mask covers where the robot is."""
-APART = 0.2
-"""Least angle, in radians, between two starts."""
+APART, RIVALS = 0.4, 0.05
+"""Least angle, in radians, between two starts; and how far the overlap of the second may be below that of the first."""
 
 
 def find_starts(
@@ -59,7 +58,8 @@ def find_starts(
     for number in np.argsort(-scores):
         turn = poses[number, :3, :3]
         others = [Rotation.from_matrix(turn @ start[:3, :3].T).magnitude() for start in starts]
-        if len(starts) < count and all(angle > APART for angle in others):
+        near = scores[number] > scores.max() - RIVALS
+        if near and len(starts) < count and all(angle > APART for angle in others):
             starts.append(poses[number])
     return [start @ views.uncentred for start in starts]
 
@@ -72,7 +72,9 @@ class _Coarse:
         self.cell = max(height, width) / CELLS
         self.grid = int(np.ceil(height / self.cell)), int(np.ceil(width / self.cell))
         x, y = (np.arange(width) / self.cell).astype(int), (np.arange(height) / self.cell).astype(int)
-        sums = np.add.reduceat(np.add.reduceat(masks, np.unique(y, return_index=True)[1], 1), np.unique(x, return_index=True)[1], 2)
+        sums = np.add.reduceat(
+            np.add.reduceat(masks, np.unique(y, return_index=True)[1], 1), np.unique(x, return_index=True)[1], 2
+        )
         counts = np.outer(np.bincount(y), np.bincount(x))
         self.inside = sums / counts > COVERED
         points = surface_points(robot, values, POINTS, rng)

@@ -44,7 +44,9 @@ def covariance_of(
     """
     moments = [_moments(residuals, parameters, number, loss) for number in range(views)]
     # Sums over blocks for each grid, of all views.
-    grids = [tuple(np.concatenate(sums) for sums in zip(*of_views, strict=True)) for of_views in zip(*moments, strict=True)]
+    grids = [
+        tuple(np.concatenate(sums) for sums in zip(*of_views, strict=True)) for of_views in zip(*moments, strict=True)
+    ]
     hessian = grids[0][1].sum(axis=0)
     _refuse_open(hessian, names)
     total = np.zeros_like(hessian)
@@ -74,7 +76,10 @@ def _moments(
     half, grids = side // 2, []
     for top, left in ((0, 0), (half, 0), (0, half), (half, half)):
         _, block = np.unique(((y + top) // side) * (2 * BLOCKS) + (x + left) // side, return_inverse=True)
-        sums = np.zeros((block.max(initial=-1) + 1, len(parameters))), np.zeros((block.max(initial=-1) + 1, *2 * (len(parameters),)))
+        sums = (
+            np.zeros((block.max(initial=-1) + 1, len(parameters))),
+            np.zeros((block.max(initial=-1) + 1, *2 * (len(parameters),))),
+        )
         np.add.at(sums[0], block, slopes)
         np.add.at(sums[1], block, curvatures)
         grids.append(sums)
