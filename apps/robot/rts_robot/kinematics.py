@@ -77,8 +77,11 @@ class Kinematics:
                 )
             numbers = [values[name] for name in self.names]
             like = exemplar(numbers)
-            numbers = constants(numbers, engine_of(numbers), like)
-            values = numbers if like is None else rts.namespace(like).stack([x.reshape(()) for x in numbers])
+            if like is None:
+                values = np.array(numbers, np.float64)
+            else:
+                numbers = constants([np.asarray(x) if np.isscalar(x) else x for x in numbers], engine_of(like), like)
+                values = rts.namespace(like).stack([x.reshape(()) for x in numbers])
         values = from_numbers(values, "values")
         if shape_of(values) != (len(self.names),):
             raise rts.InputError(
