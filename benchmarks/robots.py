@@ -6,12 +6,11 @@ random, are turned into their opposite, and with blotches disks on the outline a
 camera 1.7 to 2.2 m away, 5 random poses of the robot, and no start is given.
 
     python -m benchmarks.robots                          # errors and time at 480 x 640; some minutes
-    python -m benchmarks.robots --coverage 100           # intervals, at 120 x 160; five minutes
-    python -m benchmarks.robots --coverage 100 --whole   # the same by whole fits; an hour
+    python -m benchmarks.robots --coverage 60            # intervals, at 240 x 320, two draws a scene; ten minutes
     python -m benchmarks.robots --offsets                # joints that are off
 
-Without `--whole`, fits take Newton steps with the Jacobian of the true camera, rendered once. Errors are far below a
-pixel, so that it changes little.
+Fits for intervals take Newton steps with the Jacobian of the true camera, rendered once: errors are far below a pixel,
+so that it changes little.
 """
 
 from __future__ import annotations
@@ -37,7 +36,8 @@ from benchmarks.report import table
 PANDA = "example-robot-data/robots/panda_description/urdf/panda.urdf"
 PLACES = (Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix/share", DATA)
 """Where the package is: as pip installs it, or unpacked."""
-FULL, SMALL, VIEWS = (480, 640), (120, 160), 5
+FULL, SMALL, VIEWS, DRAWS = (480, 640), (240, 320), 5, 2
+"""Sizes of pictures, views of a scene, and draws of wrong pixels for a scene of intervals."""
 WRONG = 0.02
 """Share of wrong pixels."""
 OPENCV = np.diag([1.0, -1, -1, 1])
@@ -140,33 +140,33 @@ def accuracy(robot: Robot, seeds: int, chosen: list[str]) -> None:
     print(table(["scene", "masks", "mm", "degrees", "CPU s", "wall s"], rows))
 
 
-def coverage(robot: Robot, runs: int, chosen: list[str], whole: bool) -> None:
-    """Print how often intervals of 90 % hold the truth, at a smaller size."""
+def coverage(robot: Robot, scenes: int, chosen: list[str], kept: Path) -> None:
+    """Print how often intervals of 90 % hold the truth, at half the size. Images are kept in a folder."""
     scores: dict[str, list[np.ndarray]] = {kind: [] for kind in chosen}
-    for seed in range(runs):
-        rng = np.random.default_rng(1000 + seed)
-        camera, values = scene(robot, SMALL, rng)
-        area = np.array([mask_of(robot, q, camera, SMALL, 5) for q in values])
-        drawn = None if whole else _linear(robot, camera, values)
-        for kind in chosen:
-            hard, blotches = KINDS[kind]
-            masks = np.array([spoilt((m > 0.5) * 1.0 if hard else m, rng, blotches) for m in area])
-            if drawn is None:
-                near = np.linalg.inv(camera.view) @ OPENCV @ np.asarray(rts.rigid(0.01 * rng.normal(size=6)))
-                found = calibrated(robot, camera, values, masks, start=near)
-                off, covariance = errors(found, camera), found.covariance
-            else:
-                off, covariance = _newton(*drawn, masks)
-            together = off @ np.linalg.solve(covariance, off)
-            scores[kind].append(np.concatenate([off / np.sqrt(np.diag(covariance)), [together], off]))
-        if seed % 10 == 9 or seed == runs - 1:
+    kept.mkdir(parents=True, exist_ok=True)
+    for seed in range(scenes):
+        if not (kept / f"{seed}.npz").is_file():
+            _keep(robot, seed, kept / f"{seed}.npz")
+        with np.load(kept / f"{seed}.npz") as file:
+            area, images, slopes = (np.float64(file[name]) for name in ("area", "render", "J"))
+        for draw in range(DRAWS):
+            rng = np.random.default_rng((seed, draw))
+            for kind in chosen:
+                hard, blotches = KINDS[kind]
+                masks = np.array([spoilt((m > 0.5) * 1.0 if hard else m, rng, blotches) for m in area])
+                off, covariance = _newton(images - masks, slopes)
+                together = off @ np.linalg.solve(covariance, off)
+                scores[kind].append(np.concatenate([off / np.sqrt(np.diag(covariance)), [together], off]))
+        if seed % 20 == 19 or seed == scenes - 1:
             print(table(COVERAGE, [_covered(kind, np.array(rows)) for kind, rows in scores.items()]), flush=True)
 
 
-def _linear(robot: Robot, camera: rts.Camera, values: np.ndarray) -> tuple[Any, Any]:
-    """Images (B, H, W) at the true camera, and their Jacobian (B, 6, H, W) by a small motion of the base."""
+def _keep(robot: Robot, seed: int, path: Path) -> None:
+    """Keep the masks of a scene, images (B, H, W) and their Jacobian (B, 6, H, W) by a small motion of the base."""
     import torch
 
+    camera, values = scene(robot, SMALL, np.random.default_rng(seed))
+    area = np.array([mask_of(robot, q, camera, SMALL, 5) for q in values])
     origin, images, slopes = torch.zeros(6), [], []
     for q in values:
 
@@ -174,30 +174,37 @@ def _linear(robot: Robot, camera: rts.Camera, values: np.ndarray) -> tuple[Any, 
             return rts.render(parts, camera.within(rts.rigid(pose, MIDDLE)), SMALL, layers=1)[..., 3]
 
         value, rows = rts.engine_of(origin).jacobian(image)(origin)
-        images.append(value.double())
-        slopes.append(rows.double())
-    return torch.stack(images), torch.stack(slopes)
+        images.append(value.numpy())
+        slopes.append(rows.numpy())
+    np.savez_compressed(path, area=np.float32(area), render=np.stack(images), J=np.stack(slopes))
 
 
-def _newton(images: Any, slopes: Any, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The error (6,) of a fit, and its covariance by the application, the images being linear in the parameters."""
+def _newton(start: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The error (6,) of a fit, and its covariance by the application, the images being linear in the parameters.
+
+    Args:
+        start: (B, H, W) residuals of the true camera.
+        slopes: (B, 6, H, W) their Jacobian.
+    """
     import torch
 
-    loss, step, p = rts.Loss("cauchy", 0.5), 1e-4, torch.zeros(6, dtype=torch.float64)
-    targets = torch.as_tensor(masks)
+    loss, step, p = rts.Loss("cauchy", 0.5), 1e-4, np.zeros(6)
+    views, y, x = np.nonzero(np.abs(slopes).sum(axis=1))
+    rows, base = slopes[views, :, y, x], start[views, y, x]
 
-    def residuals(pose: Any, number: int) -> Any:
-        return images[number] - targets[number] + torch.einsum("uhw,u->hw", slopes[number], pose)
-
-    def slope(r: Any) -> Any:
+    def slope(r: np.ndarray) -> np.ndarray:
         return loss.weights(r)[0] * r
 
-    for _ in range(5):
-        r = torch.stack([residuals(p, number) for number in range(len(images))])
+    for _ in range(6):
+        r = base + rows @ p
         curved = (slope(r + step) - slope(r - step)) / (2 * step)
-        hessian = torch.einsum("bhw,buhw,bvhw->uv", curved, slopes, slopes)
-        p = p - torch.linalg.solve(hessian, torch.einsum("bhw,buhw->u", slope(r), slopes))
-    return p.numpy(), covariance_of(residuals, p, len(images), loss, ["pose"] * 6)
+        p = p - np.linalg.solve((rows * curved[:, None]).T @ rows, rows.T @ slope(r))
+    images, jacobian = torch.as_tensor(start), torch.as_tensor(slopes)
+
+    def residuals(pose: Any, number: int) -> Any:
+        return images[number] + torch.einsum("uhw,u->hw", jacobian[number], pose)
+
+    return p, covariance_of(residuals, torch.as_tensor(p), len(start), loss, ["pose"] * 6)
 
 
 MIDDLE = np.array([0, 0, 0.4])
@@ -236,15 +243,15 @@ def offsets(robot: Robot, seeds: int) -> None:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--coverage", type=int, default=0, help="runs of the measurement of intervals")
-    parser.add_argument("--whole", action="store_true", help="whole fits in that measurement")
+    parser.add_argument("--coverage", type=int, default=0, help="scenes of the measurement of intervals")
+    parser.add_argument("--kept", type=Path, default=Path("out/robots"), help="folder of images for it")
     parser.add_argument("--offsets", action="store_true", help="joints that are off")
     parser.add_argument("--seeds", type=int, default=3, help="scenes at full size")
     parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=list(KINDS), help="of masks")
     options = parser.parse_args()
     robot = panda()
     if options.coverage:
-        coverage(robot, options.coverage, options.kinds, options.whole)
+        coverage(robot, options.coverage, options.kinds, options.kept)
     elif options.offsets:
         offsets(robot, options.seeds)
     else:
