@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-POOR = 0.6
+POOR = 0.7
 """An IoU below which a view is likely to be wrong."""
 
 

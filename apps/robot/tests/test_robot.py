@@ -60,7 +60,7 @@ def test_a_dict_of_values_may_mix_numbers_and_tensors(path):
     robot = load_urdf(path)
     elbow = torch.tensor(0.3, requires_grad=True)
     plain = robot.transforms(dict.fromkeys(JOINTS, 0.1))
-    np.testing.assert_allclose(plain, robot.transforms([0.1] * 4))
+    np.testing.assert_allclose(plain, robot.transforms([0.1] * 4), atol=1e-6)
     placed = robot.transforms({"finger": 0.01, "slide": 0.0, "elbow": elbow, "shoulder": 0.0})
     placed[robot.links.index("hand")][2, 3].backward()
     assert float(elbow.grad) == pytest.approx(-FORE * np.cos(0.3), abs=1e-6)
