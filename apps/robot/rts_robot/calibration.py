@@ -184,7 +184,7 @@ class _Problem:
         values = torch.as_tensor(self._values[number], dtype=offsets.dtype)
         return self._robot.parts(values + offsets @ torch.as_tensor(self.chosen, dtype=offsets.dtype)), moved
 
-    def fitted(self, stage: rts.Stage, progress: bool | None, start: Any = None) -> rts.results.Fit:
+    def fitted(self, stage: rts.Stage, progress: bool | None, start: Any = None) -> Any:
         """The fit of the parameters, from `start` or zero on."""
 
         def scenes(parameters: Any) -> tuple[list[list[rts.Part]], list[rts.Camera]]:
