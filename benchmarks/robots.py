@@ -112,7 +112,7 @@ def errors(found: Calibration, camera: rts.Camera) -> np.ndarray:
 
 
 KINDS = {"area": (False, 0), "area, 6 blotches a view": (False, 6), "thresholded": (True, 0)}
-"""Of masks: whether they are thresholded, and the number of blotches."""
+"""Kinds of masks: whether they are thresholded, and the number of blotches."""
 
 
 def calibrated(robot: Robot, camera: rts.Camera, values: np.ndarray, masks: np.ndarray, **options: Any) -> Calibration:

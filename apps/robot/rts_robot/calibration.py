@@ -19,7 +19,7 @@ from rts_robot.uncertainty import covariance_of
 COARSE, MIDDLE, FULL = rts.Stage(1 / 8, 2, 2.0), rts.Stage(1 / 4), rts.Stage()
 """Stages of a fit: that of each start, and those of the best."""
 LIMITS = {COARSE: (3e-3, 20), MIDDLE: (1e-3, 20), FULL: (1e-5, 8)}
-"""Of each stage the least gain of a step, as a share of the loss, which is mostly that of wrong pixels; and the most
+"""For each stage, the least gain of a step, as a share of the loss, which is mostly that of wrong pixels; and the most
 steps. Further ones moved the camera by less than a tenth of its standard deviation."""
 AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes of OpenCV from those of `rts`, and back."""
@@ -168,7 +168,7 @@ class _Problem:
         self.middle = placed[:, [mesh.link for mesh in robot.meshes], :3, 3].mean(axis=(0, 1))
         self.chosen = np.array([[name == other for other in robot.names] for name in offsets], np.float64)
         self.chosen = self.chosen.reshape(len(offsets), len(robot.names))
-        self._robot, self._values, self._masks = robot, values, np.float32(masks)
+        self._robot, self._values, self._masks = robot, values, np.asarray(masks, np.float32)
         self._offsets, self._loss = offsets, loss
         self._still = [robot.parts(q) for q in values]
         self._start = {"turn": torch.zeros(3), "shift": torch.zeros(3)}

@@ -208,15 +208,17 @@ def _meshes(read: yourdfpy.URDF, links: list[str]) -> list[LinkMesh]:
         vertices, faces, colors = zip(*pieces, strict=True)
         starts = np.cumsum([0, *map(len, vertices[:-1])])
         joined = np.concatenate([f + start for f, start in zip(faces, starts, strict=True)])
-        positions = np.float32(np.concatenate(vertices))
-        meshes.append(LinkMesh(link, positions, np.int32(joined), np.concatenate(colors), _welded(positions, joined)))
+        positions = np.asarray(np.concatenate(vertices), np.float32)
+        meshes.append(
+            LinkMesh(link, positions, np.asarray(joined, np.int32), np.concatenate(colors), _welded(positions, joined))
+        )
     return meshes
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
-    return np.float32(mesh.vertices), np.int32(mesh.faces)
+    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
 
 
 def _paint(read: Any, link: Any) -> tuple[float, ...]:
@@ -238,4 +240,4 @@ def _colors(mesh: Any, paint: tuple[float, ...]) -> np.ndarray:
     if not mesh.visual.defined or encoded.shape not in ((3,), (len(mesh.vertices), 3)):
         encoded = np.array(paint)
     linear = np.where(encoded > 0.04045, ((encoded + 0.055) / 1.055) ** 2.4, encoded / 12.92)
-    return np.float32(np.broadcast_to(linear, (len(mesh.vertices), 3)))
+    return np.array(np.broadcast_to(linear, (len(mesh.vertices), 3)), np.float32)
