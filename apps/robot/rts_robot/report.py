@@ -70,7 +70,7 @@ def write_page(path: Path, robot: Robot, found: Calibration, names: Sequence[str
     figures = "\n".join(
         f'<figure><img alt="" src="{_png(overlay(robot, found, masks[n], n))}">'
         f"<figcaption>{html.escape(names[n])}: IoU {found.ious[n]:.3f}</figcaption></figure>"
-        for n in chosen.tolist()
+        for n in map(int, chosen)
     )
     turn, shift = np.degrees(found.deviations[:3]), 1e3 * found.deviations[3:]
     rows = [
