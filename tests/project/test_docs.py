@@ -36,6 +36,7 @@ ELSEWHERE = {
     "rts render man.glb --clip 0 -o man.gif": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
     "rts cameras photos/ -o thing": "make apps",
+    "rts calibrate panda.urdf --masks masks/ --joints joints.json --fov 45 -o out/camera": "make apps",
 }
 """Commands that take long, or need files of their own, and who runs them."""
 
