@@ -23,8 +23,8 @@ size, shown = ((32, 32), (64, 64)) if quick else ((96, 96), (224, 224))
 # %% [markdown]
 # ## A model from a file
 #
-# A profile turned about an axis is a vase. Written as glTF it has a material: a base colour, *metallic* and *roughness*.
-# `rts.load` reads them, and gives the part the shader `pbr`.
+# A profile turned about an axis is a vase. Written as glTF it has a material: a base colour, *metallic* and
+# *roughness*. `rts.load` reads them, and gives the part the shader `pbr`.
 
 # %%
 heights = np.linspace(-1, 1, 60)
@@ -51,7 +51,8 @@ room = np.full((64, 128, 3), 0.25, np.float32)
 room[:32], room[44:] = (0.35, 0.4, 0.45), (0.3, 0.2, 0.12)
 room[14:32, 24:44], room[10:28, 82:100] = (6.0, 5.4, 4.4), (2.0, 3.2, 5.0)
 light = {"environment": prefiltered(room)}
-cameras = [rts.Camera.look_at(eye, (0, 0, 0), fov_y=40) for eye in ((0, 0.6, 3.4), (3.2, 1, 0.6), (0, 1.6, -3), (-3, 0, 1))]
+eyes = ((0, 0.6, 3.4), (3.2, 1, 0.6), (0, 1.6, -3), (-3, 0, 1))
+cameras = [rts.Camera.look_at(eye, (0, 0, 0), fov_y=40) for eye in eyes]
 
 
 def scene(looks, light):
