@@ -124,7 +124,7 @@ def square(direction: Sequence[float], side: float) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------- bodies
 
 
-def of_mesh(vertices: np.ndarray, faces: Any, offset: Any = (0, 0, 0)) -> Body:
+def of_mesh(vertices: Any, faces: Any, offset: Any = (0, 0, 0)) -> Body:
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
     return Body(rts.Mesh(faces), {"vertices": vertices}, (vertices, faces), np.asarray(offset, float))
 

@@ -154,8 +154,8 @@ class Mixed:
 def ours(scene: Scene, setting: str) -> tuple[np.ndarray, np.ndarray]:
     """Our image and derivative image (H, W), per unit of t."""
     zero, one = torch.tensor(0.0).double(), torch.tensor(1.0).double()
-    value, slope = torch.func.jvp(lambda t: image(scene, t, *SETTINGS[setting]), (zero,), (one,))
-    return value.numpy(), slope.numpy()
+    found = torch.func.jvp(lambda t: image(scene, t, *SETTINGS[setting]), (zero,), (one,))
+    return found[0].numpy(), found[1].numpy()
 
 
 def our_gradient(scene: Scene, weights: np.ndarray, setting: str) -> Callable[[], None]:
@@ -249,7 +249,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/shadows"))
     parser.add_argument("--samples", type=int, nargs="+", default=[16, 64])
     parser.add_argument("--truth", type=int, default=2048, help="samples a pixel of each end of a difference")
-    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--scenes", nargs="*", help="names, all by default")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
@@ -257,7 +257,7 @@ def main() -> None:
     for scene in scenes():
         if not args.scenes or scene.name in args.scenes:
             rows.append(measured(scene, args))
-            print({k: v for k, v in rows[-1].items()}, flush=True)
+            print(rows[-1], flush=True)
     text = written(rows, args.samples)
     (args.output / "mitsuba.json").write_text(
         json.dumps(environment(("numpy", "torch", "mitsuba")) | {"rows": rows}, indent=1) + "\n"

@@ -35,13 +35,14 @@ def found(metallic: float, roughness: float, start: float) -> tuple[float, float
 
     logits = {"color": torch.zeros(3), "metallic": torch.logit(torch.tensor(start)), "roughness": torch.tensor(0.0)}
     fit = rts.fit(residuals, logits, method="lm", steps=25, progress=False)
-    return tuple(torch.sigmoid(fit.parameters[name]).item() for name in ("metallic", "roughness"))
+    metal, rough = (float(torch.sigmoid(fit.parameters[name])) for name in ("metallic", "roughness"))
+    return metal, rough
 
 
 def main() -> None:
     lines = []
     for metallic, roughness in ((0.0, 0.5), (1.0, 0.5), (1.0, 0.8)):
-        for start in (0.27, 0.5):
+        for start in (0.27, 0.5, 0.9):
             m, r = found(metallic, roughness, start)
             lines.append([f"{metallic:g}, {roughness:g}", f"{start:g}", f"{m:.3f}, {r:.3f}"])
             print(lines[-1], flush=True)

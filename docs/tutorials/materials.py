@@ -122,4 +122,4 @@ Image.open("materials.png").copy()
 #
 # Light and colour are a product: twice the light on half the colour is the same picture. So one of them must be known,
 # or both are found up to a factor. *Metallic* is told from highlights: a metal's have its colour, others are white.
-# In smooth light there are none, and a dull metal looks like dull paint: [measured](../results/materials.md).
+# In smooth light a fit may end at the wrong one, so begin with both: [measured](../results/materials.md).

@@ -235,7 +235,7 @@ class ShaderConformance(Conformance):
             for f in (found, expected)
         ]
         scale = max(1.0, float(np.abs(slopes[1]).max()))
-        claim_close(*slopes, TOLERANCE * scale, f"in {engine.name}, the gradient of the colour in shadows")
+        claim_close(slopes[0], slopes[1], TOLERANCE * scale, f"in {engine.name}, the gradient of the colour in shadows")
 
     # ------------------------------------------------------------------------------------------- errors
 
