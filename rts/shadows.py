@@ -131,7 +131,8 @@ def with_shadows(
         parts: one part or several; all of them cast shadows, those that are culled from either side.
         light: θ["light"] of all parts, see `rts.shading.light`, with "direction" or "position". Light from all around
             casts no shadow.
-        size: height and width of each picture, pixels. A pixel as small as one of the image's, or smaller, is best.
+        size: height and width of each picture, pixels. A pixel as large as one of the image's is best:
+            derivatives at edges that are narrower than samples are noise.
         bounds: (center, radius) of a sphere around all that casts or receives shadows, world space, known numbers;
             None to find it. Needed where the parts are traced, as in `jax.jit`. Where the position of a point light is
             traced, it has six pictures, in which things far from it are small.

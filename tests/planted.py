@@ -373,6 +373,12 @@ def sunlit(theta, gbuffer, camera):
     return xp.concat([shade + 0 * normal, xp.ones_like(shade)], axis=1)
 
 
+def shadowless(theta, gbuffer, camera):
+    """Lambert's law without shadows."""
+    light = {name: value for name, value in theta["light"].items() if name != "shadow"}
+    return rts.plugin("rts.shaders", "lambert")()({**theta, "light": light}, gbuffer, camera)
+
+
 class HalfOfThree(Multi):
     """Wrong in forward mode where there are three layers."""
 
@@ -457,7 +463,10 @@ SURFACES = {
     "forward_and_reverse_mode_agree": {"half in forward mode": of(HalfForward(7, 12)).replace(shader="normals")},
     "refine_keeps_samples_on_their_rays": {"misses kept": of(KeepsMisses())},
 }
-SHADERS = {"lengths_of_directions_have_no_effect": {"of normals": (LongNormals(), TINT), "of lights": (sunlit, SUN)}}
+SHADERS = {
+    "lengths_of_directions_have_no_effect": {"of normals": (LongNormals(), TINT), "of lights": (sunlit, SUN)},
+    "shadows_dim_what_lights_add": {"none": (shadowless, SUN)},
+}
 SPLATTERS = {
     "engines_agree": {"half of three layers": HalfOfThree()},
     "no_rows_give_an_empty_image": {"by index": Indexing()},

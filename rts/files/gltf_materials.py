@@ -50,8 +50,8 @@ class Material(NamedTuple):
         """Vertex colours (A, 3 or 4), the texture and the factor, with the alpha that the mode gives them.
 
         It is none where the mode is OPAQUE. Where the mode is MASK, the product of alpha is 1 from the cutoff on, and 0
-        below. A texture hides the colours, unless it is not `mapped`. Arrays of three components have no alpha, and
-        stay as they are, as None does.
+        below; colours have no alpha there beside a texture that is `mapped`. Arrays of three components have no alpha,
+        and stay as they are, as None does.
         """
         values = [rows, self.texture, self.color]
         if self.alpha_mode == "BLEND":

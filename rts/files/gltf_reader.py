@@ -87,8 +87,6 @@ def _piece(
     colors = None
     if "COLOR_0" in read:
         colors = unit_colors(gltf, f"COLOR_0 of {name}", read["COLOR_0"].numbers(fractions=True))
-        if material.texture is not None and "uv" in attributes and (colors[:, :3] < 1).any():
-            gltf.note("vertex colours beside a texture, which hides them", name)
     colors, texture, color = material.shown(colors, "uv" in attributes)
     if colors is not None:
         attributes["colors"] = colors, faces

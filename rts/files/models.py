@@ -139,9 +139,7 @@ def part_of(
                 f"{path}: row {first} of {name}, as {what}float32, is NaN or infinite; expected smaller numbers: "
                 "repair the file"
             )
-    translucent = any(
-        name in theta and theta[name].shape[-1] == 4 for name in ("color", "texture" if textured else "colors")
-    )
+    translucent = any(name in theta and theta[name].shape[-1] == 4 for name in ("color", "texture", "colors"))
     shader = Pbr if piece.entries is not None else Textured if textured else Unlit if piece.unlit else Lambert
     return Part(
         (surface or registry.plugin("rts.surfaces", "mesh"))(faces, indices),

@@ -19,6 +19,10 @@ from rts.files.srgb import decode_srgb
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
 _MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
+_OPTION = re.compile(r"(-[a-z]+)\s+((?:[^-\s]\S*\s+|-[\d.]\S*\s+)*)", re.IGNORECASE)
+_USUAL = {"-s": {1.0}, "-o": {0.0}, "-t": {0.0}, "-bm": {1.0}, "-mm": {0.0, 1.0}}
+"""Options of numbers → those that change nothing."""
+_SWITCHES = {"-blendu": "on", "-blendv": "on", "-cc": "off", "-clamp": "off"}
 _MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
 """A comment by which MeshLab signs; its Tr is 1 for opaque materials."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
@@ -40,6 +44,7 @@ class Material(NamedTuple):
             black, as far as the material has them.
         maps: files of "metallic", "roughness", "emissive" and "normal_map". They replace numbers.
         unread: statements of other maps.
+        options: options of maps that are read, which are not followed: "-s of map_kd", for instance.
     """
 
     color: np.ndarray | None = None
@@ -47,6 +52,7 @@ class Material(NamedTuple):
     numbers: Mapping[str, np.ndarray] = MappingProxyType({})
     maps: Mapping[str, Path] = MappingProxyType({})
     unread: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
 
     def entries(self, referrer: Path) -> dict[str, np.ndarray] | None:
         """Entries of θ for the shader `pbr`, linear; None if the material has none. `referrer` is for errors.
@@ -91,6 +97,8 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
             current.setdefault("alpha", values[0] if of_meshlab or values[0] >= 1 else 1 - values[0])
         elif key.startswith(_MAPS) and rest:
             file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
+            if key == "map_kd" or key in MAPS:
+                current.setdefault("options", {})[key] = _unfollowed(rest)
             if key == "map_kd":
                 current["texture"] = file
             elif key in MAPS:
@@ -101,6 +109,21 @@ def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
             numbers = np.maximum(np.resize(values, 3), 0) if key == "ke" else np.clip(values[0], 0, 1)
             current.setdefault("numbers", {})[NUMBERS[key]] = np.asarray(numbers, np.float32)
     return {name: _material(values) for name, values in materials.items()}
+
+
+def _unfollowed(rest: str) -> list[str]:
+    """The options of a map statement, in small letters, but for those that change nothing."""
+    options = _MAP_OPTIONS.match(rest)
+    found = []
+    for name, values in _OPTION.findall(options.group() if options else ""):
+        name, words = name.lower(), values.lower().split()
+        try:
+            usual = {float(word) for word in words} <= _USUAL.get(name, set())
+        except ValueError:
+            usual = words == [_SWITCHES.get(name)]
+        if not usual:
+            found.append(name)
+    return found
 
 
 def _numbers(library: Path, number: int, text: str) -> list[float]:
@@ -125,4 +148,5 @@ def _material(values: dict[str, Any]) -> Material:
         numbers.pop("emissive", None)
     # The map of the ambient colour is mostly that of the diffuse one.
     unread = tuple(key for key, file in values.get("unread", {}).items() if file != texture)
-    return Material(color, texture, numbers, values.get("maps", {}), unread)
+    options = tuple(f"{name} of {key}" for key, names in values.get("options", {}).items() for name in names)
+    return Material(color, texture, numbers, values.get("maps", {}), unread, options)

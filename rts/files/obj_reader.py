@@ -237,6 +237,11 @@ def _colors(v: np.ndarray) -> np.ndarray | None:
     return v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1) if v.shape[1] == 6 else None
 
 
+def _some(names: list[str]) -> str:
+    """The first three names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
 def read_obj(path: Path) -> list[Piece]:
     """One piece a material, in order of first use. See `rts.files.models.read_pieces`."""
     lines = _Lines(path).read()
@@ -246,9 +251,11 @@ def read_obj(path: Path) -> list[Piece]:
     textures = {name: read_texture(look.texture, path) for name, look in looks.items() if look.texture is not None}
     entries = {name: look.entries(path) for name, look in looks.items()}
     unread = [f"{key} of {name!r}" for name, look in looks.items() for key in look.unread]
-    if unread:
-        more = f" and {len(unread) - 3} more" if len(unread) > 3 else ""
-        warn(f"{path} has maps that are not read: {', '.join(unread[:3])}{more}")
+    options = [f"{option} of {name!r}" for name, look in looks.items() for option in look.options]
+    kinds = (("maps that are not read", unread), ("options of maps that are not followed", options))
+    notes = [f"{what}: {_some(names)}" for what, names in kinds if names]
+    if notes:
+        warn(f"{path} has {'; and '.join(notes)}")
     v, vt, vn = _rows(lines)
     # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]

@@ -94,6 +94,20 @@ def _corner(x, n):
     return int(math.floor(min(max(x - 1.5, 0.0), n - 4.0)))
 
 
+@compiled(inline="always")
+def _some_front(x, y, depth, planes):
+    """True if the plane of some cell around a point is in front of it: of most points none is."""
+    top, left = _corner(y, planes.shape[0]), _corner(x, planes.shape[1])
+    found = False
+    for j in range(4):
+        dy = y - (top + j + 0.5)
+        for i in range(4):
+            z, unit = planes[top + j, left + i, 0], planes[top + j, left + i, 1]
+            a, b = planes[top + j, left + i, 2], planes[top + j, left + i, 3]
+            found |= unit > 0 and z + a * (x - (left + i + 0.5)) + b * dy < depth - BIAS * (unit + abs(a) + abs(b))
+    return found
+
+
 @compiled
 def _look(cells, x, y, depth, planes, covers, depths, fronts):
     """Fill tables (4, 4) of the cells around a point; True if some cell is in front of it."""
@@ -112,9 +126,8 @@ def _look(cells, x, y, depth, planes, covers, depths, fronts):
             depths[j, i] = seen
             if seen < depth - BIAS * steep:
                 fronts[j, i], some = True, True
-            off = abs(seen - depth) / steep
-            if off < closest:
-                closest, own_a, own_b, own_steep = off, a, b, steep
+            if abs(seen - depth) < closest * steep:
+                closest, own_a, own_b, own_steep = abs(seen - depth) / steep, a, b, steep
     if not some:
         return False
     some = False
@@ -181,12 +194,16 @@ def _forward(start, stop, cells, points, planes, out, kept):
     for n in range(start, stop):
         x, y, depth = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
         out[n, 0], kept[n] = 0, False
-        if not _look(cells, x, y, depth, planes, covers, depths, fronts):
+        if not _some_front(x, y, depth, planes) or not _look(cells, x, y, depth, planes, covers, depths, fronts):
             continue
-        total, kept[n] = 0.0, cells.shape[1] > 2
-        for c in range(16):
-            total += covers[c // 4, c % 4] * _cell(x, y, planes, c)[1]
-            kept[n] |= covers[c // 4, c % 4] != covers[0, 0]
+        even = True
+        for c in range(1, 16):
+            even &= covers[c // 4, c % 4] == covers[0, 0]
+        total, kept[n] = covers[0, 0], cells.shape[1] > 2 or not even
+        if not even:
+            total = 0.0
+            for c in range(16):
+                total += covers[c // 4, c % 4] * _cell(x, y, planes, c)[1]
         out[n, 0] = min(max(total, 0.0), 1.0)
 
 

@@ -52,18 +52,20 @@ def _beyond(first, second, known, unit):
 @loop
 def _forward(start, stop, even, unit, out):
     height, width = even.shape
+    # The picture is continued as if it were repeated.
+    columns, rows = np.arange(-2, width + 2) % width, np.arange(-2, height + 2) % height
     for y in range(start, stop):
         for x in range(width):
             z, u = even[y, x], unit[y, x]
             for axis in range(2):
-                # The cells from two behind to two ahead; the picture is continued as if it were repeated.
+                # The cells from two behind to two ahead.
                 if axis == 0:
-                    i, j, k, m = (x - 2) % width, (x - 1) % width, (x + 1) % width, (x + 2) % width
+                    i, j, k, m = columns[x], columns[x + 1], columns[x + 3], columns[x + 4]
                     far_back, back, ahead, far_ahead = even[y, i], even[y, j], even[y, k], even[y, m]
                     is_far_back, is_back = unit[y, i] > 0, unit[y, j] > 0
                     is_ahead, is_far_ahead = unit[y, k] > 0, unit[y, m] > 0
                 else:
-                    i, j, k, m = (y - 2) % height, (y - 1) % height, (y + 1) % height, (y + 2) % height
+                    i, j, k, m = rows[y], rows[y + 1], rows[y + 3], rows[y + 4]
                     far_back, back, ahead, far_ahead = even[i, x], even[j, x], even[k, x], even[m, x]
                     is_far_back, is_back = unit[i, x] > 0, unit[j, x] > 0
                     is_ahead, is_far_ahead = unit[k, x] > 0, unit[m, x] > 0

@@ -2,7 +2,7 @@
 
 A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. Entries of θ that it reads are differentiable:
 
-    "color" (3,) or (4,)             factor on the base colour
+    "color" (3,) or (4,)             a factor of the base colour
     "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
                                      over gbuffer["uv_footprint"] by shaders with `mip=True`
     "light"                          see `rts.shading.light`
@@ -10,12 +10,13 @@ A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. Entries of 
     "shininess" ()                   of `blinn_phong`: its exponent, by default 32
     "depth_range" (2,)               of `depth`: the depths of black and white; default the near and far planes
 
-The base colour is the texture where θ has one and the surface has uv, else the G-buffer's "color", else white.
+The base colour is the product of θ["color"], of the texture where the surface has uv, and of the G-buffer's "color", as
+far as there are any.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from rts.arrays.argument_checks import quoted
@@ -122,34 +123,37 @@ class Unlit(Shader):
         return self.premultiplied(color, alpha)
 
     def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
-        """The base colour (N, 3), not premultiplied, and its alpha (N, 1), both times θ["color"] if there is one."""
+        """The base colour (N, 3), not premultiplied, and its alpha (N, 1): a product, see the top of this file."""
         position = gbuffer["position"]
-        xp = namespace(position)
-        if "texture" in theta and "uv" in gbuffer:
-            texture = theta["texture"]
-            # Averages are of visible colours: transparent texels count by their alpha.
-            weighed = self.mip and not self.opaque and shape_of(texture)[-1] == 4
-            texture = (
-                xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1) if weighed else texture
-            )
-            base = self.looked_up(texture, gbuffer)
-            check_base("theta['texture']", base)
-            if weighed:
-                alpha = base[:, 3:]
-                base = xp.concat([base[:, :3] / xp.where(alpha > 0, alpha, 1.0), alpha], axis=1)
-        elif "color" in gbuffer:
-            base = gbuffer["color"]
-            check_base("the surface's 'color'", base)
-        else:
-            base = xp.ones_like(position)
-        one = xp.ones_like(position[:, :1])
-        color = base if base.shape[1] >= 3 else base[:, :1] * xp.ones_like(position)
-        color, alpha = color[:, :3], color[:, 3:4] if base.shape[1] == 4 else one
+        color = alpha = namespace(position).ones_like(position[:, :1])
+        for base in self._bases(theta, gbuffer):
+            color = color * (base[:, :3] if base.shape[1] >= 3 else base[:, :1])
+            alpha = alpha * base[:, 3:] if base.shape[1] == 4 else alpha
+        color = color if color.shape[1] == 3 else color * namespace(position).ones_like(position)
         if "color" in theta:
             factor = entry_of(theta, "color", (3,), (4,))
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
         return color, alpha
+
+    def _bases(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> Iterator[Array]:
+        """The texture and the surface's colours at the samples (N, C), as far as there are any."""
+        if "texture" in theta and "uv" in gbuffer:
+            texture = theta["texture"]
+            xp = namespace(texture)
+            # Averages are of visible colours: transparent texels count by their alpha.
+            weighed = self.mip and not self.opaque and shape_of(texture)[-1] == 4
+            if weighed:
+                texture = xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1)
+            base = self.looked_up(texture, gbuffer)
+            check_base("theta['texture']", base)
+            if weighed:
+                alpha = base[:, 3:]
+                base = xp.concat([base[:, :3] / xp.where(alpha > 0, alpha, 1.0), alpha], axis=1)
+            yield base
+        if "color" in gbuffer:
+            check_base("the surface's 'color'", gbuffer["color"])
+            yield gbuffer["color"]
 
     def looked_up(self, texture: Array, gbuffer: GBuffer) -> Array:
         """A texture (h, w, C) at the samples (N, C), with the options of this shader."""

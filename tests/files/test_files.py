@@ -89,7 +89,7 @@ def test_the_texture_of_a_glb_is_upright(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a b.png", "tex.png", "sub/tex.png"])
-@pytest.mark.parametrize("line", ["map_Kd {} ", "map_Kd -s 1 1 1 -clamp on {}", "map_kd\t{}\r"])
+@pytest.mark.parametrize("line", ["map_Kd {} ", "map_Kd -s 1 1 1 -clamp off {}", "map_kd\t{}\r"])
 def test_texture_names_are_found_however_they_are_written(tmp_path, name, line):
     (tmp_path / "sub").mkdir()
     [part] = rts.load(textured_quad(tmp_path, name, f"newmtl m\nKd 0 0 0\n{line}\n"))

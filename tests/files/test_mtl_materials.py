@@ -57,3 +57,14 @@ def test_other_maps_are_named_in_one_warning_but_for_copies_of_the_texture(tmp_p
     assert str(warning.message) == (
         f"{tmp_path / 'm.obj'} has maps that are not read: map_bump of 'm', map_ks of 'm', map_d of 'm' and 1 more"
     )
+
+
+def test_options_that_are_not_followed_are_named_in_the_same_warning(tmp_path):
+    picture(tmp_path, "t.png", (255, 0, 0))
+    with pytest.warns(rts.errors.FileWarning) as caught:
+        loaded(tmp_path, "map_Kd -s 2 2 1 -o -0.5 0 0 -bm 1 -clamp on t.png\nmap_Pr -imfchan r t.png\nmap_Ks s.png")
+    [warning] = caught
+    assert str(warning.message) == (
+        f"{tmp_path / 'm.obj'} has maps that are not read: map_ks of 'm'; and options of maps that are not followed: "
+        "-s of map_kd of 'm', -o of map_kd of 'm', -clamp of map_kd of 'm' and 1 more"
+    )

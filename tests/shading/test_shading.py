@@ -252,8 +252,8 @@ def test_unlit_multiplies_base_colour_and_factor_and_premultiplies_where_not_opa
     np.testing.assert_allclose(Unlit()({}, GBuffer(position=position), FRONT)[0], 1)
 
 
-def test_base_colour_is_the_texture_before_the_vertex_colours():
+def test_base_colour_is_the_product_of_texture_and_vertex_colours():
     gbuffer = GBuffer(position=np.zeros((1, 3)), color=np.full((1, 3), 0.3), uv=np.full((1, 2), 0.5))
     theta = {"texture": np.full((1, 1, 3), 0.7)}
-    np.testing.assert_allclose(Unlit()(theta, gbuffer, FRONT)[0, :3], 0.7)
+    np.testing.assert_allclose(Unlit()(theta, gbuffer, FRONT)[0, :3], 0.21)
     np.testing.assert_allclose(Unlit()({}, gbuffer, FRONT)[0, :3], 0.3)
