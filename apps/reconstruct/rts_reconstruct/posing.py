@@ -1,6 +1,8 @@
-"""Cameras of views that are held out, once other cameras were fitted."""
+"""Cameras fitted to a mesh that stays: those of views that are held out, and of views that are tried."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,24 +12,34 @@ from rts_reconstruct.model import Model, moved_camera
 from rts_reconstruct.pictures import Pictures
 from rts_reconstruct.stages import Settings
 
-STEPS = 20
-"""The most steps of Levenberg–Marquardt."""
+STEPS, FEW = 20, 5
+"""The most steps of Levenberg–Marquardt, and those of a trial."""
 
 
-def posed(model: Model, pictures: Pictures, settings: Settings) -> Model:
-    """The model with poses of the views that are held out, each fitted to its picture while the model stays.
+def posed(model: Model, pictures: Pictures, settings: Settings, places: Sequence[int], steps: int = STEPS) -> Model:
+    """The model with poses of some views, each fitted to its picture while the model stays.
 
-    A mesh and all fitted cameras may move together, which no picture tells. So cameras as they were given do not fit
-    the mesh; and they are off as much as the others were.
+    A mesh and all fitted cameras may move together, which no picture tells. So cameras of views held out, as they were
+    given, do not fit the mesh; and they are off as much as the others were.
+
+    Args:
+        model: the model.
+        pictures: the pictures.
+        settings: of the fit.
+        places: numbers of views, of those to fit and then of those held out.
+        steps: the most steps.
     """
-    first = len(pictures.views)
+    views = pictures.views + pictures.held_out
+    chosen = np.asarray(places)
     residuals = rts.ViewResiduals(
         lambda p: model.part,
-        pictures.held_out,
+        [views[place] for place in places],
         cameras=moved_camera,
         background=None if pictures.outlined else pictures.background,
     )
-    start = torch.tensor(model.poses[first:])
-    fit = rts.fit(residuals, {"poses": start}, method="lm", steps=STEPS, progress=settings.progress)
-    poses = np.concatenate([model.poses[:first], fit.parameters["poses"].numpy()])
-    return model._replace(poses=poses.astype(np.float32))
+    fit = rts.fit(
+        residuals, {"poses": torch.tensor(model.poses[chosen])}, method="lm", steps=steps, progress=settings.progress
+    )
+    poses = model.poses.copy()
+    poses[chosen] = fit.parameters["poses"].numpy()
+    return model._replace(poses=poses)
