@@ -96,9 +96,11 @@ def write_light(path: Path, model: Model) -> list[Path]:
 
 def write_cameras(folder: Path, model: Model, pictures: Pictures) -> list[Path]:
     """Write fitted cameras, in the data set's world, as a model of COLMAP: `cameras/cameras.txt` and others."""
-    moved = []
+    moved, scale = [], np.ones((4, 4))
+    scale[0, 0] = scale[1, 1] = np.exp(model.focal[0])
     for number, view, pose in zip(pictures.numbers, pictures.given, model.poses, strict=True):
         camera = view.camera.within(pictures.world.motion(np.asarray(rts.rigid(pose.astype(np.float64)))))
+        camera = camera.replace(projection=camera.projection * scale, aspect=None)
         name = view.name or f"{number}.png"
         moved.append(rts.View(camera, lambda: np.zeros(0), view.size, name=name, path=view.path, lens=view.lens))
     rts.save_views(folder / "cameras", moved)

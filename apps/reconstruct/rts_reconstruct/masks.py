@@ -59,7 +59,7 @@ def plain(views: list[rts.View], named: str, background: np.ndarray | None) -> t
         InputError: no colour is given, and borders have no plain one.
     """
     looked_at = _some(views)
-    white = all(view.mask is not None and view.lens is None for view in looked_at)
+    white = all(view.mask is not None and view.lens is None and view.mask.min() > 0.5 for view in looked_at)
     behind = _border([view.image for view in looked_at], named, white) if background is None else background
     if white:
         said = f"the masks of {named} are white all over, so that they tell no object; colours alone are compared"

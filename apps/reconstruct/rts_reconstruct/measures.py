@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
-import torch
 
 import rts
 from rts_reconstruct.masks import where
@@ -44,7 +43,7 @@ class Measured(NamedTuple):
 def shown(model: Model, pictures: Pictures, place: int) -> np.ndarray:
     """A render (H, W, 4) of a model as a view has it; `place` counts the views to fit, then those held out."""
     view = (pictures.views + pictures.held_out)[place]
-    moved = moved_camera({"poses": torch.tensor(model.poses)}, view.camera, place)
+    moved = moved_camera(model.cameras, view.camera, place)
     camera = moved.map(lambda matrix: np.asarray(matrix))
     background = None if pictures.outlined else pictures.background
     return np.clip(np.asarray(rts.render(model.part, camera, view.size, supersample=2, background=background)), 0, 1)

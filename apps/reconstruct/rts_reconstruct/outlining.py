@@ -55,7 +55,7 @@ def _silhouette(solid: trimesh.Trimesh, camera: rts.Camera, size: tuple[int, int
     if shown.all() or not shown.any():
         return alpha, np.ones(size, np.float32)
     depth = max(float(np.asarray(camera.depth(np.zeros((1, 3))))[0]), CELL)
-    band = CELL * camera.projection[1, 1] * size[0] / (2 * depth)
+    band = max(1.0, CELL * camera.projection[1, 1] * size[0] / (2 * depth))
     away = np.where(shown, scipy.ndimage.distance_transform_edt(shown), scipy.ndimage.distance_transform_edt(~shown))
     return alpha, (away > band).astype(np.float32)
 

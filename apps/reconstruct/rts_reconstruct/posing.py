@@ -34,7 +34,7 @@ def posed(model: Model, pictures: Pictures, settings: Settings, places: Sequence
     residuals = rts.ViewResiduals(
         lambda p: model.part,
         [views[place] for place in places],
-        cameras=moved_camera,
+        cameras=lambda p, camera, view: moved_camera({**p, "focal": model.cameras["focal"]}, camera, view),
         background=None if pictures.outlined else pictures.background,
     )
     fit = rts.fit(
@@ -43,3 +43,14 @@ def posed(model: Model, pictures: Pictures, settings: Settings, places: Sequence
     poses = model.poses.copy()
     poses[chosen] = fit.parameters["poses"].numpy()
     return model._replace(poses=poses)
+
+
+def refined(model: Model, pictures: Pictures, settings: Settings) -> Model:
+    """The model with the pose of each view to fit, one after the other, fitted by Levenberg–Marquardt.
+
+    Adam, which fits poses along with the shape, is slow where each step shows a few views of many.
+    """
+    quiet = settings._replace(progress=False)
+    for place in range(len(pictures.views)):
+        model = posed(model, pictures, quiet, [place], FEW)
+    return model

@@ -110,7 +110,10 @@ class Run:
         if number < len(self.losses) or self.stopped:
             return
         fit, losses = stages.fitted(self.model, self.pictures, stage, steps, self.settings, *self._reporting(number))
-        self._keep(fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces))), losses)
+        fit = fit._replace(vertices=job.shared(lambda: untangled(fit.vertices, fit.faces)))
+        if self.settings.cameras:
+            fit = job.shared(lambda: posing.refined(fit, self.pictures, self.settings))
+        self._keep(fit, losses)
 
     def texture(self, number: int, size: int, steps: int) -> None:
         """The stage of the texture, unless an earlier run made it; one that was stopped is baked alone."""

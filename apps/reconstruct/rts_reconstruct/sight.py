@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-import torch
 import trimesh
 
 import rts
@@ -18,7 +17,7 @@ FACING = 0.1
 
 def camera_of(model: Model, pictures: Pictures, place: int, camera: rts.Camera) -> rts.Camera:
     """A camera (of the pictures' world) of a view, as its pose is fitted."""
-    moved = moved_camera({"poses": torch.tensor(model.poses)}, camera, place)
+    moved = moved_camera(model.cameras, camera, place)
     return moved.map(lambda matrix: np.asarray(matrix))
 
 

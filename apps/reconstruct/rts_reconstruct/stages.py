@@ -87,7 +87,8 @@ def fitted(
     start = dict(shape.start)
     rates = {"shape": stage.shape * shape.rate, "colors": stage.colors}
     if settings.cameras:
-        start["poses"], rates["poses"] = torch.tensor(model.poses), stage.poses
+        start |= model.cameras
+        rates |= dict.fromkeys(model.cameras, stage.poses)
     residuals = rts.ViewResiduals(
         shape.part,
         pictures.views,
@@ -106,8 +107,9 @@ def fitted(
         callback=lambda step, p, loss: report(step, loss, lambda: shape.mesh(p)),
         progress=settings.progress,
     )
-    poses = fit.parameters["poses"].numpy() if settings.cameras else model.poses
-    found = Model(*shape.mesh(fit.parameters), poses)
+    found = model._replace(**dict(zip(("vertices", "faces", "colors"), shape.mesh(fit.parameters), strict=True)))
+    if settings.cameras:
+        found = found._replace(**{name: fit.parameters[name].numpy() for name in model.cameras})
     return tessellated(found) if settings.surface == "subdivision" else found, fit.history
 
 

@@ -107,7 +107,7 @@ def fitted(
     assert model.atlas is not None
     atlas: Atlas = model.atlas
     surface = surface_of(model)
-    poses = {"poses": torch.tensor(model.poses)}
+    known_cameras = model.cameras
     shown = seen_texels(model, known, len(atlas.texture))
     bare = shown[..., 3] < 0.5  # Between charts nothing is fitted.
     scale = torch.tensor(np.where(shown[..., :1] < 0.5, 0, _scales(model, pictures)))
@@ -122,7 +122,7 @@ def fitted(
         pictures.views,
         batch=batch,
         seed=settings.seed,
-        cameras=(lambda p, camera, view: moved_camera(poses, camera, view)) if settings.cameras else None,
+        cameras=(lambda p, camera, view: moved_camera(known_cameras, camera, view)) if settings.cameras else None,
         background=None if pictures.outlined else pictures.background,
     )
 
@@ -153,11 +153,11 @@ def _scales(model: Model, pictures: Pictures) -> np.ndarray:
     Gradient descent by changes is then descent by texels, where each has one over its weight as its rate.
     """
     assert model.atlas is not None
-    surface, poses = surface_of(model), {"poses": torch.tensor(model.poses)}
+    surface, cameras = surface_of(model), model.cameras
     texture = torch.tensor(model.atlas.texture, requires_grad=True)
     for number, view in enumerate(pictures.views):
         part = textured(surface, model.vertices, model.atlas.uv, texture)
-        image = rts.render(part, moved_camera(poses, view.camera, number), view.size)
+        image = rts.render(part, moved_camera(cameras, view.camera, number), view.size)
         image[..., : view.image.shape[2]].mean().backward()  # Linear in the texture: the gradient is the weight.
     assert texture.grad is not None
     weights = texture.grad[..., :1].numpy() / len(pictures.views)

@@ -23,6 +23,8 @@ BELOW, DARKER = 0.1, 5.0
 """How far a view's overlap, or its PSNR in dB, is below the median of all if it disagrees."""
 GAIN = 1.0
 """dB that a view gains by a camera that is fitted, if its camera was at fault."""
+FINE = 35.0
+"""The median PSNR, dB, from which on cameras are good enough."""
 TRIED = 3
 """The most views whose cameras are tried."""
 FRONT, AROUND = 100.0, 150.0
@@ -128,7 +130,7 @@ def _disagreeing(model: Model, pictures: Pictures, rows: Sequence[Measured], set
     if names["picture"]:
         what = "masks or light" if pictures.outlined and not pictures.by_points else "light, or what moved"
         findings.append(f"pictures that disagree with the others{more}: {', '.join(names['picture'])}: look at {what}")
-    if not settings.cameras:
+    if not settings.cameras and np.median(psnr) < FINE:
         fine = [i for i in range(len(pictures.views)) if not worse[i]]
         tried = [fine[i] for i in np.unique(np.linspace(0, len(fine) - 1, TRIED).astype(int))] if fine else []
         if tried and np.median([_gain(model, pictures, i, settings) for i in tried]) > GAIN:
