@@ -36,6 +36,8 @@ ELSEWHERE = {
     "rts render man.glb --clip 0 -o man.gif": "test_cli.py",
     "rts reconstruct photos/ -o out/thing --quick": "make apps",
     "rts cameras photos/ -o thing": "make apps",
+    "rts reconstruct photos/ -o out/thing --region=-0.94,0.08,5.1,3.5": "make apps",
+    "rts reconstruct photos/ -o out/thing --masks out/thing/masks": "make apps",
 }
 """Commands that take long, or need files of their own, and who runs them."""
 

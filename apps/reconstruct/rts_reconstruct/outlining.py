@@ -99,7 +99,7 @@ def _masked(view: rts.View, file: Path) -> rts.View:
     if (height, width) != view.size:
         raise rts.InputError(
             f"the mask {file} has {width} × {height} pixels, and its picture {view.size[1]} × {view.size[0]}; expected "
-            "masks of the size of the pictures"
+            "masks of the size of the pictures" + (": this one is turned" if (width, height) == view.size else "")
         )
 
     def image() -> np.ndarray:
