@@ -56,7 +56,8 @@ def _silhouette(solid: trimesh.Trimesh, camera: rts.Camera, size: tuple[int, int
         return alpha, np.ones(size, np.float32)
     depth = max(float(np.asarray(camera.depth(np.zeros((1, 3))))[0]), CELL)
     band = max(1.0, CELL * camera.projection[1, 1] * size[0] / (2 * depth))
-    away = np.where(shown, scipy.ndimage.distance_transform_edt(shown), scipy.ndimage.distance_transform_edt(~shown))
+    inside, outside = (np.asarray(scipy.ndimage.distance_transform_edt(kind)) for kind in (shown, ~shown))
+    away = np.where(shown, inside, outside)
     return alpha, (away > band).astype(np.float32)
 
 

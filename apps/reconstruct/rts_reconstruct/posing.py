@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 import rts
 from rts_reconstruct.model import Model, moved_camera
@@ -53,4 +54,29 @@ def refined(model: Model, pictures: Pictures, settings: Settings) -> Model:
     quiet = settings._replace(progress=False)
     for place in range(len(pictures.views)):
         model = posed(model, pictures, quiet, [place], FEW)
-    return model
+    return anchored(model, pictures)
+
+
+def anchored(model: Model, pictures: Pictures) -> Model:
+    """The model and the fitted cameras, moved and scaled together so that cameras are where they were, on the whole.
+
+    Pictures do not tell where in the world all of this is, nor how large: each camera sees the same as before.
+    """
+    views = np.array([np.asarray(view.camera.view, np.float64) for view in pictures.views])
+    poses = np.array([np.asarray(rts.rigid(pose.astype(np.float64))) for pose in model.poses])
+    before, after = (np.linalg.inv(matrices)[:, :3, 3] for matrices in (views, views @ poses[: len(views)]))
+    if np.linalg.matrix_rank(before - before.mean(axis=0), tol=1e-6) < 2:
+        return model  # Cameras on a line may turn about it.
+    turn = Rotation.align_vectors(before - before.mean(axis=0), after - after.mean(axis=0))[0].as_matrix()
+    unit = float(np.linalg.norm(before - before.mean(axis=0)) / np.linalg.norm(after - after.mean(axis=0)))
+    move = before.mean(axis=0) - unit * turn @ after.mean(axis=0)
+    found = []
+    for view, pose in zip([v.camera.view for v in pictures.views + pictures.held_out], poses, strict=True):
+        # A point x is now at unit · turn x + move; depths grow by the unit.
+        eye = np.asarray(view, np.float64)
+        rotation = pose[:3, :3] @ turn.T
+        shift = unit * pose[:3, 3] + (unit - 1) * eye[:3, :3].T @ eye[:3, 3] - rotation @ move
+        found.append(np.concatenate([Rotation.from_matrix(rotation).as_rotvec(), shift]))
+    fitted = np.where((np.arange(len(found)) < len(views))[:, None], found, model.poses)
+    vertices = unit * model.vertices @ turn.T + move
+    return model._replace(vertices=vertices.astype(np.float32), poses=fitted.astype(np.float32))

@@ -53,7 +53,7 @@ def filled(model: Model, known: np.ndarray) -> Model:
     ends = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
     count = len(known)
     joined = scipy.sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
-    laplacian = scipy.sparse.diags_array(joined.sum(axis=1) + 1e-6) - joined
+    laplacian = scipy.sparse.csr_array(scipy.sparse.diags_array(joined.sum(axis=1) + 1e-6) - joined)
     free = ~known
     right = joined[free][:, known] @ model.colors[known] + 1e-6 * model.colors[known].mean(axis=0)
     colors = model.colors.copy()

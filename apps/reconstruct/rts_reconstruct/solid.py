@@ -76,9 +76,7 @@ def _solved(empty: np.ndarray, filled: np.ndarray) -> np.ndarray:
     outside = axis[:, None, None] + axis[:, None] + axis > 1
     for_one = np.where(outside, 0, np.minimum(filled, MOST))
     for_zero = np.where(outside, SURE, np.minimum(EMPTY * empty, MOST))
-    step = scipy.sparse.diags_array(
-        [-np.ones(LATTICE - 1), np.ones(LATTICE - 1)], offsets=[0, 1], shape=(LATTICE - 1, LATTICE)
-    )
+    step = scipy.sparse.eye_array(LATTICE - 1, LATTICE, k=1) - scipy.sparse.eye_array(LATTICE - 1, LATTICE)
     one, second = scipy.sparse.eye_array(LATTICE), step.T @ step
     kron = scipy.sparse.kron
     smooth = kron(kron(second, one), one) + kron(kron(one, second), one) + kron(kron(one, one), second)

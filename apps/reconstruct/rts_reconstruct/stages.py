@@ -22,6 +22,10 @@ ROUNDS = 5
 """Rounds of remeshing."""
 
 
+FOCAL = 0.1
+"""The learning rate of focal lengths, as a share of that of poses: a step changes all pictures."""
+
+
 class Stage(NamedTuple):
     """Steps with one set of rates, on a mesh of about so many faces.
 
@@ -88,7 +92,7 @@ def fitted(
     rates = {"shape": stage.shape * shape.rate, "colors": stage.colors}
     if settings.cameras:
         start |= model.cameras
-        rates |= dict.fromkeys(model.cameras, stage.poses)
+        rates |= {"poses": stage.poses, "focal": FOCAL * stage.poses}
     residuals = rts.ViewResiduals(
         shape.part,
         pictures.views,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from rts_reconstruct import contradictions, detail, files, outlining, pictures, points, sight, solid, texturing
+from rts_reconstruct import contradictions, detail, files, outlining, pictures, points, posing, sight, solid, texturing
 from rts_reconstruct.measures import measured
 from rts_reconstruct.model import Model, moved_camera
 from rts_reconstruct.points import Points
@@ -160,6 +160,21 @@ def test_a_focal_length_is_a_factor_on_the_camera():
     point = np.array([[0.3, -0.2, 0.5]], np.float32)
     before, after = (np.asarray(c.project(point, (100, 100)))[0, :2] - 50 for c in (camera, moved.map(np.asarray)))
     np.testing.assert_allclose(after, 1.1 * before, rtol=1e-5)
+
+
+def test_cameras_that_are_anchored_see_the_same_and_are_where_they_were():
+    found = pictures.read(views(), SIZE, 0)
+    model = about(found, truth())
+    motion = np.float32([0.1, -0.2, 0.15, 0.05, 0.1, -0.1])
+    away = model._replace(poses=np.repeat(motion[None], len(model.poses), axis=0))
+    back = posing.anchored(away, found)
+    np.testing.assert_allclose(back.poses, 0, atol=1e-5)
+    for view in found.views[:3]:
+        seen = [
+            np.asarray(moved_camera(m.cameras, view.camera, 0).map(np.asarray).project(m.vertices, view.size))[:, :2]
+            for m in (away, back)
+        ]
+        np.testing.assert_allclose(seen[0], seen[1], atol=1e-3)
 
 
 def test_colours_that_no_view_sees_come_from_beside():
