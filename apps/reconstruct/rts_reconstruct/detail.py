@@ -25,6 +25,8 @@ FILL = 0.6
 """The share of an atlas that charts fill, about."""
 WIDTH = 0.6
 """The width of the Gaussian that parts detail from what was fitted, in pixels of the fit."""
+LIKE = 0.1
+"""The difference from the fitted colour from which on a picture's detail counts less."""
 CLEAR = 0.98
 """The least alpha of pixels that give detail: at outlines, they show what is behind."""
 
@@ -32,9 +34,9 @@ CLEAR = 0.98
 def detailed(model: Model, pictures: Pictures) -> Model:
     """The model whose texture has the detail of the pictures as they are, added to what was fitted to smaller ones.
 
-    What is finer than pixels of the fit is a weighted mean over the views that see a texel. A view's weight is a power
-    of the number of its pixels on a piece of the surface, which grows with nearness and falls with slant. Brightness
-    stays that of the fit. A model without texture, or whose pictures were fitted as they are, stays as it is.
+    What is finer than pixels of the fit is a weighted mean over the views that show a face best. A view's weight is a
+    power of the number of its pixels on a piece of the surface, which grows with nearness and falls with slant. Views
+    whose colours are off those of the fit count less. Brightness stays that of the fit. A model without texture, or whose pictures were fitted as they are, stays as it is.
     """
     atlas = model.atlas
     shrinks = [max(a.size) / max(b.size) for a, b in zip(pictures.given, pictures.views, strict=False)]
@@ -46,6 +48,8 @@ def detailed(model: Model, pictures: Pictures) -> Model:
     face, points = _texels(model, size)
     bare = face < 0
     face, points = face[~bare], points[~bare]
+    texture = _enlarged(atlas.texture, size)
+    base = texture[~bare]
     sums, total = np.zeros((len(points), 3), np.float32), np.full(len(points), 1e-12, np.float32)
     for place, shrink in enumerate(shrinks):
         chosen, rank = np.nonzero((best == place)[face])
@@ -53,14 +57,16 @@ def detailed(model: Model, pictures: Pictures) -> Model:
             continue
         view = pictures.given[place]
         camera = camera_of(model, pictures, place, pictures.world.camera(view.camera))
-        fine, whole = _fine(view, pictures, place, shrink)
+        coarse, fine, whole = _parted(view, pictures, place, shrink)
         x, y = np.moveaxis(np.asarray(camera.project(points[chosen], view.size)), -1, 0)[:2]
         at = np.array([y - 0.5, x - 0.5])
         weight = weights[face[chosen], rank] * (scipy.ndimage.map_coordinates(whole, at, order=1) > CLEAR)
+        for channel in range(3):  # What stands before the surface in a picture has other colours.
+            off = scipy.ndimage.map_coordinates(coarse[..., channel], at, order=1) - base[chosen, channel]
+            weight = weight * np.exp(-((off / LIKE) ** 2) / 2)
         total[chosen] += weight
         for channel in range(3):
             sums[chosen, channel] += weight * scipy.ndimage.map_coordinates(fine[..., channel], at, order=1)
-    texture = _enlarged(atlas.texture, size)
     texture[~bare] += sums / total[:, None]
     return model._replace(atlas=atlas._replace(texture=spread(np.clip(texture, 0, 1), bare)))
 
@@ -110,14 +116,15 @@ def _size(model: Model, pictures: Pictures) -> int:
     return size
 
 
-def _fine(view: rts.View, pictures: Pictures, place: int, shrink: float) -> tuple[np.ndarray, np.ndarray]:
-    """What of a picture (H, W, 3) is finer than pixels of the fit; and how much of the object (H, W) pixels show."""
+def _parted(view: rts.View, pictures: Pictures, place: int, shrink: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A picture (H, W, 3) without what is finer than pixels of the fit; that; how much of the object (H, W) it has."""
     image, small = np.asarray(view.image)[..., :3], pictures.views[place]
     whole = np.ones(view.size, np.float32) if small.mask is None else _over(small.mask, view.size, shrink)
     if small.image.shape[2] == 4:
         whole = whole * _over(small.image[..., 3], view.size, shrink)
     sigma = WIDTH * shrink
-    return image - scipy.ndimage.gaussian_filter(image, (sigma, sigma, 0)), whole
+    coarse = scipy.ndimage.gaussian_filter(image, (sigma, sigma, 0))
+    return coarse, image - coarse, whole
 
 
 def _over(small: np.ndarray, size: tuple[int, int], shrink: float) -> np.ndarray:
