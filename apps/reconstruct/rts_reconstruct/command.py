@@ -32,7 +32,7 @@ def reconstruct(
         int | None, typer.Option(help="Texels a side; 1024. 0 for vertex colours.", show_default=False)
     ] = None,
     held_out: Annotated[int, typer.Option(help="Hold out every so many views, to measure only; 0 for none.")] = 8,
-    fit_cameras: Annotated[bool, typer.Option("--fit-cameras", help="Fit the poses of cameras, too.")] = False,
+    fit_cameras: Annotated[bool, typer.Option("--fit-cameras", help="Fit poses and focal length, too.")] = False,
     light: Annotated[
         bool, typer.Option("--light", help="Tell light from colours, and write colours as in even light.")
     ] = False,

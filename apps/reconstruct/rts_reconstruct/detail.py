@@ -36,7 +36,8 @@ def detailed(model: Model, pictures: Pictures) -> Model:
 
     What is finer than pixels of the fit is a weighted mean over the views that show a face best. A view's weight is a
     power of the number of its pixels on a piece of the surface, which grows with nearness and falls with slant. Views
-    whose colours are off those of the fit count less. Brightness stays that of the fit. A model without texture, or whose pictures were fitted as they are, stays as it is.
+    whose colours are off those of the fit count less. Brightness stays that of the fit. A model without
+    texture, or whose pictures were fitted as they are, stays as it is.
     """
     atlas = model.atlas
     shrinks = [max(a.size) / max(b.size) for a, b in zip(pictures.given, pictures.views, strict=False)]

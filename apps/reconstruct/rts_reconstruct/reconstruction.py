@@ -76,7 +76,8 @@ def reconstruct(
         batch: the number of pictures in a step.
         texture: texels a side, by default 1024; 0 for vertex colours.
         held_out: every so many views, one is held out and only measured; 0 for none.
-        fit_cameras: True to fit the poses of cameras, too, and write them; those of views held out are fitted to the
+        fit_cameras: True to fit the poses of cameras, too, and a factor on their focal lengths, and to write them;
+            together they stay where they were given, as large. Poses of views held out are fitted to the
             finished mesh, since fitted cameras and mesh may have moved together.
         light: True to tell light and colours apart in the end, and write colours as in even light, and the light. It is
             one environment, of spherical harmonics to the second order, whose mean irradiance is 1, since pictures do
